@@ -61,7 +61,7 @@ class Estimator:
             likelihood: for preset "precise": density of a range; defaults to the calibrated one of the model.
             optimiser: for preset "precise": finds poses of least free energy; defaults to GaussNewton().
             sigma: noise of the scanner in m; defaults to what the scans state, else 0.02.
-            initial_pose: (3,) pose at the first scan; by default the whole world is searched.
+            initial_pose: (3,) pose at the first scan, or (2,) without a heading; by default, anywhere.
             seed: random seed.
             descent: parameters of preset "paper".
 
@@ -119,7 +119,7 @@ class Estimator:
         return Predicted(ranges.reshape(shape), found.sigma.reshape(shape))
 
     def restart(self, pose: Numbers | None = None, covariance: Numbers | None = None) -> None:
-        """Forgets the belief, and starts near ``pose`` (3,) with ``covariance`` (3, 3), or from an unknown pose.
+        """Forgets the belief; starts near ``pose`` (3,) or (2,) with ``covariance`` (3, 3), or from an unknown pose.
 
         Raises UserError if no scanner is known yet.
         """

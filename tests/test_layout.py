@@ -26,7 +26,7 @@ LAYERS = (
     ("common.router", "common.containers"),
     (
         "services.simulator", "services.estimator", "services.controller", "services.recorder", "services.viewer",
-        "services.bridge_ros2",
+        "services.mapper", "services.bridge_ros2",
     ),
     ("presage",),
     ("lab",),

@@ -29,6 +29,7 @@ ROLES: dict[str, str] = {
     "simulator": "the simulated robot: scanner, odometry, wheels",
     "bridge_ros2": "a robot in ROS 2 and its rviz: scanner, odometry, wheels, goals",
     "estimator": "estimates where the robot is",
+    "mapper": "maps while the robot is driven, in place of the estimator",
     "controller": "drives the robot",
     "recorder": "reads and records everything",
     "viewer": "the live page, read-only",

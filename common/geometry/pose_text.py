@@ -14,6 +14,14 @@ NUMBER = r"-?(\d{1,9}\.?\d*|\.\d+)"
 POSE_TEXT = rf"^$|^{NUMBER},{NUMBER}(,{NUMBER})?$"  # the empty text is allowed, too
 
 
+def start_of_text(text: str, option: str) -> Array:
+    """(3,) x, y in m and yaw in rad, or (2,) x, y if the heading is left out, because it is unknown then.
+
+    Raises UserError, naming ``option``, for invalid text.
+    """
+    return pose_of_text(text, option)[: text.count(",") + 1]
+
+
 def pose_of_text(text: str, option: str) -> Array:
     """(3,) x, y in m and yaw in rad, which defaults to 0. Raises UserError, naming ``option``, for invalid text."""
     if not text or not re.fullmatch(POSE_TEXT, text):

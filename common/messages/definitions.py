@@ -13,10 +13,27 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
+from common.geometry.occupancy_grid import OccupancyGrid
 from common.limits import Angle, Distance, PositiveAngle, PositiveDistance
 from common.messages.pose import Pose as Pose  # noqa: PLC0414 - most modules import it from here
 from common.messages.pose import Twist as Twist  # noqa: PLC0414
-from common.messages.wire import Beams, Costs, Count, Finite, Floats, Matrix3, Message, Name, NotNegative, Points, Text
+from common.messages.wire import (
+    Beams,
+    Costs,
+    Count,
+    Finite,
+    Floats,
+    Matrix3,
+    Message,
+    Name,
+    NotNegative,
+    Points,
+    Poses,
+    Text,
+)
+from common.robot.motion_distortion import beam_times, sweep_time
+
+GOAL_TOLERANCE_M = 0.02  # default of Goal.tolerance
 
 
 class Stamped(Message):
@@ -27,7 +44,7 @@ class Stamped(Message):
 
 
 class Scan(Stamped):
-    """One sweep of the scanner (sensor_msgs/LaserScan)."""
+    """One sweep of the scanner (sensor_msgs/LaserScan); its stamp is the time of the beam that was measured first."""
 
     angle_min: Angle  # rad, direction of the first beam in laser, counter-clockwise seen from above in any mounting
     angle_increment: Angle  # rad, between beams; negative if they run clockwise, as of a scanner mounted upside down
@@ -36,6 +53,8 @@ class Scan(Stamped):
     ranges: Beams  # (B,) m; +inf is nothing within range_max, -inf is too close (REP-117), 0 is not measured
     mount: Pose = Pose(x=0.0, y=0.0)  # pose of the scanner in base_link
     scan_time: NotNegative = 0.0  # s, between scans
+    time_increment: Annotated[float, Field(ge=-1, le=1)] = 0.0  # s, between beams; negative if the last beam was
+    # measured first; 0 if all were measured at the stamp, or if the times are unknown
     frame_id: Name = "laser"
     sigma: Distance = 0.0  # m, standard deviation of a range; unknown if this and sigma_relative are 0
     sigma_relative: Annotated[float, Field(ge=0, le=1)] = 0.0  # standard deviation as a share of the range,
@@ -44,6 +63,15 @@ class Scan(Stamped):
     def angles(self) -> npt.NDArray[np.float64]:
         """(B,) beam directions in laser, rad."""
         return self.angle_min + self.angle_increment * np.arange(len(self.ranges), dtype=np.float64)
+
+    def beam_times(self) -> npt.NDArray[np.float64]:
+        """(B,) times of the beams after the stamp, s."""
+        return beam_times(len(self.ranges), self.time_increment)
+
+    @property
+    def sweep_time(self) -> float:
+        """Time from the first beam to the last, s."""
+        return sweep_time(len(self.ranges), self.time_increment)
 
 
 class Odom(Stamped):
@@ -128,12 +156,22 @@ class Prediction(Stamped):
     frame_id: Name = "laser"
 
 
+class Map(Stamped):
+    """The map that the mapper has built so far; its origin is the place where mapping began."""
+
+    grid: OccupancyGrid  # free, occupied and unknown cells
+    poses: Poses  # (K, 3) base_link in map, of the key scans in order of time
+    closures: Points = np.zeros((0, 2), np.float32)  # (2 C, 2) m in map, the two ends of each loop closure
+    frame_id: Name = "map"
+
+
 class Goal(Stamped):
     """The pose that the robot is to reach."""
 
     pose: Pose  # base_link in map
-    tolerance: PositiveDistance = 0.2  # m, the goal is reached within this distance
+    tolerance: PositiveDistance = GOAL_TOLERANCE_M  # m, the goal is reached within this distance
     yaw_tolerance: PositiveAngle | None = None  # rad, tolerance of the final heading; nil accepts any heading
+    approach: Angle | None = None  # rad in map, direction of motion over the last 0.6 m; nil accepts any direction
     cancel: bool = False  # drop the goal and stop
 
 
@@ -149,6 +187,16 @@ class CmdVel(Stamped):
     twist: Twist  # base_link
 
 
+class PolicyEnergy(Message):
+    """Expected free energy of the chosen policy, in nats: risk + ambiguity - pose_information - place_information."""
+
+    risk: Finite  # -ln p of the predicted states under the preferences: distance to go, gaps, change of velocity
+    ambiguity: Finite  # expected entropy of the scans
+    pose_information: Finite  # expected gain about where the robot is within a place; negative if motion loses more
+    place_information: Finite  # expected gain about which of several places the robot is at
+    probability: Annotated[float, Field(ge=0, le=1)]  # of the policy among those compared, by softmax(-5000 G)
+
+
 class Status(Stamped):
     """What the controller does, and why."""
 
@@ -159,6 +207,7 @@ class Status(Stamped):
     goal: Pose | None = None  # base_link in map
     goal_seq: Count = 0  # seq of the goal
     distance: Distance | None = None  # m, from the believed pose to the goal
+    energy: PolicyEnergy | None = None  # of the chosen policy; nil without a policy, and with preset paper
 
 
 class Plan(Stamped):

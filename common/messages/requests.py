@@ -40,6 +40,7 @@ class LocaliseRequest(Request):
     """Restart localisation, from a known pose or globally."""
 
     pose: Pose | None = None  # base_link in map; nil searches the whole map
+    heading_known: bool = True  # whether pose.yaw means anything
 
 
 class ResetRequest(Request):
@@ -132,6 +133,18 @@ class RecordReply(Reply):
     file: Text = ""  # path on the recorder's machine of the present or last recording; empty if there is none yet
     messages: Count = 0  # number of messages in that recording
     seconds: NotNegative = 0.0  # s of wall time since its start, or its length once it is complete
+
+
+class SaveMapRequest(Request):
+    """Write the map as NAME.yaml, with the image NAME.pgm and the trajectory NAME.tum."""
+
+    name: Name  # letters, digits, - and _
+
+
+class SaveMapReply(Reply):
+    """The world that was written."""
+
+    file: Text = ""  # path of NAME.yaml on the mapper's machine
 
 
 class ConfigReply(Reply):

@@ -88,3 +88,10 @@ def mount_of(transform: Transform) -> Mount:
         raise ValueError(f"the scanner is inclined by {tilt:.0f} degrees; it has to be mounted level or upside down")
     x, y, yaw = (float(v) for v in transform.planar())
     return Mount((x, y, yaw), upside_down=up < 0)
+
+
+def plausible_time_increment(scan: Any) -> float:
+    """Time between two beams of a LaserScan in s; 0 if the driver states none, or one longer than the scan takes."""
+    increment, longest = float(scan.time_increment), float(scan.scan_time)
+    longest = longest if 0 < longest < 1 else 1.0
+    return increment if 0 < increment * (len(scan.ranges) - 1) <= longest else 0.0

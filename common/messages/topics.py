@@ -11,7 +11,9 @@ from common.messages import requests as r
 ROOT = "presage"
 # Roles as named in certificates, described in common/bus/security.py. The role of a service has the service's name.
 CONTROL_ROLES = ("operator", "viewer-control")  # may move the robot, delete data, or change what runs
-SERVICE_ROLES = ("simulator", "bridge_ros2", "estimator", "controller", "recorder", "viewer", "viewer-control")
+SERVICE_ROLES = (
+    "simulator", "bridge_ros2", "estimator", "mapper", "controller", "recorder", "viewer", "viewer-control",
+)  # fmt: skip
 ROBOT_ROLES = ("simulator", "bridge_ros2")  # publish what the robot measures
 GOAL_ROLES = (*CONTROL_ROLES, "bridge_ros2")  # may set goals and poses; with the bridge, rviz may
 COMPUTE_ROLES = (*SERVICE_ROLES, "operator")  # may send requests that need much computing time
@@ -62,8 +64,17 @@ ODOM = Topic(
     "odom", m.Odom, "simulator", 15, "newest", publisher_roles=ROBOT_ROLES, about="dead reckoning, which drifts"
 )
 TRUTH = Topic("truth", m.Truth, "simulator", 15, "newest", about="true pose and velocity of the robot")
-BELIEF = Topic("belief", m.Belief, "estimator", 15, "newest", about="estimated pose, its uncertainty and free energy")
+BELIEF = Topic(
+    "belief",
+    m.Belief,
+    "estimator",
+    15,
+    "newest",
+    publisher_roles=("estimator", "mapper"),
+    about="estimated pose, its uncertainty and free energy; while mapping, of the mapper",
+)
 PREDICTION = Topic("prediction", m.Prediction, "estimator", 15, "newest", about="the scan predicted for the belief")
+MAP = Topic("map", m.Map, "mapper", 0, "newest", about="the map so far, on change and every 5 s")
 CMD_VEL = Topic("cmd_vel", m.CmdVel, "controller", 15, "newest", about="velocity command")
 GOAL = Topic(
     "goal",
@@ -113,6 +124,7 @@ TOPICS: tuple[Topic, ...] = (
     TRUTH,
     BELIEF,
     PREDICTION,
+    MAP,
     GOAL,
     DRIVE,
     CMD_VEL,
@@ -161,6 +173,7 @@ PREDICT = Query(
     requester_roles=COMPUTE_ROLES,
     about="predict scans from given poses",
 )
+SAVE_MAP = Query("save_map", r.SaveMapRequest, r.SaveMapReply, "mapper", about="write the map into files")
 CONFIG = Query(
     "config",
     r.Request,
@@ -186,6 +199,7 @@ QUERIES: tuple[Query, ...] = (
     RECORDING,
     MODEL,
     PREDICT,
+    SAVE_MAP,
     CONFIG,
 )
 

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 class Robot(BaseModel):
@@ -20,6 +21,9 @@ class Robot(BaseModel):
     max_turn: Positive = 2.0  # rad/s
     acceleration: Positive = 1.0  # m/s²
     turn_acceleration: Positive = 3.0  # rad/s²
+    dead_band: NotNegative = 0.0  # m/s, the base does not move at a lower speed
+    turn_dead_band: NotNegative = 0.0  # rad/s, nor turns at a lower rate
+    latency: NotNegative = 0.0  # s, from a command to its effect
     margin: Positive = 0.05  # m, gap to obstacles that the obstacle stop keeps
     command_timeout: Positive = 0.2  # s, the robot brakes hard if it gets no new command for this time
     command_age: Positive = 0.5  # s, commands that respond to older scans are ignored

@@ -36,6 +36,11 @@ class Sweep(NamedTuple):
         """Beam directions of a scan message."""
         return cls(scan.angle_min, scan.angle_increment, len(scan.ranges))
 
+    @classmethod
+    def of_angles(cls, angles: Array) -> Sweep:
+        """Evenly spaced beams at ``angles`` (B,) rad in laser."""
+        return cls(float(angles[0]), float(angles[-1] - angles[0]) / max(1, len(angles) - 1), len(angles))
+
     @property
     def spacing(self) -> float:
         """Angle between neighbouring beams, rad."""

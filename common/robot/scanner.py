@@ -51,6 +51,11 @@ class Scanner(BaseModel):
         step = self.fov / (self.beams - 1)
         return -step if self.upside_down else step
 
+    @property
+    def turn_per_beam(self) -> float:
+        """Angle between beams as a share of a full turn."""
+        return abs(self.angle_increment) / (2 * np.pi)
+
     def angles(self) -> Array:
         """(B,) beam directions, rad in laser."""
         return self.angle_min + self.angle_increment * np.arange(self.beams, dtype=np.float64)

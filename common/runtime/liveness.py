@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 REQUIRED_SERVICES = ("simulator", "estimator", "controller")  # without which a robot does not navigate
 OPTIONAL_SERVICES = ("recorder", "viewer")
 REPLAY = "replay"  # publishes the messages of all other services, and no health messages
-SUBSTITUTES = {"simulator": "bridge_ros2"}  # a ROS robot takes the place of the simulator
+SUBSTITUTES = {"simulator": "bridge_ros2", "estimator": "mapper"}  # services that take the place of another
 
 REPORT_TIMEOUT_S = 2.5  # without a report (health message or heartbeat), which comes once a second, a service is late
 INPUT_TIMEOUT_S = 2.0  # inputs newer than this count as arriving
@@ -32,6 +32,7 @@ RESULTS = {
     "replay": (None, ("scan", "published")),
     "remote": (None, ("scan", "received")),
     "estimator": (("scan", "received"), ("belief", "published")),
+    "mapper": (("scan", "received"), ("belief", "published")),
     "controller": (("belief", "received"), ("status", "published")),
     "recorder": (("*", "received"), ("*", "written")),
 }

@@ -54,6 +54,15 @@ class RobotSettings(ServiceSettings):
         float,
         Field(gt=0, le=100, allow_inf_nan=False, description="maximum angular acceleration and braking, rad/s²"),
     ] = 3.0
+    dead_band: Annotated[
+        float, Field(ge=0, le=1, allow_inf_nan=False, description="speed below which the base does not move, m/s")
+    ] = 0.0
+    turn_dead_band: Annotated[
+        float, Field(ge=0, le=1, allow_inf_nan=False, description="turn rate below which the base does not turn, rad/s")
+    ] = 0.0
+    latency: Annotated[
+        float, Field(ge=0, le=0.5, allow_inf_nan=False, description="time from a command to its effect, s")
+    ] = 0.0
 
     def build_robot(self) -> Robot:
         """Build a robot with these limits; raises UserError if it would take too long to stop."""
@@ -77,6 +86,9 @@ class RobotSettings(ServiceSettings):
             max_turn=self.max_turn,
             acceleration=self.acceleration,
             turn_acceleration=self.turn_acceleration,
+            dead_band=self.dead_band,
+            turn_dead_band=self.turn_dead_band,
+            latency=self.latency,
         )
 
 

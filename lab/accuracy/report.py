@@ -73,11 +73,10 @@ def bench_accuracy(
         for estimator in chosen
     ]
     rows = run_all(jobs, workers, console)
-    for title, own in _by_title(rows).items():
-        if markdown:
-            print(_markdown(own, title))
-            print(LEGEND)
-        else:
+    if markdown:
+        print(table(rows), LEGEND, sep="\n\n")
+    else:
+        for title, own in _by_title(rows).items():
             console.print(_table(own, title))
     write_json(json_file, {"rows": rows, "trials": trials, "minutes": minutes, **provenance(seed)})
     if figure is not None:
@@ -141,6 +140,11 @@ def _table(rows: list[dict[str, Any]], title: str) -> Table:
     return table
 
 
+def table(rows: list[dict[str, Any]]) -> str:
+    """A Markdown table for each world and scanner."""
+    return "\n\n".join(_markdown(own, title) for title, own in _by_title(rows).items())
+
+
 def _markdown(rows: list[dict[str, Any]], title: str) -> str:
     """A Markdown table with one line per task; `LEGEND` explains the cells."""
     names = list(dict.fromkeys(row["estimator"] for row in rows))
@@ -148,18 +152,19 @@ def _markdown(rows: list[dict[str, Any]], title: str) -> str:
     for task in dict.fromkeys(row["task"] for row in rows):
         own = {row["estimator"]: row for row in rows if row["task"] == task}
         limit = next((row["bound_rms_m"] for row in own.values() if row["bound_rms_m"] is not None), None)
-        cells = [_cell(own[name]) if name in own else "" for name in names]
+        cells = [cell(own[name]) if name in own else "" for name in names]
         lines.append(f"| {task} | " + " | ".join(cells) + f" | {_number(limit, 1e3)} |")
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines)
 
 
-def _cell(row: dict[str, Any]) -> str:
+def cell(row: dict[str, Any], *, nees: bool = True) -> str:
+    """Errors and counts of one task, for a Markdown table; `LEGEND` explains them."""
     counts = f"{row['found']}/{row['of']}, {row['tracking_but_wrong']} wrong"
     if row["position_error_median_m"] is None:
         return counts
     error = f"{_number(row['position_error_median_m'], 1e3)}/{_number(row['position_error_rms_m'], 1e3)} mm"
-    nees = f", NEES {row['nees_mean']:.2f}" if row["nees_mean"] is not None else ""
-    return f"{error}, {counts}{nees}"
+    consistency = f", NEES {row['nees_mean']:.2f}" if nees and row["nees_mean"] is not None else ""
+    return f"{error}, {counts}{consistency}"
 
 
 def _draw(rows: list[dict[str, Any]], file: Path) -> None:

@@ -43,11 +43,18 @@ class Scene:
         lasers = se2.compose(poses, np.array(self.scanner.mount))
         return np.asarray(self.world.ray_distances(lasers, self.scanner.angles()))
 
-    def observe(self, clean: Array, stamp: float, odom: Array | None = None) -> Observation:
+    def observe(
+        self, clean: Array, stamp: float, odom: Array | None = None, time_increment: float = 0.0
+    ) -> Observation:
         """Observation of noise-free ranges (B,) with fresh noise added."""
         scanner = self.scanner
         return Observation(
-            scanner.limit(scanner.add_noise(clean, self.rng)), scanner.angles(), scanner.range_max, stamp, odom
+            scanner.limit(scanner.add_noise(clean, self.rng)),
+            scanner.angles(),
+            scanner.range_max,
+            stamp,
+            odom,
+            time_increment=time_increment,
         )
 
     def blocked(self, clean: Array, share: float) -> Array:
@@ -66,11 +73,13 @@ class Scene:
                 break
         return np.asarray(ranges)
 
-    def path(self, seconds: float, speed: float = 1.0, start: Array | None = None) -> Array:
+    def path(
+        self, seconds: float, speed: float = 1.0, start: Array | None = None, *, at_full_speed: bool = False
+    ) -> Array:
         """Poses (N, 3), one per scan, of a drive between random places along free straight lines.
 
-        The drive begins at rest at ``start`` (3,), or at a random pose. Speeds are up to ``speed`` m/s and 1 rad/s, and
-        accelerations are within the robot's limits.
+        The drive begins at rest at ``start`` (3,), or at a random pose. Speeds are up to ``speed`` m/s and 1 rad/s, or
+        just these ``at_full_speed``, and accelerations are within the robot's limits.
         """
         dt = 1 / self.scanner.rate
         room = shapely.buffer(self.world.free_space, -ROBOT.radius)
@@ -85,6 +94,8 @@ class Scene:
                     self.rng.uniform(0.2, speed),
                     self.rng.uniform(-MAX_TURN_RATE, MAX_TURN_RATE),
                 )
+                if at_full_speed:
+                    wanted_speed, wanted_turn = speed, float(np.copysign(MAX_TURN_RATE, wanted_turn))
             towards = target - pose[:2]
             distance = float(np.hypot(*towards))
             wanted = towards / max(distance, 1e-9) * min(wanted_speed, np.sqrt(2 * 0.5 * distance))

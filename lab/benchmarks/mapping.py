@@ -18,10 +18,11 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from lab.accuracy.runner import provenance
 from lab.integrity.cases import CASES, make_trial
+from presage.learning.map_of_log import raw_drive
 from presage.logs.scan_files import read_scans
-from presage.mapping.drive import RawDrive
-from presage.mapping.slam import build_trajectory
 from presage.terminal.output import check_file, write_json
+from services.mapper.slam.drive import Laser, RawDrive
+from services.mapper.slam.trajectory import build_trajectory
 
 Errors = tuple[Array, Array]  # (K,) m and (K,) rad
 COLUMNS = ("position_mean_m", "position_std_m", "position_max_m", "heading_mean_deg", "heading_std_deg")
@@ -93,8 +94,7 @@ def _drive_of_log(log: Path) -> RawDrive:
     scans = read_scans(log)
     if scans.stamps is None:
         raise UserError(f"{log}: the scans have no times")
-    geometry = scans.geometry
-    return RawDrive(scans.stamps, scans.ranges, geometry.angles, geometry.mount, geometry.range_max, scans.odom)
+    return raw_drive(scans, scans.stamps, scans.odom)
 
 
 def _simulated(seed: int, seconds: float) -> tuple[RawDrive, Array]:
@@ -103,7 +103,8 @@ def _simulated(seed: int, seconds: float) -> tuple[RawDrive, Array]:
     scans, scanner = trial.observations, trial.scanner
     ranges, odom = np.array([scan.ranges for scan in scans]), np.array([scan.odom for scan in scans])
     stamps = np.array([scan.stamp for scan in scans], float)
-    return RawDrive(stamps, ranges, scanner.angles(), np.array(scanner.mount), scanner.range_max, odom), trial.truths
+    laser = Laser(scanner.angles(), np.array(scanner.mount), scanner.range_max)
+    return RawDrive(stamps, ranges, laser, odom), trial.truths
 
 
 def _rows(name: str, drive: RawDrive, errors: Callable[[Array], Errors], console: Console) -> list[dict[str, Any]]:

@@ -13,12 +13,13 @@ from rich.console import Console
 from rich.table import Table
 
 from common.geometry import se2
+from common.geometry.occupancy_grid import FREE, OCCUPIED, UNKNOWN, Cells
+from common.geometry.ros_map_writer import write_map
 from common.geometry.world import World, load_world
 from common.messages.requests import WorldReply
 from common.robot.base import Robot
 from common.robot.scanner import SCANNERS
 from lab.accuracy.runner import provenance
-from presage.learning.grid_map import rooms, write_map
 from presage.terminal.output import check_file, make_folder, write_json
 from services.controller.policies.free_space import FreeSpace
 from services.controller.policies.geodesic_field import FreeSpaceGraph
@@ -27,6 +28,7 @@ from services.simulator.people import People
 from services.simulator.simulation import Setup, Simulation
 
 SCANS = 100
+ROOM_WIDTH_M, DOOR_WIDTH_M = 6.0, 1.2
 
 
 def bench_map(
@@ -85,3 +87,24 @@ def _drive(simulation: Simulation) -> None:
     for _ in range(SCANS):
         simulation.advance()
         simulation.observe()
+
+
+def rooms(size: int, seed: int = 0, cell: float = 0.05) -> Cells:
+    """A random grid (size, size) of square rooms with doors and boxes, surrounded by unknown cells; ``cell`` in m."""
+    rng = np.random.default_rng(seed)
+    values = np.full((size, size), UNKNOWN, np.uint8)
+    edge, room, door = size // 50, round(ROOM_WIDTH_M / cell), round(DOOR_WIDTH_M / cell)
+    lines = range(edge, size - edge + 1, room)
+    last = lines[-1]
+    values[edge:last, edge:last] = FREE
+    for line in lines:
+        values[line - 2 : line + 2, edge - 2 : last + 2] = values[edge - 2 : last + 2, line - 2 : line + 2] = OCCUPIED
+    for line in lines[1:-1]:
+        for begin in lines[:-1]:
+            for walls in (values, values.T):
+                gap = begin + rng.integers(door, room - 2 * door)
+                walls[line - 2 : line + 2, gap : gap + door] = FREE
+    for _ in range(size**2 // 2000):
+        (x, y), (w, h) = rng.integers(edge + 8, last - 8, 2), rng.integers(1, 10, 2)
+        values[y : min(y + h, last), x : min(x + w, last)] = OCCUPIED
+    return values

@@ -74,6 +74,24 @@ def bench_map(
     raise typer.Exit(run(world, size, BEAMS, out, 0, json_file, console))
 
 
+@app.command("area")
+def bench_area(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the learned buildings.")],
+    areas: Annotated[str, typer.Option(help="Comma-separated areas in m².")] = "144,500,2000,8000",
+    places: Annotated[int, typer.Option(min=1, help="Number of random places for each area.")] = 100,
+    moved: Annotated[float, typer.Option(min=0, max=1, help="Share of moved furniture in a second run.")] = 0.5,
+    seed: Seed = 5,
+    json_file: Json = None,
+) -> None:
+    """Global localisation from one scan by the size of the map: generated office buildings side by side.
+
+    Example: `presage bench area --out built --areas 144,2000 --places 20`.
+    """
+    from lab.benchmarks.area import bench_area as run
+
+    raise typer.Exit(run(areas, places, moved, seed, out, worker_count(), json_file, console))
+
+
 @app.command("mapping")
 def bench_mapping(
     log: Annotated[Path | None, typer.Option(help="A log to map, of any format in docs/logs.md.")] = None,
@@ -93,6 +111,25 @@ def bench_mapping(
     from lab.benchmarks.mapping import bench_mapping as run
 
     raise typer.Exit(run(log, relations, worlds, seed, seconds, json_file, console))
+
+
+@app.command("refinement")
+def bench_refinement(
+    worlds: Annotated[int, typer.Option(min=0, max=1000, help="Number of generated buildings beside office.")] = 2,
+    seed: Seed = 1,
+    seconds: Annotated[float, typer.Option(min=10, help="Length of the drive that refines.")] = 300.0,
+    out: GeneratedFolder = None,
+    json_file: Json = None,
+) -> None:
+    """Errors of localisation in a rough map, and in what `presage map --refine` makes of it with one drive.
+
+    The rough maps are noisy grids of 5 cm cells and floor plans without furniture. Another drive is localised.
+
+    Examples: `presage bench refinement --worlds 0 --seconds 60`; `presage bench refinement --json refinement.json`.
+    """
+    from lab.benchmarks.refinement import bench_refinement as run
+
+    raise typer.Exit(run(worlds, seed, seconds, out or Path("refinement"), json_file, worker_count(), console))
 
 
 @app.command("metrics")
@@ -171,6 +208,26 @@ def bench_accuracy(
         scanner=scanner,
     )
     raise typer.Exit(code)
+
+
+@app.command("distortion")
+def bench_distortion(
+    worlds: Annotated[str, typer.Option(help="Comma-separated worlds.")] = "office,maze",
+    estimators: Annotated[
+        str, typer.Option(help="Comma-separated, as of `bench accuracy`.")
+    ] = "precise,particle-filter",
+    drives: Annotated[int, typer.Option(min=1, help="Drives of each estimator in each world.")] = 5,
+    seconds: Seconds = 40.0,
+    seed: Seed = 1,
+    json_file: Json = None,
+) -> None:
+    """Error at 1 m/s and 1 rad/s if beams are measured one after another, over that with instantaneous scans.
+
+    Example: `presage bench distortion --worlds office --drives 2 --json distortion.json`.
+    """
+    from lab.accuracy.motion_distortion import bench_distortion as run
+
+    raise typer.Exit(run(worlds, estimators, drives, seconds, BEAMS, seed, json_file, console))
 
 
 @app.command("integrity")

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from common.errors import UserError
-from lab.cli.navigation import navigate
+from lab.cli.navigation import dock, navigate
 from lab.cli.options import Alpha, Estimators, ExperimentSeed, Out, Trials, show, worker_count
 from presage.terminal.options import console
 from presage.terminal.output import make_folder
@@ -22,7 +22,7 @@ app = typer.Typer(no_args_is_help=True)
 def common_options(context: typer.Context, seed: ExperimentSeed = 1, out: Out = Path("experiments")) -> None:
     """The experiments of Burghardt & Lanillos 2021 with presets paper and precise and the particle filter.
 
-    Also navigation around walls and people, and localisation on real logs.
+    Also navigation around walls and people, docking, and localisation on real logs.
     """
     context.obj = seed, out
 
@@ -189,7 +189,7 @@ def real_drive(
     Compares preset precise with the particle filter in four tasks. a: tracking with odometry; b: tracking without;
     c: global localisation, starting at every 50th scan; d: kidnapping. Errors are relative to the log's reference
     poses. After Ctrl-C the same command continues.
-    Examples: `presage map drive.npz --mount 0,0,0 --poses reference --half first -o first_half.yaml`, then
+    Examples: `presage map drive.npz --mount 0,0,0 --poses reference --half first --no-learn -o first_half.yaml`, then
     `presage experiment real --log drive.npz --mount 0,0,0 --world first_half.yaml --quick`;
     `presage experiment --out mine real --log fr079.mcap --world fr079.yaml --name fr079 --every 50`.
     """
@@ -250,3 +250,4 @@ def tables(
 
 
 app.command("navigation")(navigate)
+app.command("docking")(dock)

@@ -1,4 +1,4 @@
-"""`presage experiment navigation`."""
+"""`presage experiment navigation` and `docking`."""
 
 from __future__ import annotations
 
@@ -23,9 +23,8 @@ def navigate(
     ] = "known",
     people: Annotated[int, typer.Option(min=0, max=100, help="Number of walking people; the map lacks them.")] = 0,
     estimator: Annotated[str, typer.Option(help="precise or particle-filter.")] = "precise",
-    epistemic: Annotated[
-        bool, typer.Option(help="While the pose is ambiguous, drive to where scans resolve the ambiguity.")
-    ] = True,
+    epistemic: Annotated[bool, typer.Option(help="Policies are also judged by the information that they gain.")] = True,
+    sweep: Annotated[bool, typer.Option("--sweep", help="Scans are distorted by the robot's motion.")] = False,
 ) -> None:
     """Navigation between random places, around walls and people.
 
@@ -42,7 +41,9 @@ def navigate(
     from lab.navigation import experiment as driving
 
     seed, out = context.obj
-    job = driving.NavigationJob(0, seed, start=start, people=people, estimator=estimator, epistemic=epistemic)
+    job = driving.NavigationJob(
+        0, seed, start=start, people=people, estimator=estimator, epistemic=epistemic, sweep=sweep
+    )
     world_names, drive_names = (
         tuple(part.strip() for part in text.split(",") if part.strip()) for text in (worlds, drives)
     )
@@ -52,3 +53,15 @@ def navigate(
         return driving.run(job, trials, out, worker_count(1), console, worlds=world_names, drives=drive_names)
 
     show(driving, run, out)
+
+
+def dock(context: typer.Context, trials: Trials = 100) -> None:
+    """Docking within 3 mm and 0.5 degrees: a base with latency, dead band and slipping wheels, scans with distortion.
+
+    Examples: `presage experiment docking --trials 4`; `presage experiment --seed 7 --out mine docking`.
+    """
+    from lab.navigation import docking
+
+    seed, out = context.obj
+    job = docking.DockingJob(0, seed)
+    show(docking, lambda: docking.run(job, trials, out, worker_count(1), console), out)

@@ -44,10 +44,13 @@ class LockstepRun:
     limit: int  # maximum number of iterations
     controller: tuple[str, ...] = ("--preset", "paper")  # command-line arguments of the controller
     simulator: tuple[str, ...] = ()  # command-line arguments of the simulator
+    sweep: bool = False  # whether motion distorts the scans, as by default in the simulator
     start_known: bool = True  # whether the estimator is given the true start
     # Whether the run ends when the controller reports that the goal is reached or refused; otherwise it ends when the
     # robot truly is near the goal.
     ends_with_status: bool = False
+    goal: Goal | None = None  # defaults to the journey's, at any heading
+    scans_after_end: int = 0  # recorded after that, while the robot comes to a stand
 
 
 @dataclass
@@ -61,6 +64,7 @@ class RunTrace:
         default_factory=list
     )  # stamps (ns) at which the controller published a new goal preference
     health: Health | None = None  # the controller's last health message
+    ended_ns: int | None = None  # stamp at which the run ended, before `scans_after_end`; None if it was aborted
     failure: str = ""  # why the run was aborted; empty if it was not
 
     def path(self) -> Array:
@@ -72,14 +76,20 @@ class RunTrace:
         return np.array([belief.pose.array() for belief in self.beliefs])
 
     def has(self, stamp_ns: int) -> bool:
-        """Whether the truth and the belief of that scan have been received."""
-        return all(bool(kept) and kept[-1].stamp_ns >= stamp_ns for kept in (self.truths, self.beliefs))
+        """Whether the truth, the belief and the status of that scan have been received."""
+        kept_stamps = (
+            [each.stamp_ns for each in self.truths],
+            [each.stamp_ns for each in self.beliefs],
+            list(self.statuses),
+        )
+        return all(max(stamps, default=-1) >= stamp_ns for stamps in kept_stamps)
 
     def discard_after(self, stamp_ns: int) -> None:
         """Removes all messages about later scans."""
         self.truths = [each for each in self.truths if each.stamp_ns <= stamp_ns]
         self.beliefs = [each for each in self.beliefs if each.stamp_ns <= stamp_ns]
         self.statuses = {stamp: each for stamp, each in self.statuses.items() if stamp <= stamp_ns}
+        self.plans = [stamp for stamp in self.plans if stamp <= stamp_ns]
 
 
 @contextmanager
@@ -124,6 +134,7 @@ def run(params: LockstepRun, stack: Stack) -> RunTrace:
             pose,
             "--beams",
             str(params.beams),
+            "--sweep" if params.sweep else "--no-sweep",
             "--pace",
             "lockstep",
             "--wait-for",
@@ -131,11 +142,8 @@ def run(params: LockstepRun, stack: Stack) -> RunTrace:
             *params.simulator,
         )
         stack.wait_alive(bus)
-        answer = _send_goal(
-            watch,
-            stack,
-            Goal(stamp_ns=0, seq=1, pose=Pose(x=params.journey.goal[0], y=params.journey.goal[1])),
-        )
+        x, y = params.journey.goal
+        answer = _send_goal(watch, stack, params.goal or Goal(stamp_ns=0, seq=1, pose=Pose(x=x, y=y)))
         if answer.state == "blocked" and not params.ends_with_status:
             raise UserError(answer.reason)
         bus.declare_alive(HARNESS_NAME)
@@ -179,7 +187,8 @@ def _record(watch: Watch, stack: Stack, params: LockstepRun, trace: RunTrace) ->
         if message is not None:
             _append(message, trace, end)
             if end is None and _is_final(message, trace, params):
-                end = message.stamp_ns
+                trace.ended_ns = message.stamp_ns
+                end = message.stamp_ns + params.scans_after_end * _period(trace)
         if len(trace.truths) + len(trace.beliefs) > count:
             last_progress = time.monotonic()
         elif message is None or isinstance(message, Health):
@@ -213,6 +222,11 @@ def _is_final(message: Stamped, trace: RunTrace, params: LockstepRun) -> bool:
     if isinstance(message, Status) and params.ends_with_status and message.goal_seq:
         return message.state == "reached" or message.refused
     return False
+
+
+def _period(trace: RunTrace) -> int:
+    """Time between scans in ns; 0 before the second scan."""
+    return trace.truths[1].stamp_ns - trace.truths[0].stamp_ns if len(trace.truths) > 1 else 0
 
 
 def _is_next(kept: Sequence[Stamped], message: Stamped) -> bool:

@@ -1,4 +1,4 @@
-"""Fills the tables of experiments.md, navigation.md and real_logs.md in docs/ from the JSON."""
+"""Fills the tables of README and the pages in docs/ from the JSON of the experiments."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ from typing import Any
 
 from common.errors import UserError
 from lab.experiments import results
+from lab.experiments.readme_tables import TABLES
 
 # Modules of the experiments. Each has a function `table`.
 MODULES = {
+    "accuracy": "lab.accuracy.report",
     "e1": "lab.paper.e1_localisation",
     "e2": "lab.paper.e2_crossing",
     "e3": "lab.paper.e3_navigation",
@@ -22,10 +24,11 @@ MODULES = {
     "aliasing": "lab.paper.aliasing",
     "prediction": "lab.paper.prediction",
     "navigation": "lab.navigation.experiment",
+    "docking": "lab.navigation.docking",
     "real": "lab.real_logs.experiment",
+    "integrity": "lab.integrity.report",
 }
 TABLE_MARKS = re.compile(r"(<!-- table (?P<name>[\w/.-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
-Summary = dict[str, dict[str, Any]]
 
 
 def table_of(name: str, folder: Path) -> str:
@@ -33,8 +36,10 @@ def table_of(name: str, folder: Path) -> str:
     kind = name.rsplit("/", maxsplit=1)[-1].partition("-")[0]  # navigation-unknown belongs to navigation
     if kind not in MODULES:
         raise UserError(f"no experiment {kind!r}: choose from {', '.join(MODULES)}")
-    table: Callable[[Summary], str] = import_module(MODULES[kind]).table
+    table: Callable[[Any], str] = import_module(MODULES[kind]).table
     result = results.read(folder / f"{name}.json")
+    if kind == "accuracy":
+        return table(result["rows"])
     return "\n\n".join([table(result["summary"]), *(f"{note[0].upper()}{note[1:]}" for note in result["notes"])])
 
 
@@ -42,6 +47,8 @@ def fill_tables(page: str, folder: Path) -> str:
     """Returns the page with every marked table replaced by the current results, without the notes below it."""
 
     def rows(name: str) -> str:
-        return "".join(f"{line}\n" for line in table_of(name, folder).splitlines() if line.startswith("|"))
+        table = TABLES[name](folder) if name in TABLES else table_of(name, folder)
+        lines = [line for line in table.splitlines() if line.startswith("|") or not line]
+        return "\n".join(lines).strip() + "\n"
 
     return TABLE_MARKS.sub(lambda m: f"{m[1]}{rows(m['name'])}{m[3]}", page)

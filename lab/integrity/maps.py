@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.geometry.occupancy_grid import OccupancyGrid
 from common.geometry.shapes import Circle, Obstacle
 from common.geometry.world import World
 from lab.accuracy.scenes import Scene
-from presage.learning.map_of_log import cells_of
 from services.estimator.precise.learning.calibration import Drive
+from services.mapper.slam.drive import Laser
+from services.mapper.slam.grid import grid_of_scans
 
 CELL_M, SCANS = 0.05, 300
 
@@ -43,5 +43,6 @@ def noisy_grid(scene: Scene) -> World:
 
 def grid_of(name: str, drive: Drive) -> World:
     """The world that an occupancy grid of 5 cm cells shows, built from scans with known poses."""
-    values, (x, y) = cells_of(drive, CELL_M)
-    return World.model_validate({"name": name, "grid": OccupancyGrid.of(values, CELL_M, (x, y, 0.0))})
+    laser = Laser(drive.angles, drive.mount, drive.range_max)
+    grid = grid_of_scans(drive.poses, drive.ranges, laser, CELL_M)
+    return World.model_validate({"name": name, "grid": grid})

@@ -21,6 +21,7 @@ from presage.terminal.output import make_folder
 ESTIMATORS = ("precise", "particle-filter", "amcl-defaults")
 HEADS = (
     "case",
+    "estimator",
     "trials",
     "tracking",
     "wrong of these",
@@ -42,14 +43,14 @@ of scans whose error along x, along y and in yaw exceeds the protection level.""
 
 
 def bench_integrity(plan: IntegrityPlan, out: Path, workers: int, console: Console) -> int:
-    """Runs the benchmark, prints a Markdown table for each estimator, and writes the results into ``out``."""
+    """Runs the benchmark, prints a Markdown table, and writes the results into ``out``."""
     _check(plan)
     make_folder(out, "--out")
     scores, rows = run(plan, out, workers, console)
     parameters = asdict(plan)
     title = "Integrity: whether an estimator is right about itself"
     result = Result("integrity", title, plan.seed, parameters, scores, trials=rows, notes=[" ".join(LEGEND.split())])
-    text = "\n\n".join([*(f"{name}\n\n{table(own)}" for name, own in scores.items()), LEGEND]) + "\n"
+    text = f"{table(scores)}\n\n{LEGEND}\n"
     (out / "integrity.md").write_text(text, encoding="utf-8")
     files = result.write(out, reliability_diagram(scores))
     print(text)
@@ -69,8 +70,13 @@ def _check(plan: IntegrityPlan) -> None:
 
 
 def table(scores: dict[str, dict[str, Any]]) -> str:
-    """The Markdown table of one estimator."""
-    return markdown(HEADS, [[name, *_cells(row)] for name, row in scores.items()])
+    """The Markdown table, with a row for each case and estimator."""
+    cases = list(dict.fromkeys(case for own in scores.values() for case in own))
+    cases = cases[:1] if cases[1:] == ["all"] else cases
+    return markdown(
+        HEADS,
+        [[case, name, *_cells(own[case])] for case in cases for name, own in scores.items() if case in own],
+    )
 
 
 def _cells(row: dict[str, Any]) -> list[str]:

@@ -5,8 +5,9 @@ Definitions:
 - A scan with a contact counts as moving if the true speed is above `MIN_MOVING_SPEED` before or after it.
 - The path ratio is the driven length, plus the straight distance left to the goal, divided by the length of the
   shortest path with clearance (`shortest_path`). Stopping short of the goal therefore gains nothing.
-- The time ratio is the time from the first scan until the controller reports `reached`, divided by `least_trip`.
-  `time_over_bound` divides by the time of a base that need not turn, a lower bound for every drive.
+- The time ratio is the time from the first scan until the controller reports `reached`, divided by a lower bound for
+  every drive: at full speed around the corners of the shortest path, without a turn or a stop.
+- The distance left to the goal is that of the true pose once the robot stands.
 """
 
 from __future__ import annotations
@@ -21,15 +22,15 @@ import shapely
 
 from common.geometry.se2 import Array
 from common.geometry.world import World
-from common.messages.definitions import Goal, Pose, Truth
+from common.messages.definitions import GOAL_TOLERANCE_M, Truth
 from common.robot.base import Robot
+from lab.experiments.journeys import least_time
 from lab.experiments.lockstep import RunTrace
-from lab.navigation.shortest_path import Trip, least_trip, length
+from lab.navigation.shortest_path import Trip, length
 from services.simulator.people import PERSON_RADIUS_M as PERSON_RADIUS
 
 MIN_MOVING_SPEED = 0.01  # m/s
-TOLERANCE = float(Goal(stamp_ns=0, pose=Pose(x=0, y=0)).tolerance)  # m
-MAX_REACHED_DISTANCE = TOLERANCE + 0.1  # m; farther from the goal, a reported arrival is wrong
+MAX_REACHED_DISTANCE = GOAL_TOLERANCE_M  # m; if the robot stands farther from the goal, a reported arrival is wrong
 MAX_EVENTS = 200  # stored per trial
 
 
@@ -38,8 +39,7 @@ def measure(trace: RunTrace, trip: Trip, world: World, robot: Robot) -> dict[str
     path, seconds = trace.path(), _seconds(trace)
     distance_left = float(np.hypot(*(path[-1, :2] - np.array(trip.goal))))
     shortest, driven = length(np.array(trip.shortest)), length(path)
-    holonomic_robot = robot.model_copy(update={"drive": "holonomic"})
-    least, bound = (least_trip(trip.shortest, trip.start[2], each, TOLERANCE) for each in (robot, holonomic_robot))
+    least = least_time(shortest, robot, GOAL_TOLERANCE_M)
     outcome = _outcome(trace, distance_left)
     return {
         "outcome": outcome,
@@ -51,8 +51,7 @@ def measure(trace: RunTrace, trip: Trip, world: World, robot: Robot) -> dict[str
         "driven_m": driven,
         "path_over_shortest": (driven + distance_left) / shortest,
         "least_s": least,
-        "time_over_least": seconds / least,
-        "time_over_bound": seconds / bound,
+        "time_over_bound": seconds / least,
         **_contacts(trace),
         "held_back": sum(truth.stopped for truth in trace.truths),  # scans, by the obstacle stop
         "clearance_m": float(_clearance(world, path).min()) - robot.radius,
@@ -68,7 +67,7 @@ def measure(trace: RunTrace, trip: Trip, world: World, robot: Robot) -> dict[str
 
 
 def _seconds(trace: RunTrace) -> float:
-    return trace.truths[-1].stamp_ns * 1e-9
+    return (trace.truths[-1].stamp_ns if trace.ended_ns is None else trace.ended_ns) * 1e-9
 
 
 def _outcome(trace: RunTrace, distance_left: float) -> str:

@@ -17,6 +17,7 @@ from rich.console import Console
 
 from common.errors import UserError
 from common.geometry.world import load_world
+from common.messages.definitions import GOAL_TOLERANCE_M
 from common.robot.base import Robot
 from common.robot.scanner import SCANNERS
 from lab.experiments import results
@@ -25,7 +26,7 @@ from lab.experiments.lockstep import LockstepRun, session
 from lab.experiments.lockstep import run as run_in_lockstep
 from lab.experiments.trials import run_trials
 from lab.navigation import figure as driving_figure
-from lab.navigation.drive import MAX_REACHED_DISTANCE, TOLERANCE, measure
+from lab.navigation.drive import MAX_REACHED_DISTANCE, measure
 from lab.navigation.shortest_path import MIN_TRIP_LENGTH, START_GOAL_MARGIN, WALL_GAP, draw_trip, load_shortest_paths
 
 EXPERIMENT_ID = 7  # part of the random seeds
@@ -36,10 +37,11 @@ OPTION_VALUES = {
     "estimator": ("precise", "particle-filter"),
     "prior": ("motion", "odometry"),
 }
+SCANS_TO_STAND = 15  # 1 s; when the goal is reached, the robot is about to stop
 WORST_TRIALS = 5  # trials named in the summary
 QUANTITIES = {  # statistics over the trials that reached the goal; the other trials are listed under `worst`
     "path_over_shortest": ("median", "max"),
-    "time_over_least": ("median", "max"),
+    "left_m": ("median", "max"),
     "seconds": ("median", "max"),
     "time_over_bound": ("median", "max"),
     "untracked_s": ("median", "max"),
@@ -66,6 +68,7 @@ class NavigationJob:
     estimator: str = "precise"
     prior: str = "motion"
     epistemic: bool = True
+    sweep: bool = False  # whether motion distorts the scans
     beams: int = 622
     limit: float = 120.0  # s of simulated time
 
@@ -88,8 +91,10 @@ class NavigationJob:
             round(self.limit * SCANNERS["tim571"].rate),
             controller=("--preset", "geodesic", "--drive", self.drive, epistemic_option),
             simulator=("--drive", self.drive, *people),
+            sweep=self.sweep,
             start_known=self.start == "known",
             ends_with_status=True,
+            scans_after_end=SCANS_TO_STAND,
         )
 
 
@@ -123,6 +128,7 @@ def result_name(job: NavigationJob, worlds: Sequence[str], drives: Sequence[str]
         *([job.estimator] if job.estimator != NavigationJob.estimator else []),
         *([job.prior] if job.prior != NavigationJob.prior else []),
         *([] if job.epistemic else ["no-epistemic"]),
+        *(["sweep"] if job.sweep else []),
         *([f"beams{job.beams}"] if job.beams != NavigationJob.beams else []),
     ]
     return "-".join(["navigation", *parts])
@@ -179,7 +185,7 @@ def _reasons(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
 def worst(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """The worst trials: first those that did not reach the goal, then those with contacts, then the slowest."""
     order = sorted(
-        rows, key=lambda r: (r["reached"], -r["contacts_moving"], -r["contacts_standing"], -r["time_over_least"])
+        rows, key=lambda r: (r["reached"], -r["contacts_moving"], -r["contacts_standing"], -r["time_over_bound"])
     )
     return [
         {"trial": row["trial"], "outcome": row["outcome"], "why": _describe_trial(row)} for row in order[:WORST_TRIALS]
@@ -193,7 +199,7 @@ def _describe_trial(row: dict[str, Any]) -> str:
         where = f"{first['s']:g} s, ({first['x']:.2f}, {first['y']:.2f}), {first['speed']:.2f} m/s"
         parts.append(f"touched something in {touched} scans, first at {where}")
     if row["reached"]:
-        parts.append(f"{row['time_over_least']:.2f} times the least time, {row['path_over_shortest']:.2f} the way")
+        parts.append(f"{row['time_over_bound']:.2f} times the least time, {row['path_over_shortest']:.2f} the way")
         seconds_by_reason = {reason: s for reason, s in row["reason_s"].items() if not reason.startswith("reached")}
         if seconds_by_reason:
             longest = max(seconds_by_reason, key=lambda reason: seconds_by_reason[reason])
@@ -224,7 +230,7 @@ def run(
         "worlds": list(worlds),
         "drives": list(drives),
         "trials": trials,
-        "tolerance_m": TOLERANCE,
+        "tolerance_m": GOAL_TOLERANCE_M,
         "truly_m": MAX_REACHED_DISTANCE,
         "apart_m": MIN_TRIP_LENGTH,
         "spare_m": START_GOAL_MARGIN,

@@ -27,6 +27,7 @@ def describe(job: NavigationJob) -> str:
     parts += [f"{job.people} people at {job.people_speed:g} m/s"] if job.people else []
     parts += [f"prior {job.prior}"] if job.prior != "motion" else []
     parts += [] if job.epistemic else ["without the epistemic term"]
+    parts += ["scans distorted by motion"] if job.sweep else []
     return ", ".join(parts)
 
 
@@ -56,7 +57,7 @@ def draw(by_group: Mapping[str, Rows], worlds: Mapping[str, str], title: str) ->
     )
     for axes, quantity, label in (
         (left, "path_over_shortest", "path over the shortest way with clearance"),
-        (right, "time_over_least", "time over the least time"),
+        (right, "time_over_bound", "time over the least time"),
     ):
         _distribution(drawing.style_axes(axes), by_group, quantity, label)
     drawing.legend_below(figure, left)
@@ -105,6 +106,7 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
     """The Markdown table of docs/navigation.md. Pairs are median; maximum, of the step time mean; maximum."""
     number, mm = results.number, results.millimetres
     people = any(row["min_clearance_to_people_m"] is not None for row in summary.values())
+    measured_left = all("median_left_m" in row for row in summary.values())  # not in results before November 2026
     heads = [
         "world, drive",
         "reached",
@@ -112,6 +114,7 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
         "contacts moving; standing",
         "path / shortest",
         "time / least",
+        *(["distance left (mm)"] if measured_left else []),
         "gap (m)",
         *(["to people (m)"] if people else []),
         "error (mm)",
@@ -124,7 +127,8 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
             str(row["trials_claimed_elsewhere"]),
             f"{row['trials_with_contact_moving']}; {row['trials_with_contact_standing']}",
             f"{number(row['median_path_over_shortest'])}; {number(row['max_path_over_shortest'])}",
-            f"{number(row['median_time_over_least'])}; {number(row['max_time_over_least'])}",
+            f"{number(row['median_time_over_bound'])}; {number(row['max_time_over_bound'])}",
+            *([f"{mm(row['median_left_m'])}; {mm(row['max_left_m'])}"] if measured_left else []),
             number(row["min_clearance_m"]),
             *([number(row["min_clearance_to_people_m"])] if people else []),
             f"{mm(row['median_error_median_m'])}; {mm(row['max_error_max_m'])}",

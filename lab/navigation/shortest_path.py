@@ -1,4 +1,4 @@
-"""Shortest path and least time.
+"""Shortest paths.
 
 An exact computation, independent of the controller's planner: Dijkstra's algorithm on the visibility graph of free
 space shrunk by the robot's radius and a gap (Lozano-Perez and Wesley 1979). The round corners of the shrunk space are
@@ -17,10 +17,9 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from common.errors import UserError
-from common.geometry.se2 import Array, wrap
+from common.geometry.se2 import Array
 from common.geometry.world import World, load_world
 from common.robot.base import Robot
-from lab.experiments.journeys import least_time
 
 ARC_TOLERANCE = 1e-3  # m, error of the polygons that replace arcs
 WALL_GAP = 0.03  # m between the footprint and the walls along the shortest path
@@ -161,24 +160,3 @@ def draw_trip(world: str, rng: np.random.Generator, robot: Robot, apart: float =
 def _inside(place: Array, room: tuple[float, float, float, float]) -> bool:
     x0, y0, x1, y1 = room
     return bool(x0 <= place[0] <= x1 and y0 <= place[1] <= y1)
-
-
-def least_turn(angle: float, robot: Robot) -> float:
-    """Minimum time in s to turn on the spot by ``angle`` rad, starting and ending at rest."""
-    w, a = robot.max_turn, robot.turn_acceleration
-    away = abs(angle)
-    return float(2 * np.sqrt(away / a)) if away < w**2 / a else away / w + w / a
-
-
-def least_trip(path: npt.ArrayLike, heading: float, robot: Robot, tolerance: float) -> float:
-    """Minimum time in s from standstill until ``tolerance`` m before the end of a path (K, 2).
-
-    The robot accelerates, keeps full speed around every corner and need not stop at the end. A differential base first
-    turns on the spot into the direction of the path.
-    """
-    along = np.asarray(path, float)
-    seconds = least_time(length(along), robot, tolerance)
-    if robot.drive == "differential":
-        x, y = along[1] - along[0]
-        seconds += least_turn(float(wrap(np.arctan2(y, x) - heading)), robot)
-    return seconds

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from common.geometry.ros_map_writer import write_grid
 from common.geometry.world import load_world
 from lab.real_logs.drive import (
     GLOBAL,
@@ -32,9 +33,9 @@ from lab.real_logs.drive import (
     StretchJob,
     trial,
 )
-from presage.learning.grid_map import write_map
-from presage.learning.map_of_log import cells_of
 from services.estimator.precise.motion_model import MotionNoise
+from services.mapper.slam.drive import Laser
+from services.mapper.slam.grid import grid_of_scans
 
 TRACKING_CANDIDATES: dict[str, tuple[float, ...]] = {
     "amcl_defaults": (1.0,),
@@ -149,8 +150,9 @@ def _map_of_quarter(job: StretchJob, quarter: int, folder: Path) -> Path:
     """Writes a ROS map of the first ``quarter`` scans, with the cell size of the job's map. Returns its path."""
     grid = load_world(job.map).grid
     cell = grid.resolution if grid is not None else CELL_SIZE
-    values, (x, y) = cells_of(job.drive.part(np.arange(quarter)), cell)
-    return write_map(folder, values, name="quarter", image="quarter.pgm", resolution=cell, origin=[x, y, 0.0])
+    drive = job.drive.part(np.arange(quarter))
+    laser = Laser(drive.angles, drive.mount, drive.range_max)
+    return write_grid(folder, "quarter", grid_of_scans(drive.poses, drive.ranges, laser, cell))
 
 
 def _evenly_spaced(job: StretchJob, first: int, last: int, count: int) -> list[int]:

@@ -42,7 +42,13 @@ def goal(
         float | None, typer.Argument(parser=_number, help="Heading at the goal, deg. Defaults to any heading.")
     ] = None,
     yaw_option: Annotated[float | None, typer.Option("--yaw", hidden=True)] = None,
-    tolerance: Annotated[float, typer.Option(min=0.01, help="Distance at which the goal counts as reached, m.")] = 0.2,
+    tolerance: Annotated[
+        float, typer.Option(min=0.001, help="Distance at which the goal counts as reached, m.")
+    ] = 0.02,
+    yaw_tolerance: Annotated[float, typer.Option(min=0.1, max=180, help="Tolerance of the heading, deg.")] = 5.7,
+    approach: Annotated[
+        float | None, typer.Option(help="Direction of motion over the last 0.6 m, deg. Defaults to any direction.")
+    ] = None,
     wait: Annotated[
         bool, typer.Option("--wait", help="Wait until the goal is reached, refused, or blocked for 30 s.")
     ] = False,
@@ -50,7 +56,8 @@ def goal(
 ) -> None:
     """Send the robot to a goal, or cancel its goal.
 
-    Examples: `presage goal 15 1.5 --wait`; `presage goal 15 1.5 90`; `presage goal --cancel`.
+    Examples: `presage goal 15 1.5 --wait`; `presage goal 15 1.5 90`; `presage goal --cancel`. To dock within 3 mm and
+    0.5 degrees: `presage goal 15 1.5 90 --approach 90 --tolerance 0.003 --yaw-tolerance 0.5`.
     """
     from common.messages.definitions import Goal
     from presage.live.commands import send_goal
@@ -58,6 +65,8 @@ def goal(
     if not cancel and (x is None or y is None):
         raise UserError("a goal is two numbers, X Y in m (or --cancel)")
     yaw = yaw_option if yaw is None else yaw
+    if approach is not None and not np.isfinite(approach):
+        raise UserError(f"--approach {approach}: a finite number is needed, in deg")
     if not np.isfinite(tolerance):
         raise UserError(f"--tolerance {tolerance}: a finite number is needed, in m")
     # The time as sequence number distinguishes this goal from those of other clients in the controller's status.
@@ -66,7 +75,8 @@ def goal(
         seq=time.time_ns(),
         pose=_pose(x or 0.0, y or 0.0, yaw or 0.0),
         tolerance=tolerance,
-        yaw_tolerance=None if yaw is None else 0.1,
+        yaw_tolerance=None if yaw is None else float(np.deg2rad(yaw_tolerance)),
+        approach=None if approach is None else float(se2.wrap(np.deg2rad(approach))),
         cancel=cancel,
     )
     raise typer.Exit(send_goal(chosen_link(context), request, console, wait=wait))
@@ -102,18 +112,18 @@ def relocalise(
         float | None, typer.Argument(help="x in the map, m. Defaults to the estimator's initial pose.")
     ] = None,
     y: Annotated[float | None, typer.Argument(help="y in the map, m.")] = None,
-    yaw: Annotated[float, typer.Argument(parser=_number, help="Heading, deg.")] = 0.0,
+    yaw: Annotated[float | None, typer.Argument(parser=_number, help="Heading, deg. Defaults to any heading.")] = None,
 ) -> None:
     """Reset the estimator and localise again, near a given position or globally.
 
-    Examples: `presage relocalise`; `presage relocalise 3 1.5`.
+    Examples: `presage relocalise`; `presage relocalise 3 1.5`; `presage relocalise 3 1.5 90`.
     """
     from presage.live.commands import relocalise as run
 
     if (x is None) != (y is None):
         raise UserError("a position is two numbers, X Y in m")
-    pose = _pose(x, y, yaw) if x is not None and y is not None else None
-    run(chosen_link(context), pose, console)
+    pose = _pose(x, y, yaw or 0.0) if x is not None and y is not None else None
+    run(chosen_link(context), pose, console, heading_known=yaw is not None)
 
 
 def _pose(x: float, y: float, yaw: float = 0.0) -> Pose:

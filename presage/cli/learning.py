@@ -42,7 +42,7 @@ def train(
         int | None,
         typer.Option(
             min=10,
-            help="Simulated scans. Defaults to 5000 (precise), 13000 (paper) or 2000 (with --from).",
+            help="Simulated scans. Defaults to 5000 or 10 per m² (precise), 13000 (paper) or 2000 (with --from).",
         ),
     ] = None,
     seed: Seed = None,
@@ -97,7 +97,7 @@ def train(
     if preset == "precise":
         recipe = Recipe(tuning.resolution or 0.04, seed=seed)
         precise.train_precise(
-            precise.TrainPreciseOptions(world, chosen, tuple(simulator), folder, samples or 5000, recipe), link, console
+            precise.TrainPreciseOptions(world, chosen, tuple(simulator), folder, samples, recipe), link, console
         )
     else:
         from presage.learning import train_paper as paper  # imports torch, which need not be installed
@@ -125,24 +125,39 @@ def map_(
         str, typer.Option(help="slam: computed from the scans and odometry; reference: the log's own.")
     ] = "slam",
     odometry: Annotated[bool, typer.Option(help="Whether slam uses the log's odometry.")] = True,
+    refine: Annotated[
+        str, typer.Option(help="Rough map or floor plan whose frame and unvisited parts the new map keeps.")
+    ] = "",
+    learn: Annotated[bool, typer.Option(help="Whether to learn the model of preset precise as well.")] = True,
+    models: Annotated[
+        Path | None, typer.Option(help="Folder for its weights. Defaults to the folder the services read.")
+    ] = None,
     mount: MountText = "",
     config: Config = None,
 ) -> None:
     """Build a ROS map from a drive: NAME.yaml and .pgm, the trajectory NAME.tum and a picture NAME.png.
 
-    The poses come from the scans themselves (SLAM), or with `--poses reference` from the log.
+    The poses come from the scans themselves (SLAM), or with `--poses reference` from the log. The model that predicts
+    the scans is learned at these poses, so that the map can be used at once.
+
+    With --refine, the new map has the frame of a rough one, such as a ROS map of 5 cm cells or a floor plan without
+    furniture, and its cells where the drive saw nothing.
 
     A cell is occupied if beams of at least two scans ended in it, and of at least 60 % of the scans that observed it.
     It is free if a beam passed through it, otherwise unknown.
 
-    Examples: `presage map run.mcap`; `presage map fr079.npz --mount 0,0,0 --poses reference --half first
-    -o first_half.yaml`, then
+    Examples: `presage map run.mcap -o here.yaml`, then `presage up --world here.yaml`;
+    `presage map run.mcap --refine rough.yaml -o fine.yaml`;
+    `presage map fr079.npz --mount 0,0,0 --poses reference --half first --no-learn -o first_half.yaml`, then
     `presage experiment real --log fr079.npz --mount 0,0,0 --world first_half.yaml`.
     """
     from common.runtime.config import load_section
     from presage.learning.map_of_log import MapOptions, map_command
     from presage.logs.options import LogSettings
+    from services.estimator.shared.model_folder import training_folder
 
+    folder = (models or training_folder()) if learn else None
     target = out or Path(f"{log.resolve().name.split('.')[0]}.yaml")
     reading = load_section(LogSettings, config, "log", mount=mount).reading()
-    map_command(MapOptions(log, target, half, cell, reading, poses, odometry), console, err_console)
+    options = MapOptions(log, target, half, cell, reading, poses, odometry, refine, folder)
+    map_command(options, console, err_console)

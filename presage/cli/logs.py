@@ -46,7 +46,9 @@ def localize(
             " scan independently of the others."
         ),
     ] = "global",
-    initial_pose: Annotated[str, typer.Option(help="Initial pose for mode track, x,y[,yaw_deg], in m and deg.")] = "",
+    initial_pose: Annotated[
+        str, typer.Option(help="Initial pose for mode track, x,y[,yaw_deg], in m and deg; any heading without yaw.")
+    ] = "",
     start: Annotated[
         float | None, typer.Option(min=0.0, help="Skip the scans of this many seconds at the beginning.")
     ] = None,

@@ -83,6 +83,9 @@ def up(
     ] = None,
     seed: Seed = None,
     record: Annotated[Path | None, typer.Option(help="Record into this folder.")] = None,
+    mapping: Annotated[
+        bool, typer.Option("--mapping", help="Map an unknown building by driving through it by hand (docs/mapping.md).")
+    ] = False,
     port: Annotated[
         int,
         typer.Option(min=0, max=65535, help="TCP port of the router on 127.0.0.1. 0 chooses a free port."),
@@ -103,6 +106,7 @@ def up(
 
     Examples: `presage up`, then in another terminal `presage goal 15 1.5 --wait`;
     `presage up --world office --people 10 --record recordings --seed 7`; `presage up --estimator particle-filter`;
+    `presage up --world office --mapping`;
     `presage up --robots 3`, then `presage --robot robot-2 goal 15 1.5`; `presage up --config turtlebot.yaml`.
     """
     from presage.session.up import UpOptions, run_up
@@ -122,6 +126,7 @@ def up(
         robots=robots,
         record=record,
         port=port,
+        mapping=mapping,
         without=frozenset(name for name, left in left_out.items() if left),
         open_page=open_page,
     )

@@ -15,6 +15,7 @@ from presage.diagnosis.findings import Finding
 PACKAGES_OF_SERVICES = {
     "simulator": ("scipy",),
     "estimator": ("safetensors", "numba", "scipy"),
+    "mapper": ("numba", "scipy", "PIL"),
     "controller": ("scipy",),
     "recorder": ("mcap", "zstandard", "lz4"),
 }

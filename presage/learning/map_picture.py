@@ -8,20 +8,20 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from common.geometry.occupancy_grid import FREE, OCCUPIED, Cells
+from common.geometry.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from common.geometry.se2 import Array
 
 
-def draw_map(png: Path, values: Cells, origin: tuple[float, float], cell: float, poses: Array) -> None:
-    """Draws cells (rows, columns) of ``cell`` m, and the places of poses (N, 3)."""
-    rows, columns = values.shape
+def draw_map(png: Path, grid: OccupancyGrid, poses: Array) -> None:
+    """Draws a grid with a yaw of 0, and the places of poses (N, 3)."""
+    values, rows, columns = grid.values, grid.height, grid.width
     size = 12 / max(rows, columns)
     figure = Figure(figsize=(max(4, columns * size), max(4, rows * size)), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
     grey = np.select([values == FREE, values == OCCUPIED], [1.0, 0.0], 0.8)
-    extent = (origin[0], origin[0] + columns * cell, origin[1], origin[1] + rows * cell)
-    axes.imshow(grey, origin="lower", extent=extent, cmap="gray", vmin=0, vmax=1, interpolation="antialiased")
+    (x0, y0), (x1, y1) = grid.corners()[0], grid.corners()[2]
+    axes.imshow(grey, origin="lower", extent=(x0, x1, y0, y1), cmap="gray", vmin=0, vmax=1, interpolation="antialiased")
     axes.plot(poses[:, 0], poses[:, 1], color="#0072B2", linewidth=0.6)
     axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
     figure.savefig(png, dpi=150)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +14,12 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from common.errors import UserError
 from common.geometry import se2
+from common.geometry.se2 import Array
 from common.geometry.world import World, load_world
 from common.robot.base import Robot
+from common.robot.motion_distortion import beam_times, correct_beams, evenly_spaced
 from common.robot.ranges import is_surface
+from common.robot.scan_geometry import Sweep
 from common.robot.scanner import Scanner
 from common.versions import commit, versions
 from presage.learning.drive_figure import draw_learned
@@ -40,7 +43,7 @@ class TrainDriveOptions:
     log: Path
     world: str = ""  # a map, in which scans are simulated for the places that the drive did not observe
     out: Path = field(default_factory=training_folder)
-    samples: int = 2000  # number of simulated scans in the map
+    samples: int = 2000  # number of simulated scans in the map; may be 0
     recipe: Recipe = Recipe(resolution=0.05)  # noqa: RUF009 - frozen
     share: float = 1.0  # of the drive to use, from its beginning
     reading: Reading | None = None  # properties of the log that the file does not state
@@ -54,7 +57,11 @@ def train_from_drive(options: TrainDriveOptions, console: Console) -> Path:
     scans = read_scans(options.log, reading=options.reading)
     scans.print_notes(console)
     drive = drive_of(scans, options.log)
-    drive, _ = split(drive, options.share)
+    return train_on_drive(options, split(drive, options.share)[0], console)
+
+
+def train_on_drive(options: TrainDriveOptions, drive: Drive, console: Console) -> Path:
+    """Trains a model on posed scans that were read from ``options.log``, as `train_from_drive` does."""
     if len(drive.ranges) < MIN_SCANS:
         raise UserError(
             f"{options.log}: {len(drive.ranges)} scans with a reference pose; training needs at least {MIN_SCANS}"
@@ -62,6 +69,7 @@ def train_from_drive(options: TrainDriveOptions, console: Console) -> Path:
     world = load_world(options.world) if options.world else rectangle(drive, options.log)
     path = weights.path_of(options.out, world.name)
     weights.refuse_to_overwrite(path, world)
+    uses_map = bool(options.world and options.samples)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     start = time.monotonic()
     with Progress(*columns, console=console) as bar:
@@ -70,7 +78,7 @@ def train_from_drive(options: TrainDriveOptions, console: Console) -> Path:
         def report(title: str, done: float) -> None:
             bar.update(task, description=f"training: {title}", completed=done)
 
-        simulated = simulated_beams(world, drive, options.samples, options.recipe.seed) if options.world else None
+        simulated = simulated_beams(world, drive, options.samples, options.recipe.seed) if uses_map else None
         learned = learn_drive(drive, options.recipe, simulated, report)
     card = card_of(options, world, drive, learned, time.monotonic() - start)
     weights.save(path, learned.model, learned.places, card)
@@ -82,7 +90,7 @@ def train_from_drive(options: TrainDriveOptions, console: Console) -> Path:
 
 
 def drive_of(scans: Scans, log: Path) -> Drive:
-    """The scans with a reference pose; raises UserError if there are none, or if they have no stamps."""
+    """The scans with a reference pose, corrected for motion; raises UserError if there are none, or no stamps."""
     if scans.truth is None or not np.isfinite(scans.truth).all(axis=1).any():
         raise UserError(
             f"{log}: no reference poses, but training on a drive needs the pose of each scan in the map: use an .npz "
@@ -104,7 +112,22 @@ def drive_of(scans: Scans, log: Path) -> Drive:
         scans.geometry.range_max,
         odom,
     )
-    return whole.part(use)
+    drive = whole.part(use)
+    return replace(drive, ranges=_corrected_ranges(drive, scans.time_increment)) if scans.time_increment else drive
+
+
+def _corrected_ranges(drive: Drive, time_increment: float) -> Array:
+    """Ranges (N, B) m as if all beams of a scan had been measured at its stamp."""
+    sweep, times = Sweep.of_angles(drive.angles), beam_times(len(drive.angles), time_increment)[:, None]
+    motion, period = se2.between(drive.poses[:-1], drive.poses[1:]), np.diff(drive.stamps)
+    # A sweep takes place after its stamp. Without time between two stamps, the velocity is unknown.
+    velocities = np.zeros(drive.poses.shape)
+    velocities[:-1] = motion / np.where(period > 0, period, np.inf)[:, None]
+    corrected = (
+        correct_beams(ranges, drive.angles, times * velocity, drive.mount)
+        for ranges, velocity in zip(drive.ranges, velocities, strict=True)
+    )
+    return np.array([evenly_spaced(*each, sweep, -np.inf) for each in corrected])
 
 
 def split(drive: Drive, share: float = 0.5) -> tuple[Drive, Drive]:
@@ -159,7 +182,7 @@ def card_of(
     """The model card: the origin of the model and the results of its calibration."""
     calibration, errors = learned.calibration, learned.errors
     source = f"{len(drive.ranges)} posed scans of {options.log.name}"
-    if options.world:
+    if options.world and options.samples:
         source = f"{source}; elsewhere {options.samples} simulated scans in map {world.name}"
     return weights.FieldCard(
         world=world,

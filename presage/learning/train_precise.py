@@ -35,6 +35,8 @@ from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.model_folder import training_folder
 
 TEST_SAMPLES = 500
+MIN_SAMPLES, SAMPLES_PER_M2 = 5000, 10  # training scans; the error depends on the number of beams that meet a surface
+BEAMS_PER_SAMPLE = 400  # of a sweep
 
 
 @dataclass(frozen=True)
@@ -45,8 +47,13 @@ class TrainPreciseOptions:
     scanner: Scanner = SCANNERS["tim571"]
     simulator_arguments: tuple[str, ...] = ()  # that select the scanner
     out: Path = field(default_factory=training_folder)
-    samples: int = 5000
+    samples: int | None = None  # defaults to `default_samples`
     recipe: Recipe = Recipe()  # noqa: RUF009 - frozen
+
+
+def default_samples(world: World) -> int:
+    """Number of training scans, by the free area: so many that large worlds are learned about as exactly as small."""
+    return max(MIN_SAMPLES, round(SAMPLES_PER_M2 * world.free_area))
 
 
 def train_precise(options: TrainPreciseOptions, link: Link, console: Console) -> Path:
@@ -58,7 +65,7 @@ def train_precise(options: TrainPreciseOptions, link: Link, console: Console) ->
     path = weights.path_of(options.out, world.name)
     weights.refuse_to_overwrite(path, world)
     rng = np.random.default_rng(options.recipe.seed)
-    counts = {"train": options.samples, "test": TEST_SAMPLES}
+    counts = {"train": options.samples or default_samples(world), "test": TEST_SAMPLES}
     poses = {name: world.sample_poses(count, rng, Robot().radius) for name, count in counts.items()}
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console) as bar:
@@ -92,7 +99,7 @@ def learn_and_save(
     seconds = time.monotonic() - start
     visited = se2.compose(poses["train"], np.array(options.scanner.mount))[:, :2]
     places = seed_places(model.field, visited)
-    card = _card(options, world, model, quality, seconds)
+    card = _card(options, world, len(poses["train"]), model, quality, seconds)
     weights.save(path, model, places, card)
     return card
 
@@ -107,7 +114,9 @@ def _train(
     def report(title: str, done: float) -> None:
         bar.update(task, description=f"training: {title}", completed=0.9 * done)
 
-    field = learn_field(Beams.of(poses["train"], mount, angles, scans["train"]), options.recipe, report)
+    beams_per_sweep = max(options.recipe.beams_per_sweep, BEAMS_PER_SAMPLE * len(scans["train"]))
+    recipe = replace(options.recipe, beams_per_sweep=beams_per_sweep)
+    field = learn_field(Beams.of(poses["train"], mount, angles, scans["train"]), recipe, report)
     # The weights are stored in half precision, so that the model is evaluated with the same precision.
     field = replace(field, phi=field.phi.astype(np.float16).astype(np.float32))
     report("precision", 1.0)
@@ -130,12 +139,12 @@ def _train(
 
 
 def _card(
-    options: TrainPreciseOptions, world: World, model: FieldModel, quality: Quality, seconds: float
+    options: TrainPreciseOptions, world: World, samples: int, model: FieldModel, quality: Quality, seconds: float
 ) -> weights.FieldCard:
     return weights.FieldCard(
         world=world,
         scanner=options.scanner,
-        samples=options.samples,
+        samples=samples,
         seed=options.recipe.seed,
         resolution=options.recipe.resolution,
         origin=model.field.origin,

@@ -8,6 +8,7 @@ from collections import defaultdict
 from typing import Any
 
 import numpy as np
+from pydantic import BaseModel
 from rich.console import Console
 from rich.table import Table
 
@@ -25,6 +26,7 @@ BLOCKED_TIMEOUT_S = 30.0
 # Without statuses from the controller: time until a note is printed, and until the command gives up.
 STATUS_WARNING_S, STATUS_TIMEOUT_S = 3.0, 30.0
 MIN_PROGRESS_M = 0.3  # a smaller decrease of the distance to the goal does not end a blockage
+MAX_TEXT = 200  # characters; longer texts are shortened
 
 
 def topic_named(name: str) -> Topic:
@@ -165,7 +167,7 @@ def show_rates(link: Link, name: str | None, seconds: float, console: Console) -
 
 
 def to_plain_values(message: Message, *, full: bool) -> dict[str, Any]:
-    """A message as values that JSON can hold; long arrays are shortened to both ends unless ``full``."""
+    """A message as values that JSON can hold; long arrays and texts are shortened to both ends unless ``full``."""
 
     def convert(value: Any) -> Any:
         if isinstance(value, np.ndarray):
@@ -174,8 +176,10 @@ def to_plain_values(message: Message, *, full: bool) -> dict[str, Any]:
             if full or len(numbers) <= 9:
                 return numbers
             return [*numbers[:3], f"... {len(numbers)} ...", *numbers[-3:]]
-        if isinstance(value, Message):
+        if isinstance(value, BaseModel):
             return {name: convert(getattr(value, name)) for name in type(value).model_fields}
+        if isinstance(value, str) and len(value) > MAX_TEXT and not full:
+            return f"{value[:10]} ... {len(value)} ... {value[-10:]}"
         return [convert(item) for item in value] if isinstance(value, list) else value
 
     result: dict[str, Any] = convert(message)
@@ -208,10 +212,10 @@ def echo(link: Link, name: str, count: int, console: Console, *, full: bool) -> 
     return 0
 
 
-def relocalise(link: Link, pose: Pose | None, console: Console) -> None:
+def relocalise(link: Link, pose: Pose | None, console: Console, *, heading_known: bool = True) -> None:
     """Resets the estimator's belief; raises UserError with the reason if the estimator refuses."""
     with session(link) as bus:
-        reply = bus.ask(LOCALISE, LocaliseRequest(pose=pose), Reply)
+        reply = bus.ask(LOCALISE, LocaliseRequest(pose=pose, heading_known=heading_known), Reply)
     if not reply.ok:
         raise UserError(f"refused: {reply.reason}")
     console.print("localising again " + (f"from ({pose.x:g}, {pose.y:g})" if pose else "from the initial pose"))

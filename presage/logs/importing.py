@@ -150,6 +150,7 @@ def write_recording(
             ranges=np.zeros(0, np.float32),
             mount=Pose.of(log.mount),
             scan_time=period,
+            time_increment=log.time_increment,
             sigma=options.sigma or 0.0,
         )
         for stamp_ns, logged in itertools.chain(first_scans, stamped):

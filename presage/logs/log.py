@@ -56,6 +56,7 @@ class Log:
     scans: int  # number of scans in the file, including unusable ones
     read: Callable[[], Iterator[LoggedScan]]  # reads from the beginning; raises UserError if the file is damaged
     range_min: float = 0.0  # m
+    time_increment: float = 0.0  # s between beams, as in a scan message
     mount_assumed: bool = False  # whether neither the log nor the user states the mount
     odometry: str = ""  # source of the odometry; empty if there is none
     reference: str = ""  # source of the reference poses; empty if there are none

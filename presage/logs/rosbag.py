@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from common.errors import UserError
 from common.geometry.se2 import Array
-from common.messages.ros_messages import Mount, stamp_of
+from common.messages.ros_messages import Mount, plausible_time_increment, stamp_of
 from common.robot.ranges import normalise_driver_ranges
 from presage.logs.frame_history import FrameHistory
 from presage.logs.log import Log, LoggedScan, Reading
@@ -95,7 +95,7 @@ def open_rosbag(path: Path, kind: Literal["ros1", "ros2"], reading: Reading) -> 
     base = poses.base(laser, topics.odom, reading.base_frame)
     mount = _mount(path, poses.frames, base, laser, reading, notes)
     try:
-        angles, _ = _angles(first, flipped=mount.upside_down)
+        angles, reverse = _angles(first, flipped=mount.upside_down)
     except ValueError as error:
         raise UserError(f"{path}: {error}") from None
     log = Log(
@@ -108,6 +108,7 @@ def open_rosbag(path: Path, kind: Literal["ros1", "ros2"], reading: Reading) -> 
         lambda: iter(()),
         float(first.range_min),
         notes=notes,
+        time_increment=plausible_time_increment(first) * (-1 if reverse else 1),
     )
     if not 0 < log.range_max < np.inf:
         raise UserError(

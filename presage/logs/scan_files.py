@@ -45,6 +45,7 @@ class Scans:
     commands: Array | None = None  # (N, 3) the last velocity command before each scan; NaN where there is none
     goals: Array | None = None  # (N, 3) the goal at each scan; NaN where there is none
     stamps_ns: npt.NDArray[np.int64] | None = None  # (N,) of a recording
+    time_increment: float = 0.0  # s between beams, as in a scan message
 
     def __len__(self) -> int:
         return len(self.ranges)
@@ -70,6 +71,7 @@ class Scans:
             geometry.sigma_relative,
             geometry.mount_assumed,
             row(self.truth),
+            time_increment=self.time_increment,
         )
 
     def __iter__(self) -> Iterator[LaserScan]:
@@ -154,6 +156,7 @@ def scans_of_log(log: Log) -> Scans:
         log.initial_pose,
         np.array(references) if log.reference else None,
         truth_is=log.reference or RECORDED_TRUTH,
+        time_increment=log.time_increment,
         notes=(*log.notes, *([f"left out: {left_out}"] if left_out else [])),
     )
 
@@ -207,6 +210,7 @@ def _read_recording(path: Path) -> Scans:
         commands=np.array(commands),
         goals=np.array(goals),
         stamps_ns=np.array([s.stamp_ns for s in scans], np.int64),
+        time_increment=first.time_increment,
     )
 
 

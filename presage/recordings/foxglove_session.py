@@ -32,6 +32,7 @@ from common.messages.definitions import (
     Drive,
     Goal,
     Health,
+    Map,
     Odom,
     Plan,
     Prediction,
@@ -127,6 +128,7 @@ class SessionConverter:
             Drive: self._drive,
             Plan: self._plan,
             Preference: self._preference,
+            Map: self._map,
         }
 
     def convert(self, topic: Topic, message: Stamped, raw: Raw) -> Iterator[FoxgloveMessage]:
@@ -209,6 +211,9 @@ class SessionConverter:
 
     def _preference(self, preference: Preference, ns: int, _: int) -> Iterator[tuple[str, Any]]:
         yield "/preference", shapes.preference_grid(preference, ns)
+
+    def _map(self, grown: Map, ns: int, _: int) -> Iterator[tuple[str, Any]]:
+        yield "/map", shapes.grown_map(grown, ns)
 
     def _status(self, status: Status, _: int, logged: int) -> Iterator[tuple[str, Any]]:
         yield "/status", numbers.of_status(status)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+import numpy.typing as npt
 import shapely
 from foxglove_schemas_protobuf.ArrowPrimitive_pb2 import ArrowPrimitive
 from foxglove_schemas_protobuf.Color_pb2 import Color
@@ -29,10 +30,11 @@ from foxglove_schemas_protobuf.Vector2_pb2 import Vector2
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.timestamp_pb2 import Timestamp
 
+from common.geometry import occupancy_grid
 from common.geometry import rasterize as raster
 from common.geometry.se2 import Array
 from common.geometry.world import World
-from common.messages.definitions import Belief, Hypothesis, Plan, Prediction, Preference, Scan
+from common.messages.definitions import Belief, Hypothesis, Map, Plan, Prediction, Preference, Scan
 from common.robot.ranges import is_surface
 
 TRUTH, BELIEF, GOAL = (0.0, 0.0, 0.0), (0.84, 0.37, 0.0), (0.0, 0.62, 0.45)  # RGB, as in `presage plot`
@@ -258,15 +260,33 @@ def grid(world: World, ns: int) -> Grid:
     """The map, with RGBA and occupancy (0 free, 100 occupied, 255 unknown) as one byte each."""
     (x0, y0), cell, x, y = raster.cell_centres(world)
     free, wall = raster.classify_points(world, x, y, cell)
-    columns = x.shape[1]
-    data = np.zeros((*x.shape, 5), np.uint8)
+    return _coloured_grid(free, wall, (x0, y0, 0.0), cell, ns)
+
+
+def grown_map(message: Map, ns: int) -> Grid:
+    """The map so far, like `grid`."""
+    values = message.grid.values
+    return _coloured_grid(
+        values == occupancy_grid.FREE,
+        values == occupancy_grid.OCCUPIED,
+        message.grid.origin,
+        message.grid.resolution,
+        ns,
+    )
+
+
+def _coloured_grid(
+    free: npt.NDArray[np.bool_], wall: npt.NDArray[np.bool_], origin: tuple[float, float, float], cell: float, ns: int
+) -> Grid:
+    columns = free.shape[1]
+    data = np.zeros((*free.shape, 5), np.uint8)
     data[..., 4] = 255
     data[free], data[wall] = (*FREE, 0), (*OCCUPIED, 100)
     names = ("red", "green", "blue", "alpha", "occupancy")
     return Grid(
         timestamp=time_of(ns),
         frame_id="map",
-        pose=pose((x0, y0, 0.0), -0.01),  # below everything else
+        pose=pose(origin, -0.01),  # below everything else
         column_count=columns,
         cell_size=Vector2(x=cell, y=cell),
         row_stride=columns * len(names),

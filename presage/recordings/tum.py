@@ -16,7 +16,6 @@ import numpy as np
 from rich.console import Console
 
 from common.errors import UserError
-from common.geometry.se2 import Array
 from common.messages.definitions import Belief, Odom, Truth
 from common.messages.topics import BELIEF, ODOM, TRUTH
 from presage.recordings.selection import entries, keys_of, refuse_to_overwrite, robot_of, with_progress
@@ -58,14 +57,6 @@ class Trajectory:
         stream = self._stack.enter_context((self.folder / self._file).open("w", encoding="ascii"))
         stream.write(f"# base_link in {FRAMES[self.name]}: timestamp x y z qx qy qz qw\n")
         return stream
-
-
-def write_tum(path: Path, stamps: Array, poses: Array) -> None:
-    """Writes poses (N, 3) at ``stamps`` (N,) s."""
-    x, y, yaw = poses.T
-    zero = np.zeros(len(x))
-    rows = np.column_stack([stamps, x, y, zero, zero, zero, np.sin(yaw / 2), np.cos(yaw / 2)])
-    np.savetxt(path, rows, fmt="%.9f", header="base_link in map: timestamp x y z qx qy qz qw")
 
 
 def export_tum(

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from common.errors import UserError
 from common.geometry import se2
-from common.geometry.pose_text import pose_of_text
+from common.geometry.pose_text import start_of_text
 from common.geometry.se2 import Array
 from common.geometry.world import load_world
 from common.versions import commit, versions
@@ -113,7 +113,7 @@ def build_estimator_options(
     """
     if estimator not in get_args(Name):
         raise UserError(f"no estimator {estimator!r}: choose one of {', '.join(get_args(Name))}")
-    pose = pose_of_text(initial_pose, "--initial-pose") if initial_pose else None
+    pose = start_of_text(initial_pose, "--initial-pose") if initial_pose else None
     if not world:
         if kind_of(file) != "recording":
             raise UserError(f"{file}: a log does not state its world: give it with --world")
@@ -135,7 +135,10 @@ class Localised:
 def run(
     estimator: Estimator, scans: Iterable[LaserScan], *, fresh: bool = False, start: Array | None = None
 ) -> Iterator[Localised]:
-    """Yields the belief after each scan, from ``start`` (3,) or an unknown pose; with ``fresh``, each scan is alone."""
+    """Yields the belief after each scan, from ``start`` (3,) or (2,), or from an unknown pose.
+
+    With ``fresh``, each scan is alone.
+    """
     for k, scan in enumerate(scans):
         if k == 0:
             estimator.check(scan)
@@ -226,7 +229,7 @@ def _with_progress(
 
 
 def _start(options: LocalizeOptions, scans: Scans) -> Array | None:
-    """The start pose (3,) for mode track, from the command line, the file, or its reference; None for mode global."""
+    """The start of mode track, (3,) or (2,): given, or from the file or its reference. None for mode global."""
     if options.mode == "global":
         return None
     if options.estimator_options.initial_pose is not None:

@@ -43,7 +43,7 @@ from common.errors import UserError
 AUTHORITY_FOLDER, AUTHORITY_KEY = "authority", "ca.key"
 # Roles that act in place of a robot and therefore have many rights: made only with `add`.
 ROLES_ON_REQUEST = frozenset({"replay", "remote", "bridge_ros2"})
-ROLES_PER_ROBOT = ("simulator", "estimator", "controller")
+ROLES_PER_ROBOT = ("simulator", "estimator", "mapper", "controller")
 # Host names in the router's certificate. Presage verifies roles instead of names; other programs may verify names.
 DEFAULT_ROUTER_HOSTS = ("localhost", "127.0.0.1", "router")
 Key = ec.EllipticCurvePrivateKey

@@ -41,10 +41,12 @@ def plan_session(
     estimator: Sequence[str] = (),
     *,
     simulated: bool = True,
+    mapping: bool = False,
 ) -> SessionPlan:
     """Checks options, environment and settings file as the services would, so that a mistake is reported once.
 
-    Models are read, but nothing is compiled and no bus is used. Raises UserError for a mistake.
+    While ``mapping``, no service but the simulator knows the world. Models are read, but nothing is compiled and no bus
+    is used. Raises UserError for a mistake.
     """
     common = arguments(config=config)
     shared = [*common, *arguments(world=world)]
@@ -55,6 +57,9 @@ def plan_session(
     estimator_settings = load_settings(EstimatorSettings, estimator_args)
     if estimator_settings.estimator == "paper":  # it localises at one heading only, which its controller keeps
         controller_args += arguments(preset="paper")
+    if mapping:
+        controller_args += arguments(preset="manual")
+        simulator_args += arguments(hide_world=True)
     if simulator_settings.pace == "lockstep":
         controller_args += arguments(belief_timeout=LOCKSTEP_BELIEF_TIMEOUT_S)
     load_settings(ControllerSettings, controller_args).check()
@@ -65,7 +70,8 @@ def plan_session(
         pose = loaded_world.start_pose(radius) if start is None else np.array(start)
         if (error := loaded_world.placement_error(pose, radius)) is not None:
             raise UserError(f"start {error} (settings start and radius)")
-    check(estimator_options(estimator_settings), loaded_world)
+    if not mapping:
+        check(estimator_options(estimator_settings), loaded_world)
     return SessionPlan(
         tuple(common),
         tuple(simulator_args),

@@ -23,14 +23,14 @@ from common.errors import UserError
 from common.processes import end_with_this_process
 from presage.session.ports import accepts, check_port, free_port
 
-COLOURS = {"router": 37, "simulator": 36, "estimator": 35, "controller": 33, "recorder": 32, "viewer": 34}
+COLOURS = {"router": 37, "simulator": 36, "estimator": 35, "mapper": 35, "controller": 33, "recorder": 32, "viewer": 34}
 SECURITY_VARIABLES = {"PRESAGE_SECURITY", "PRESAGE_ROLE"}  # choose this process's credentials, not the children's
 INTERRUPTS = [signal.SIGINT, signal.SIGTERM]
 if sys.platform != "win32":
     INTERRUPTS.append(signal.SIGHUP)
 TERMINATION_TIMEOUT_S = 5.0  # between SIGTERM and SIGKILL
 # The controller stops the robot first; the recorder ends late, to record how the others stop.
-SHUTDOWN_ORDER = ("controller", "estimator", "simulator", "viewer", "recorder", "router")
+SHUTDOWN_ORDER = ("controller", "estimator", "mapper", "simulator", "viewer", "recorder", "router")
 
 
 @dataclass

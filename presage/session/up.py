@@ -29,6 +29,7 @@ class UpOptions:
     robots: int = 1
     record: Path | None = None
     port: int = 7447  # 0 chooses a free port
+    mapping: bool = False  # maps an unknown building instead of localising in a known world
     without: frozenset[str] = frozenset()  # services that are not started
     open_page: bool = False
 
@@ -40,7 +41,13 @@ def run_up(options: UpOptions, console: Console) -> None:
     """
     simulated = "simulator" not in options.without
     plan = plan_session(
-        options.config, options.world, options.drive, options.simulator, options.estimator, simulated=simulated
+        options.config,
+        options.world,
+        options.drive,
+        options.simulator,
+        options.estimator,
+        simulated=simulated,
+        mapping=options.mapping,
     )
     robot, pace = plan.estimator_settings.robot, plan.simulator_settings.pace
     robots = [robot] if options.robots == 1 else [f"{robot}-{k}" for k in range(1, options.robots + 1)]
@@ -50,6 +57,8 @@ def run_up(options: UpOptions, console: Console) -> None:
         )
     if not simulated and (options.robots > 1 or pace != "realtime"):
         raise UserError("--no-simulator allows one robot in real time only: leave out --robots, and the setting pace")
+    if options.mapping and options.robots > 1:
+        raise UserError("--mapping maps with one robot: leave out --robots")
     with Stack(robots[0], options.port or None, security=credentials_for(robots[0])) as stack:
         stack.start_router()
         viewer = [*plan.config, *arguments(recordings=options.record)]
@@ -62,7 +71,10 @@ def run_up(options: UpOptions, console: Console) -> None:
         if page:
             show_page_link(stack, console, open_it=options.open_page)
         with announced(stack.endpoint, robots, stack.security):
-            _show_hints(stack, plan.estimator_settings.world, robots, console)
+            if options.mapping:
+                console.print("[bold green]mapping[/]: drive with the arrow keys on the page, then save the map there.")
+            else:
+                _show_hints(stack, plan.estimator_settings.world, robots, console)
             _watch(stack, console)
 
 
@@ -70,7 +82,9 @@ def _start_services(stack: Stack, options: UpOptions, plan: SessionPlan, robots:
     record, without = options.record, options.without
     if (page or record is not None) and len(robots) == 1:  # an idle recorder starts from a button on the page
         stack.start("recorder", *plan.config, *arguments(directory=record, idle=record is None))
-    if "estimator" not in without:
+    if options.mapping:
+        stack.start("mapper", *plan.config)
+    elif "estimator" not in without:
         stack.start("estimator", *plan.estimator, *arguments(robots=",".join(robots) if len(robots) > 1 else ""))
     if "controller" not in without:
         stack.start("controller", *plan.controller)

@@ -12,6 +12,7 @@ import numpy as np
 from common.geometry.se2 import Array
 from common.messages.definitions import CmdVel, Scan
 from common.robot.base import Robot
+from common.robot.motion_distortion import correct_scan
 from common.runtime import safety
 
 MIN_SPEED = 1e-3  # m/s and rad/s; smaller components become 0
@@ -59,11 +60,16 @@ class CommandGate:
             else:
                 self._periods.append(min((scan.stamp_ns - before) * 1e-9, 1.0))
         self._scan = (scan.stamp_ns, now)
-        self._points = safety.scan_points(scan)
+        velocity = self._current_velocity(now)
+        self._points = safety.scan_points(scan if velocity is None else correct_scan(scan, velocity))
 
     def add_velocity(self, twist: Array, now: float) -> None:
         """Stores the robot's velocity (3,) from odometry."""
         self._velocity = (twist, now)
+
+    def _current_velocity(self, now: float) -> Array | None:
+        """Velocity (3,) from odometry; None if there was none lately."""
+        return self._velocity[0] if self._velocity and now - self._velocity[1] < 0.5 else None
 
     def command(self, message: CmdVel, now: float) -> Array | None:
         """Velocity (3,) to pass on, in m/s, m/s, rad/s. Returns None if nothing should be sent."""
@@ -76,7 +82,7 @@ class CommandGate:
         twist = safety.clip_twist(message.twist.array(), self.robot)
         self.stopped = False
         if self.obstacle_stop:
-            current = self._velocity[0] if self._velocity and now - self._velocity[1] < 0.5 else None
+            current = self._current_velocity(now)
             reaction_time = max(safety.REACTION_TIME_S, 2 * self._period)
             twist, self.stopped = safety.limit_velocity(twist, self._points, self.robot, current, reaction_time)
         twist = np.where(np.abs(twist) < MIN_SPEED, 0.0, twist)

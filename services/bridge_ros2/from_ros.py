@@ -12,7 +12,7 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from common.limits import MAX_BEAMS, MAX_COORDINATE_M, MAX_DISTANCE_M, MAX_SPEED
 from common.messages.definitions import Odom, Pose, Scan, Twist
-from common.messages.ros_messages import Mount, Transform, read_pose, stamp_of
+from common.messages.ros_messages import Mount, Transform, plausible_time_increment, read_pose, stamp_of
 from common.robot.ranges import normalise_driver_ranges
 from services.bridge_ros2.frames import DeadReckoning
 
@@ -40,9 +40,12 @@ def scan_of(message: Any, mount: Mount, stamp_ns: int) -> Scan:
     ranges = np.asarray(message.ranges, np.float32)
     side = -1.0 if mount.upside_down else 1.0
     first, step = side * first, side * step
+    period = float(message.scan_time)
+    period = period if 0 < period < 3600 else 0.0
+    time_increment = plausible_time_increment(message)
     if step < 0:
         first, step, ranges = first + step * (beams - 1), -step, ranges[::-1]
-    period = float(message.scan_time)
+        time_increment = -time_increment
     return Scan(
         stamp_ns=stamp_ns,
         angle_min=float(se2.wrap(first)),
@@ -51,7 +54,8 @@ def scan_of(message: Any, mount: Mount, stamp_ns: int) -> Scan:
         range_max=farthest,
         ranges=normalise_driver_ranges(ranges, nearest, farthest),
         mount=Pose.of(mount.pose),
-        scan_time=period if 0 < period < 3600 else 0.0,
+        scan_time=period,
+        time_increment=time_increment,
         frame_id=(message.header.frame_id or "laser")[:64],
     )
 

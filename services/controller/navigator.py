@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common.geometry import se2
-from common.messages.definitions import Belief, CmdVel, Drive, Goal, Scan, Status
+from common.messages.definitions import Belief, CmdVel, Drive, Goal, PolicyEnergy, Scan, Status
 from common.robot.base import Robot
+from common.robot.motion_distortion import correct_scan
 from common.runtime import safety
+from services.controller.docking import STANDING_TIME_S, Docking
 from services.controller.goal_state import GoalState
 from services.controller.manual_drive import ManualDrive
 from services.controller.policies.decision import Decision, Policy
-from services.controller.policies.motion_model import is_moving, turn_rate
+from services.controller.policies.motion_model import delay_until_effect, is_moving, turn_rate
 from services.controller.policies.paper_action import ActionParameters
 from services.controller.policies.straight_line import StraightLinePolicy
 from services.controller.velocity_command import VelocityCommand
@@ -39,25 +41,37 @@ class Navigator:
         self.goal_state = GoalState()
         self._command = VelocityCommand(self.robot)
         self._manual = ManualDrive()
+        self._docking: Docking | None = None  # if the goal has an approach direction
         self._scan: Scan | None = None
         self._scan_points = np.zeros((0, 2))  # m in base_link
 
     def on_scan(self, scan: Scan) -> None:
-        """Keep the scan for the obstacle limits and for the policy."""
-        self._scan_points, self._scan = safety.scan_points(scan), scan
+        """Keep the scan, corrected for the robot's motion, for the obstacle limits and for the policy."""
+        self._scan = correct_scan(scan, self._command.velocity)
+        self._scan_points = safety.scan_points(self._scan)
+        self.policy.prepare(self._scan)
 
     def on_drive(self, drive: Drive) -> None:
         """Store a manual velocity command, which has priority over the goal."""
         self._manual.update(drive, max(self.scan_stamp or 0, self._command.stamp_ns or 0))
 
     def on_goal(self, goal: Goal) -> None:
-        """Replace the goal, cancel it, or refuse it if the policy knows that it cannot be reached."""
-        position = goal.pose.array()[:2]
+        """Replace the goal, cancel it, or refuse it if it is known that it cannot be reached."""
+        self._docking = None if goal.approach is None or goal.cancel else Docking(goal, self.robot)
         if goal.cancel:
             self.goal_state.cancel()
         else:
-            self.goal_state.start(goal, self.policy.refusal(position))
-        self.policy.set_goal(position if self.goal_state.active else None)
+            self.goal_state.start(goal, self._refusal(goal))
+        destination = goal.pose.array()[:2] if self._docking is None else self._docking.line()[0]
+        self.policy.set_goal(destination if self.goal_state.active else None)
+
+    def _refusal(self, goal: Goal) -> str | None:
+        if self._docking is None:
+            return self.policy.refusal(goal.pose.array()[:2])
+        if (reason := self._docking.refusal()) is not None:
+            return reason
+        reasons = [self.policy.refusal(point) for point in self._docking.line()]
+        return next((f"the line to the goal is not free: {reason}" for reason in reasons if reason is not None), None)
 
     @property
     def scan_stamp(self) -> int | None:
@@ -84,7 +98,10 @@ class Navigator:
         command, limited_by_scan = self._command.limit(belief.stamp_ns, desired, self._scan_points)
         moving = is_moving(self._command.velocity)
         self.goal_state.update_progress(belief.stamp_ns, self.decision, moving=moving, limited_by_scan=limited_by_scan)
-        return command, self.goal_state.status(belief.stamp_ns, distance)
+        status = self.goal_state.status(belief.stamp_ns, distance)
+        if (terms := self.decision.terms) is not None:
+            status = status.model_copy(update={"energy": PolicyEnergy(**terms)})
+        return command, status
 
     def step_without_belief(self, stamp_ns: int) -> tuple[CmdVel, Status] | None:
         """Command and status that answer a scan while no estimator runs, so that manual driving still works.
@@ -122,6 +139,7 @@ class Navigator:
     def _suspend_goal(self) -> None:
         self.goal_state.suspend()
         self.policy.interrupt()
+        self._interrupt_docking()
 
     def _manual_status(self, stamp_ns: int, distance: float | None) -> Status:
         """Status with state "manual"; the state of the goal is left as it is."""
@@ -134,13 +152,18 @@ class Navigator:
         if belief.state in {"lost", "localising", "ambiguous"}:
             self.decision = self.policy.decide_unlocalised(belief, self._command.velocity)
             self.goal_state.lose_pose(self.decision.state, self.decision.reason)
+            self._interrupt_docking()
             return self.decision.action
         self.goal_state.find_pose()
-        if distance <= goal.tolerance:
+        if self._docking is not None:
+            velocity = self._docking_velocity(self._docking, belief, pose, goal)
+            if velocity is not None:
+                return velocity
+        elif distance <= goal.tolerance:
             self.policy.interrupt()
             turn = self._turn_to_goal_heading(pose, goal)
             if turn is None:
-                self.goal_state.reach(f"within {goal.tolerance:g} m of the goal")
+                self.goal_state.reach(_arrival(belief, goal))
                 return np.zeros(3)
             self.decision = Decision(turn, "there: turning into the goal's heading")
             return turn
@@ -148,6 +171,24 @@ class Navigator:
         if self.decision.refused:
             self.goal_state.refuse(self.decision.reason)
         return self.decision.action
+
+    def _docking_velocity(self, docking: Docking, belief: Belief, pose: Array, goal: Goal) -> Array | None:
+        """Velocity (3,) in base_link on the line to the goal; None while the policy drives to the line."""
+        delay = delay_until_effect(self.robot, self._scan)
+        ahead = self._command.motion_until_effect(belief.stamp_ns, delay)
+        velocity = docking.velocity(se2.compose(pose, ahead))
+        if velocity is None:
+            return None
+        self.policy.interrupt()
+        self.decision = Decision(velocity)
+        lately = self._command.motion_until_effect(belief.stamp_ns, delay + STANDING_TIME_S)
+        if not (lately.any() or velocity.any() or self._command.velocity.any()) and docking.arrived(pose):
+            self.goal_state.reach(_arrival(belief, goal))
+        return velocity
+
+    def _interrupt_docking(self) -> None:
+        if self._docking is not None:
+            self._docking.interrupt()
 
     def _turn_to_goal_heading(self, pose: Array, goal: Goal) -> Array | None:
         """Turn (3,) in base_link towards the goal's heading; None if the heading is within tolerance or free."""
@@ -157,3 +198,14 @@ class Navigator:
         if abs(error) <= goal.yaw_tolerance:
             return None
         return np.array([0.0, 0.0, turn_rate(error, self.robot)])
+
+
+def _arrival(belief: Belief, goal: Goal) -> str:
+    """Status text on arrival, which says so if the belief is not accurate enough to be sure of it."""
+    reason = f"within {goal.tolerance:g} m of the goal"
+    if belief.covariance is None:
+        return reason
+    uncertainty = 2 * float(np.sqrt(np.linalg.eigvalsh(belief.covariance[:2, :2])[-1]))
+    return (
+        reason if uncertainty <= goal.tolerance else f"{reason} by a belief that is only certain to {uncertainty:.2g} m"
+    )

@@ -14,6 +14,7 @@ from common.messages.topics import BELIEF, CMD_VEL, DRIVE, GOAL, PLAN, PREDICT, 
 from common.runtime.service import Service
 from services.controller.belief_wait import Answered, AwaitsPredictions, AwaitsScan, BeliefWait, NoBelief
 from services.controller.navigator import Navigator
+from services.controller.policies.manual import ManualPolicy
 from services.controller.policies.paper_action import ActionParameters
 from services.controller.settings import ControllerSettings
 
@@ -77,9 +78,10 @@ class ControllerService(Service):
         settings = self.settings
         settings.check()
         robot = settings.build_robot()
-        if settings.world:
+        world = None
+        if settings.world and settings.preset != "manual":
             self.log.info("loading the world", world=settings.world)
-        world = load_world(settings.world) if settings.world else None
+            world = load_world(settings.world)
         if settings.preset == "geodesic" and world is not None:
             # scipy takes a third of a second to import, and preset paper does not need it.
             from services.controller.policies.planner import GeodesicPolicy
@@ -87,7 +89,8 @@ class ControllerService(Service):
             keep_heading = settings.heading == "keep"
             self.geodesic = GeodesicPolicy(robot, world, keep_heading=keep_heading, epistemic=settings.epistemic)
         parameters = ActionParameters(gamma=settings.gamma)
-        self.navigator = Navigator(robot, parameters, world, self.geodesic)
+        policy = ManualPolicy() if settings.preset == "manual" else self.geodesic
+        self.navigator = Navigator(robot, parameters, world, policy)
         # Declare the publishers now: the first message on a key that was just declared may be lost.
         for topic in (STATUS, CMD_VEL, PLAN, PREFERENCE):
             self.loop.bus.publisher(topic, self.name)
@@ -155,7 +158,7 @@ class ControllerService(Service):
         if motions is None:
             self._step(belief, cpu_ns)
             return
-        request = PredictRequest(poses=motions.poses(), beams=PREDICTED_BEAMS)
+        request = PredictRequest(poses=motions.poses().reshape(-1, 3), beams=PREDICTED_BEAMS)
         self._latest_request = self.request(PREDICT, request, PREDICTION_TIMEOUT_S)
         self._wait = AwaitsPredictions(belief, cpu_ns)
 

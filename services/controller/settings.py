@@ -30,16 +30,17 @@ class ControllerSettings(SelfFilterSettings):
         Field(description="the map: a shipped world, a world file or a ROS map.yaml; may be empty with preset paper"),
     ] = "corridor"
     preset: Annotated[
-        Literal["geodesic", "paper"],
-        Field(description="geodesic: around walls and obstacles in the scan; paper: straight to the goal (equation 4)"),
+        Literal["geodesic", "paper", "manual"],
+        Field(
+            description="geodesic: around walls and obstacles in the scan; paper: straight to the goal (equation 4); "
+            "manual: only by hand, without a map"
+        ),
     ] = "geodesic"
     heading: Annotated[
         Literal["travel", "keep"],
         Field(description="a holonomic robot turns into its direction of travel, or keeps its heading"),
     ] = "travel"
-    epistemic: Annotated[
-        bool, Field(description="with a goal and several possible places, drive where they can be told apart")
-    ] = True
+    epistemic: Annotated[bool, Field(description="policies are also judged by the information that they gain")] = True
     gamma: Annotated[float, Field(gt=0, lt=1, description="preset paper: action step size per scan (equation 4)")] = 0.3
     belief_timeout: Annotated[
         float, Field(gt=0, le=60, description="the robot stops after this time without a belief, s")

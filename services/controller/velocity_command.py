@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from common.geometry import se2
 from common.messages.definitions import CmdVel, Twist
 from common.runtime import safety
 
@@ -21,22 +23,55 @@ class VelocityCommand:
         self.robot = robot
         self.velocity = np.zeros(3)  # (3,) m/s, m/s, rad/s in base_link
         self.stamp_ns: int | None = None  # of the latest belief or scan that was answered
+        self._below_dead_band = np.zeros(3)  # desired velocities that were too low to command, summed over scans
         self._before_pause: Array | None = None  # velocity before a pause of the simulation
+        self._sent: deque[tuple[int, Array]] = deque(maxlen=100)  # stamps in ns and velocities of the last commands
 
     def limit(self, stamp_ns: int, desired: Array, points: Array) -> tuple[CmdVel, bool]:
         """The command for a desired velocity (3,), and whether the obstacle ``points`` (K, 2) m reduced it."""
         period_s = 0.0 if self.stamp_ns is None else max(0.0, (stamp_ns - self.stamp_ns) * 1e-9)
         self.stamp_ns = stamp_ns
-        ramped = safety.ramp(self.velocity, safety.clip_twist(desired, self.robot), self.robot, period_s)
+        possible = self._in_pulses(safety.clip_twist(desired, self.robot))
+        ramped = safety.ramp(self.velocity, possible, self.robot, period_s)
         self.velocity, limited_by_scan = safety.limit_velocity(ramped, points, self.robot)
+        self._sent.append((stamp_ns, self.velocity))
         vx, vy, wz = map(float, self.velocity)
         return CmdVel(stamp_ns=stamp_ns, twist=Twist(vx=vx, vy=vy, wz=wz)), limited_by_scan
+
+    def motion_until_effect(self, stamp_ns: int, delay_s: float) -> Array:
+        """Motion (3,) in base_link from a stamp until a command with that stamp takes effect, ``delay_s`` later.
+
+        Until then the earlier commands apply, each as much later than its stamp.
+        """
+        motion, end_ns, first_ns = np.zeros(3), stamp_ns, stamp_ns - round(delay_s * 1e9)
+        for sent_ns, velocity in reversed(self._sent):
+            begin_ns = min(max(sent_ns, first_ns), end_ns)
+            motion = se2.compose(velocity * (end_ns - begin_ns) * 1e-9, motion)
+            end_ns = begin_ns
+        return motion
+
+    def _in_pulses(self, desired: Array) -> Array:
+        """The desired velocity (3,), but in pulses of the dead band's size where the base would not move.
+
+        The sum of the pulses follows that of the desired velocities, as in a sigma-delta modulator.
+        """
+        limits = np.array([self.robot.dead_band, self.robot.dead_band, self.robot.turn_dead_band])
+        speed = np.array([np.hypot(*desired[:2])] * 2 + [abs(desired[2])])
+        too_low = (speed > 0) & (speed < limits)
+        self._below_dead_band = np.where(too_low, self._below_dead_band + desired, 0.0)
+        total = np.array([np.hypot(*self._below_dead_band[:2])] * 2 + [abs(self._below_dead_band[2])])
+        # Slightly more than the dead band, because the base compares rounded numbers.
+        pulse = np.where(total >= limits, self._below_dead_band * 1.01 * limits / np.maximum(total, 1e-9), 0.0)
+        pulse = np.where(too_low, pulse, 0.0)
+        self._below_dead_band -= pulse
+        return np.where(too_low, pulse, desired)
 
     def stop(self, stamp_ns: int, *, paused: bool) -> CmdVel:
         """The command to stand. If the simulation may be ``paused``, `resume` can undo it."""
         if paused:
             self._before_pause = self.velocity
         self.velocity = np.zeros(3)
+        self._sent.append((stamp_ns, self.velocity))
         return CmdVel(stamp_ns=stamp_ns, twist=Twist())
 
     def resume(self, stamp_ns: int) -> bool:

@@ -22,13 +22,13 @@ from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.particle_filter.sensor import Sensor
 from services.estimator.particle_filter.settings import Settings as ParticleSettings
 from services.estimator.precise.estimator import PreciseEstimator
-from services.estimator.precise.gauss_newton import Optimiser, View, polish
+from services.estimator.precise.gauss_newton import Optimiser
 from services.estimator.precise.global_seeds import SEED_SPACING_M, Seeds, thin_places
 from services.estimator.precise.learning import weights
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.settings import Settings
 from services.estimator.shared.generative_models import GenerativeModel, RayCaster, map_error
-from services.estimator.shared.interface import Estimator
+from services.estimator.shared.interface import Estimator, Observation
 from services.estimator.shared.model_folder import find_folder
 
 DEFAULT_SIGMA_M = 0.02  # noise of a scanner whose scans state none
@@ -47,7 +47,7 @@ class EstimatorOptions:
     models: Path | None = None  # folder of weights; defaults to the shipped ones
     sigma: float | None = None  # m, the scanner's noise; defaults to what the scans state, else DEFAULT_SIGMA_M
     seed: int = 0
-    initial_pose: Array | None = None  # (3,); None if unknown (paper then starts at the map's centre)
+    initial_pose: Array | None = None  # (3,), or (2,) without heading; None if unknown (paper starts at the centre)
     descent: Descent = Descent()  # noqa: RUF009 - frozen; for paper
     generative_model: GenerativeModel | None = None  # for precise: used instead of `model`
     likelihood: Likelihood | None = None  # for precise; defaults to the weights' calibration or the noise
@@ -144,12 +144,12 @@ def prepare(options: EstimatorOptions) -> Factory:
 
 
 def _precise(options: EstimatorOptions, world: World) -> Factory:
-    model, places, card = load_model(options, world)
+    model, seeds, card = load_model(options, world)
     calibration = card.calibration if card else None
     settings = calibration.settings() if calibration else Settings(inflation=card.inflation if card else 1.0)
     error = 0.0 if calibration else map_error(world)
-    seeds, bounds = Seeds.at(model, places), (card.world if card else world).bounds
-    _compile(model, seeds, options.likelihood or Likelihood())
+    bounds = (card.world if card else world).bounds
+    _compile(model, seeds)
 
     def make(geometry: Geometry) -> Estimator:
         if card:
@@ -171,12 +171,13 @@ def _precise(options: EstimatorOptions, world: World) -> Factory:
     return make
 
 
-def load_model(options: EstimatorOptions, world: World) -> tuple[GenerativeModel, Array, weights.FieldCard | None]:
-    """Returns the model, places (S, 2) m where the laser can be, and the card of a learned model, else None."""
+def load_model(options: EstimatorOptions, world: World) -> tuple[GenerativeModel, Seeds, weights.FieldCard | None]:
+    """Returns the model, the seeds of a search, and the card of a learned model, else None."""
     if options.generative_model is None and options.model != "exact":
         return weights.load(field_path(options, world))
     places = world.sample_free(max(4000, int(60 * world.free_area)), np.random.default_rng(0), 0.05)
-    return options.generative_model or RayCaster(world), thin_places(places, SEED_SPACING_M), None
+    model = options.generative_model or RayCaster(world)
+    return model, Seeds.at(model, thin_places(places, SEED_SPACING_M)), None
 
 
 def field_path(options: EstimatorOptions, world: World) -> Path:
@@ -233,11 +234,14 @@ def check_mount(geometry: Geometry, trained: Scanner) -> None:
         )
 
 
-def _compile(model: GenerativeModel, seeds: Seeds, likelihood: Likelihood) -> None:
-    """Calls every compiled loop once, so that no scan has to wait for compilation."""
-    angles = np.linspace(-1, 1, 16)
-    view = View(model, likelihood, np.zeros(3), angles, np.ones(16), 25.0)
-    polish(view, seeds.rank(view, 2), iterations=1)
+def _compile(model: GenerativeModel, seeds: Seeds) -> None:
+    """Lets an estimator search and track, so that every loop is compiled and no scan has to wait for compilation."""
+    estimator = PreciseEstimator(model, Seeds(seeds.places[:4], seeds.panoramas[:4]), np.zeros(3))
+    angles, beam = np.linspace(-1, 1, 32), np.arange(32)
+    ranges = estimator.predict(np.array([[*seeds.places[0], 0.0]]), angles).ranges[0]
+    ranges[7] = np.inf
+    for stamp, moved in enumerate((0.0, 0.01, 1.0)):  # in the last scan, something stands in the way
+        estimator.update(Observation(ranges - moved * (beam % 16 < 5), angles, 25.0, 0.07 * stamp))
 
 
 @explain_missing_packages()

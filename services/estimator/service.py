@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from common.errors import UserError
-from common.geometry.pose_text import pose_of_text
+from common.geometry.pose_text import start_of_text
 from common.messages.definitions import Belief, CmdVel, Goal, Hypothesis, Odom, Pose, Prediction, Scan, Stamped
 from common.messages.requests import LocaliseRequest, ModelReply, ModelRequest, PredictRequest, Reply, Request
 from common.messages.topics import (
@@ -43,7 +43,7 @@ def estimator_options(settings: EstimatorSettings) -> EstimatorOptions:
         models=settings.models,
         sigma=settings.sigma,
         seed=settings.seed,
-        initial_pose=pose_of_text(settings.initial_pose, "--initial-pose") if settings.initial_pose else None,
+        initial_pose=start_of_text(settings.initial_pose, "--initial-pose") if settings.initial_pose else None,
         descent=Descent(alpha=settings.alpha, iterations=settings.iterations),
     )
 
@@ -138,7 +138,8 @@ class EstimatorService(Service):
             return answer_prediction(self.estimator, request, self.geometry.angles, self.geometry.range_max)
         if not isinstance(request, LocaliseRequest):
             return super().on_request(query, request)
-        self.estimator.restart(None if request.pose is None else request.pose.array())
+        start = None if request.pose is None else request.pose.array()
+        self.estimator.restart(start if start is None or request.heading_known else start[:2])
         return Reply()
 
     def _update(self, scan: Scan) -> None:
@@ -200,6 +201,7 @@ class EstimatorService(Service):
             odom.pose.array() if odom else None,
             command.twist.array() if command else None,
             self.goal.pose.array() if self.goal else None,
+            time_increment=scan.time_increment,
         )
 
 

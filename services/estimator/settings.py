@@ -73,7 +73,7 @@ class EstimatorSettings(ServiceSettings):
         str,
         Field(
             pattern=POSE_TEXT,
-            description="initial pose x,y[,yaw_deg]; empty if unknown (paper then starts at the map's centre)",
+            description="initial pose x,y[,yaw_deg], or x,y for any heading; empty if unknown (paper: the centre)",
         ),
     ] = ""
     alpha: Annotated[

@@ -100,6 +100,8 @@ class SimulatorService(Service):
             robot=robot,
             start=settings.start_pose(),
             seed=settings.seed,
+            slip=settings.slip,
+            sweep=settings.sweep,
             obstacle_stop=settings.obstacle_stop,
             people=settings.people,
             people_speed=settings.people_speed,
@@ -205,7 +207,8 @@ class SimulatorService(Service):
         """Carry out a request. Raises UserError if that is not possible."""
         if query is WORLD:
             simulation = self.simulation
-            return WorldReply(world=simulation.world, scanner=self.setup.scanner, robot=self.setup.robot)
+            world = None if self.settings.hide_world else simulation.world
+            return WorldReply(world=world, scanner=self.setup.scanner, robot=self.setup.robot)
         if isinstance(request, SampleRequest):
             return self._sample(request)
         if query is STEP:

@@ -31,6 +31,9 @@ class SimulatorSettings(RobotSettings):
     service: ClassVar[str] = "simulator"
 
     world: Annotated[str, Field(description="a shipped world, a world file or a ROS map.yaml")] = "corridor"
+    hide_world: Annotated[
+        bool, Field(description="do not tell the world to other programs, as in an unknown building")
+    ] = False
     scanner: Annotated[str, Field(description=f"one of {', '.join(SCANNERS)}, or a file")] = "tim571"
     beams: Annotated[
         int | None, Field(ge=2, le=MAX_BEAMS, description="number of beams; defaults to the scanner's")
@@ -76,6 +79,10 @@ class SimulatorSettings(RobotSettings):
     ] = "auto"
     people: Annotated[int, Field(ge=0, le=100, description="number of walking people, who are not in the map")] = 0
     people_speed: Annotated[float, Field(ge=0, le=3, description="walking speed of the people, m/s")] = 1.0
+    sweep: Annotated[
+        bool, Field(description="measure one beam after another, as a rotating scanner does, not all at once")
+    ] = True
+    slip: Annotated[float, Field(ge=0, le=0.5, description="mean share of its motion that a wheel loses")] = 0.0
     obstacle_stop: Annotated[
         bool, Field(description="brake before obstacles in the scan; turn off only for fault injection")
     ] = True

@@ -15,10 +15,13 @@ from common.geometry.se2 import Array
 from common.geometry.world import Obstacle, World
 from common.messages.definitions import Odom, Pose, Scan, Truth, Twist
 from common.robot.base import Robot
+from common.robot.motion_distortion import beam_times, correct_scan
 from common.robot.scanner import Scanner
 from common.runtime import safety
+from services.simulator.actuator import Actuator
 from services.simulator.odometry import Drift, Odometer
 from services.simulator.physics import SUBSTEP_S, Engine, Physics, choose_engine
+from services.simulator.recent_motion import MotionState, RecentMotion
 
 if TYPE_CHECKING:
     from services.simulator.people import People
@@ -36,14 +39,20 @@ class Setup:
     start: tuple[float, float, float] | None = None  # x m, y m, yaw rad; defaults to the world's start
     seed: int = 0
     drift: Drift = field(default_factory=Drift)
+    slip: float = 0.0  # mean share of its motion that a wheel loses
     obstacle_stop: bool = True  # off only for fault injection
+    sweep: bool = False  # measure one beam after another, as a rotating scanner does, not all at once
     people: int = 0
     people_speed: float = 1.0  # m/s
     engine: Engine = field(default_factory=lambda: choose_engine("auto"))
 
 
 class Simulation:
-    """The simulated robot. The same setup and commands give the same bytes."""
+    """The simulated robot. The same setup and commands give the same bytes.
+
+    With `Setup.sweep`, a scan is published when its last beam has been measured, with the stamp of its first: the
+    physics is ahead of the stamp by the time of a sweep, and a command takes effect as much later.
+    """
 
     def __init__(self, setup: Setup) -> None:
         """Begin at time 0. Raises UserError if the robot would stand in a wall, or the people have no room."""
@@ -53,7 +62,7 @@ class Simulation:
         if (error := self.placement_error(pose)) is not None:
             raise UserError(f"start {error}")
         # Separate random streams, so that people do not change the noise.
-        scan_seed, odom_seed, people_seed = np.random.SeedSequence(setup.seed).spawn(3)
+        scan_seed, odom_seed, people_seed, slip_seed = np.random.SeedSequence(setup.seed).spawn(4)
         self.people: People | None = None
         if setup.people:
             # scipy takes half a second to import, and a world without people does not need it.
@@ -70,7 +79,11 @@ class Simulation:
         self.odometer = Odometer(setup.drift, np.random.default_rng(odom_seed))
         self.substeps = max(1, round(1 / (scanner.rate * SUBSTEP_S)))
         self.steps = 0
-        self._velocity = np.zeros(3)  # set at the wheels, within the acceleration limits
+        # The scanner turns once per period.
+        self._time_increment = scanner.turn_per_beam * self.period_ns * 1e-9 if setup.sweep else 0.0
+        self._beam_times = beam_times(scanner.beams, self._time_increment)  # s after the stamp
+        self._motion = RecentMotion(self.physics.pose(), self.substeps, SUBSTEP_S)
+        self._actuator = Actuator(robot, setup.slip, np.random.default_rng(slip_seed))
         self._command: tuple[int, Array] | None = None  # stamp and velocity of the latest command
         self._last_command_step = 0  # value of `steps` when a command with a new stamp last arrived
         # How much faster simulated time may pass than the controller's clock; multiplies the command timeout.
@@ -112,14 +125,25 @@ class Simulation:
         silence_s = (self.steps - self._last_command_step) * self.period_ns * 1e-9
         timed_out = silence_s >= self.setup.robot.command_timeout * self.clock_factor
         target = np.zeros(3) if timed_out else self._target_velocity()
-        before = self.physics.pose()
-        self._move_people(before)
+        before, measured = self._at_stamp().wheels, self._motion.now.wheels
+        self._move_people(self.physics.pose())
         self._contact = False
+        self._actuator.set_target(target, at_once=timed_out)
         for _ in range(self.substeps):
-            self._velocity = safety.ramp(self._velocity, target, self.setup.robot, SUBSTEP_S, hard=timed_out)
-            self._contact |= self.physics.drive(self._velocity)
-        self.odometer.move(before, self.physics.pose())
+            wheels, velocity = self._actuator.step(SUBSTEP_S, hard=timed_out)
+            self._contact |= self.physics.drive(velocity)
+            pose = self.physics.pose()
+            measured = se2.compose(measured, wheels * SUBSTEP_S) if self.setup.slip else pose
+            self._motion.add(pose, measured, self.physics.twist())
+        self.odometer.move(before, self._at_stamp().wheels)
         self.steps += 1
+
+    def _at_stamp(self) -> MotionState:
+        """The robot's state at the stamp of the present scan."""
+        if not self._time_increment:
+            return self._motion.now
+        state = self._motion.at(self._beam_times[-1:])
+        return MotionState(state.pose[0], state.wheels[0], state.twist[0])
 
     def _move_people(self, pose: Array) -> None:
         """Move the people by one scan period; the robot is at ``pose`` (3,)."""
@@ -138,14 +162,15 @@ class Simulation:
         # Each period ends with a velocity from which the robot can brake without contact. If no other velocity does, it
         # brakes.
         target, self._stopped = safety.limit_velocity(
-            self._command[1], self._scan_points, self.setup.robot, self._velocity, self.period_ns * 1e-9
+            self._command[1], self._scan_points, self.setup.robot, self._actuator.velocity, self.period_ns * 1e-9
         )
         return target
 
     def observe(self) -> tuple[Odom, Truth, Scan]:
         """Measurements at the present time. Each call draws new noise for the scan."""
-        pose, twist, scanner = self.physics.pose(), self.physics.twist(), self.setup.scanner
-        exact = self._cast_rays(pose[None])[0]
+        state, scanner = self._at_stamp(), self.setup.scanner
+        pose, twist = state.pose, state.twist
+        exact = self._sweep() if self._time_increment else self._cast_rays(pose[None])[0]
         ranges = scanner.limit(scanner.add_noise(exact, self._noise))
         velocity = Twist(vx=float(twist[0]), vy=float(twist[1]), wz=float(twist[2]))
         odometer = self.odometer
@@ -161,8 +186,23 @@ class Simulation:
             people=np.zeros((0, 2), np.float32) if self.people is None else self.people.places.astype(np.float32),
         )
         scan = self._scan_message(ranges)
-        self._scan_points = safety.scan_points(scan)
+        self._scan_points = self._points_now(scan)
         return odom, truth, scan
+
+    def _sweep(self) -> Array:
+        """Ranges (B,) m of one sweep, each beam from the pose at its own time, without noise and range limits."""
+        beams = self._motion.at(self._beam_times[-1] - self._beam_times).pose
+        lasers = se2.compose(beams, np.array(self.setup.scanner.mount))
+        lasers[:, 2] += self.setup.scanner.angles()
+        return self.physics.ranges(lasers, np.zeros(1), _reach(self.setup.scanner))[:, 0]
+
+    def _points_now(self, scan: Scan) -> Array:
+        """End points (K, 2) m of the scan in base_link at the present time, which is after a sweep."""
+        if not self._time_increment:
+            return safety.scan_points(scan)
+        since_stamp = se2.between(self._at_stamp().pose, self._motion.now.pose)
+        corrected = correct_scan(scan, since_stamp / self._beam_times[-1])
+        return se2.transform(se2.inverse(since_stamp), safety.scan_points(corrected))
 
     def _scan_message(self, ranges: Array) -> Scan:
         scanner = self.setup.scanner
@@ -175,6 +215,7 @@ class Simulation:
             ranges=ranges.astype(np.float32),
             mount=Pose.of(scanner.mount),
             scan_time=self.period_ns * 1e-9,
+            time_increment=self._time_increment,
             sigma=scanner.sigma,
             sigma_relative=scanner.sigma_relative,
         )
@@ -183,9 +224,7 @@ class Simulation:
         """Ranges (N, B) m from base_link poses (N, 3), without noise and range limits."""
         scanner = scanner or self.setup.scanner
         lasers = se2.compose(poses, np.array(scanner.mount))
-        # Slightly beyond the maximum range, so that near it the noise decides whether there is a return.
-        reach = scanner.range_max + 6 * float(scanner.deviation(np.array(scanner.range_max))) + 1e-6
-        return self.physics.ranges(lasers, scanner.angles(), reach, people=people)
+        return self.physics.ranges(lasers, scanner.angles(), _reach(scanner), people=people)
 
     def sample(self, poses: Array, beams: int | None, noise_seed: int | None) -> Array:
         """Ranges (N, B) m that the scanner would measure from poses (N, 3), for training.
@@ -225,9 +264,11 @@ class Simulation:
             raise UserError(error)
         self._make_room(pose)
         self.physics.place(pose)
-        self._velocity, self._command = np.zeros(3), None
+        self._motion.place(self.physics.pose())
+        self._actuator.stop()
+        self._command = None
         # Obstacles around the new pose, for a command that arrives before the next scan. Draws no noise.
-        self._scan_points = safety.scan_points(
+        self._scan_points = self._points_now(
             self._scan_message(self.setup.scanner.limit(self._cast_rays(pose[None])[0]))
         )
 
@@ -267,6 +308,11 @@ class Simulation:
             raise UserError("the obstacle would stand outside the world")
         if shapely.distance(shape, shapely.Point(self.physics.pose()[:2])) < self.setup.robot.radius:
             raise UserError("the obstacle would stand on the robot")
+
+
+def _reach(scanner: Scanner) -> float:
+    """Slightly more than the maximum range in m, so that near it the noise decides whether there is a return."""
+    return scanner.range_max + 6 * float(scanner.deviation(np.array(scanner.range_max))) + 1e-6
 
 
 def _create_physics(engine: Engine, world: World, robot: Robot, pose: Array) -> Physics:

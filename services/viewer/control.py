@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from common.bus.bus import Bus, wait_until
 from common.errors import UserError
-from common.messages.definitions import Drive, Goal, Pose, Status, Twist
+from common.messages.definitions import GOAL_TOLERANCE_M, Drive, Goal, Pose, Status, Twist
 from common.messages.requests import (
     LocaliseRequest,
     ObstacleRequest,
@@ -25,6 +25,8 @@ from common.messages.requests import (
     Reply,
     Request,
     ResetRequest,
+    SaveMapReply,
+    SaveMapRequest,
     SpeedRequest,
 )
 from common.messages.topics import (
@@ -36,6 +38,7 @@ from common.messages.topics import (
     RECORDING,
     RESET,
     RESUME,
+    SAVE_MAP,
     SPEED,
     STEP,
     TELEPORT,
@@ -89,6 +92,7 @@ class Control:
             requests.SetSpeed: self._speed,
             requests.DriveByHand: self._drive,
             requests.Record: self._record,
+            requests.SaveMap: self._save_map,
         }
 
     def do(self, robot: str, action: requests.Action) -> ActionResult:
@@ -130,7 +134,7 @@ class Control:
             stamp_ns=self._lookup.stamp_ns(robot),
             seq=time.time_ns(),
             pose=Pose(x=action.x, y=action.y, yaw=action.yaw or 0.0),
-            tolerance=action.tolerance or 0.2,
+            tolerance=action.tolerance or GOAL_TOLERANCE_M,
             yaw_tolerance=None if action.yaw is None else YAW_TOLERANCE_RAD,
         )
         self._bus.put(GOAL, goal.encode(), key=GOAL.key(robot))
@@ -174,7 +178,7 @@ class Control:
         pose = None
         if action.x is not None and action.y is not None:
             pose = Pose(x=action.x, y=action.y, yaw=action.yaw or 0.0)
-        self.ask(robot, LOCALISE, LocaliseRequest(pose=pose), Reply)
+        self.ask(robot, LOCALISE, LocaliseRequest(pose=pose, heading_known=action.yaw is not None), Reply)
         return ActionResult(ok=True, reason="searching near there" if pose is not None else "searching the whole map")
 
     def _obstacle(self, robot: str, action: requests.EditObstacle) -> ActionResult:
@@ -221,3 +225,8 @@ class Control:
         if reply.recording:
             state = f"recording into {reply.file}"
         return ActionResult(ok=True, reason=state, more=more)
+
+    def _save_map(self, robot: str, action: requests.SaveMap) -> ActionResult:
+        file = self.ask(robot, SAVE_MAP, SaveMapRequest(name=action.name), SaveMapReply).file
+        use = f"presage train --world {file}, then presage up --world {file}"
+        return ActionResult(ok=True, reason=f"map saved; to drive in it: {use}")

@@ -16,7 +16,7 @@ from functools import partial
 from typing import ClassVar
 
 from common.bus.inbox import Sample
-from common.messages.definitions import Health, Status
+from common.messages.definitions import Health, Map, Status
 from common.messages.topics import SCAN, TOPICS, Topic
 from common.messages.wire import DecodeError
 from common.runtime.liveness import RobotLiveness, start_command
@@ -131,6 +131,8 @@ class ViewerService(Service):
             return
         view = followed.view
         self._show(robot, view, view.add(sample.topic, message, now, sample.published_ns))
+        if isinstance(message, Map) and view.map is not None:
+            self._tell(robot, "map", view.map)
         if view.time_restarted:
             view.time_restarted = False
             self._tell(robot, "history", _history(view))
@@ -192,6 +194,7 @@ class ViewerService(Service):
             "services": self._services(robot, followed),
             "journal": _journal(view),
             "field": view.fields.shown,
+            "map": view.map,
         }
 
         def send() -> None:

@@ -118,6 +118,13 @@ class Record(Action):
     action: Literal["start", "stop", "status"]
 
 
+class SaveMap(Action):
+    """Save the map that the mapper has built."""
+
+    do: Literal["save_map"]
+    name: Annotated[str, Field(max_length=64)]
+
+
 class ListRecordings(Action):
     """List the recordings."""
 
@@ -157,6 +164,7 @@ ACTIONS = (
     SetSpeed,
     DriveByHand,
     Record,
+    SaveMap,
     ListRecordings,
     Open,
     Close,

@@ -50,6 +50,15 @@ def test_directions_of_beams(upside_down, step):
     np.testing.assert_allclose(found[order], expected, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("step", "stated", "expected"), [(0.5, 0.01, 0.01), (-0.5, 0.01, -0.01), (0.5, 0.05, 0.0), (0.5, np.nan, 0.0)]
+)
+def test_times_of_beams(step, stated, expected):
+    """Beams that are put into another order keep their times; a scan of 0.1 s cannot take 0.2 s."""
+    scan = scan_of(laser([1, 2, 3, 4, 5], angle_increment=step, time_increment=stated), Mount(), 0)
+    assert scan.time_increment == pytest.approx(expected)
+
+
 def test_full_circle():
     scan = scan_of(
         laser([1.0] * 360, angle_min=0.0, angle_increment=np.deg2rad(1), angle_max=np.deg2rad(359)), Mount(), 0

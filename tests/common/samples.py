@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+from common.geometry.occupancy_grid import OccupancyGrid
 from common.geometry.world import Box, Circle, Obstacle, World
 from common.messages.definitions import Belief, Hypothesis, Preference
 from common.messages.topics import QUERIES, TOPICS
@@ -31,6 +32,7 @@ WORLD = World(
 FIXED: dict[type, st.SearchStrategy] = {
     World: st.just(WORLD),
     Obstacle: st.sampled_from([*WORLD.obstacles, Obstacle(name="p", polygon=[(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)])]),
+    OccupancyGrid: st.just(OccupancyGrid.of(np.array([[0, 100, 255]], np.uint8), 0.05, (1.0, 2.0, 0.0))),
     Scanner: st.builds(
         lambda beams: Scanner(name="s", beams=beams, fov=1.0, rate=15.0, range_min=0.0, range_max=9.0, sigma=0.0),
         st.integers(2, 1000),

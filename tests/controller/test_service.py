@@ -10,7 +10,7 @@ from common.messages.requests import PredictReply, Reply
 from common.messages.topics import BELIEF, CMD_VEL, PREDICT, SCAN
 from common.runtime.service import Loop
 from services.controller import service as shell
-from services.controller.policies.epistemic import CandidateMotions
+from services.controller.policies.active_localisation import CandidateMotions
 from services.controller.service import ControllerService
 from services.controller.settings import ControllerSettings
 from tests.controller.driving import PERIOD_NS, belief, goal, room, scan

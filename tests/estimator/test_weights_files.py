@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import safetensors.numpy
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -63,9 +64,19 @@ def test_damaged_files(files, damage):
     check_error(files.path, files.load)
 
 
-@pytest.mark.parametrize("scales", [np.ones(3), np.full(int(np.prod(CLASSES)), np.nan)], ids=["shape", "not finite"])
-def test_invalid_field(tmp_path, scales):
-    path = precise.saved(FieldModel(FIELD.field, scales), tmp_path)
+@pytest.mark.parametrize(
+    ("name", "tensor"),
+    [
+        ("scales", np.ones(3, np.float32)),
+        ("scales", np.full(int(np.prod(CLASSES)), np.nan, np.float32)),
+        ("panoramas", np.ones((2, 3, 120), np.uint16)),
+    ],
+    ids=["shape", "not finite", "panoramas"],
+)
+def test_invalid_field(tmp_path, name, tensor):
+    path = precise.saved(FIELD, tmp_path)
+    path.write_bytes(safetensors.numpy.save(safetensors.numpy.load_file(path) | {name: tensor}))
+    path.with_suffix(".json").write_text(precise.card(FIELD).model_dump_json())
     check_error(path, precise_weights.load)
 
 

@@ -91,7 +91,7 @@ def test_up_drives_two_robots_to_the_goal(compose):
     up = project("up", "--exit-code-from", "goal", timeout=300)
     assert up.returncode == 0, up.stdout[-5000:] + up.stderr[-2000:]
     for robot in ("robot-1", "robot-2"):
-        assert f"{robot} | reached: within 0.2 m of the goal" in up.stdout
+        assert f"{robot} | reached: within 0.02 m of the goal" in up.stdout
     for service in (*SERVICES, "viewer"):
         assert f"{service}-1 exited with code 0" in up.stdout + up.stderr
     project.down()
@@ -116,7 +116,7 @@ def test_secure_mode_and_health(compose, tmp_path):
             assert watch.until(Truth, lambda truth: truth.pose.x > 5.0, TIMEOUT_S), project.explain("goal")
             assert known.alive() >= {"simulator", "estimator", "controller", "recorder"}
         assert project.ends("goal") == 0
-        assert "reached: within 0.2 m of the goal" in project.do("logs", "goal")
+        assert "reached: within 0.02 m of the goal" in project.do("logs", "goal")
         assert not stranger.linked()
     assert "refused" in project.do("logs", "router")
 
@@ -172,7 +172,7 @@ def test_replaced_services(compose):
         assert watch.until(Truth, lambda truth: truth.stamp_ns > alone.stamp_ns + 2e9, TIMEOUT_S) is not None
         project.do("up", "--detach", "--no-deps", "estimator", PRESAGE_ESTIMATOR="particle-filter")
         assert project.ends("goal") == 0
-        assert "reached: within 0.2 m of the goal" in project.do("logs", "goal")
+        assert "reached: within 0.02 m of the goal" in project.do("logs", "goal")
 
         # Replace the controller: the robot stops, then accepts the next goal.
         project.do("up", "--detach", "--no-deps", "controller", PRESAGE_MAX_SPEED="0.8")

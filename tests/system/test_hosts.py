@@ -20,7 +20,7 @@ def test_documented_hosts(process, tmp_path):
     script = ROOT / "tests" / "system" / "three_hosts.py"
     running = process(script, str(ROOT / "docs" / "deployment.md"), str(tmp_path))
     assert running.wait(170) == 0, running.output
-    assert "reached: within 0.2 m of the goal" in running.output
+    assert "reached: within 0.02 m of the goal" in running.output
     (file,) = (tmp_path / "recordings").glob("*.mcap")
     counts = {key.split("/")[-1]: count for key, count in read_recording(file).counts().items()}
     assert min(counts["scan"], counts["belief"], counts["cmd_vel"]) > 100

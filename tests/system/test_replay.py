@@ -147,6 +147,7 @@ def test_time_that_jumps_back(process, bus, link, tmp_path):
         stop.set()
         thread.join(WAIT_TIMEOUT_S)
     assert not any(failed.values()), [s.output for s in services]
+    assert {belief.state for belief in beliefs} == {"tracking"}
     assert max(np.hypot(*(b.pose.array() - truth[b.stamp_ns])[:2]) for b in beliefs) < 0.05
     assert {command.stamp_ns for command in commands if isinstance(command, CmdVel)} <= truth.keys()
 

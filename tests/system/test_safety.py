@@ -22,6 +22,7 @@ FAULT_SPEED = 0.97  # m/s
 START = ("--start", "3.2,1.4,0", "--beams", "271", "--pace", "lockstep", "--seed", "3")
 # m from the robot's front to the box. Braking at 1 m/s² takes 0.5 m, and the reaction a scan or two.
 BOX_DISTANCE = 0.95
+SCANS_WITH_BOX = 45  # braking takes 15
 
 
 def speed(truth):
@@ -30,27 +31,28 @@ def speed(truth):
 
 def add_barrier(bus, truth):
     """Adds a box across the whole corridor, ``BOX_DISTANCE`` ahead of the robot."""
-    box = Box(center=(truth.pose.x + 0.27 + BOX_DISTANCE + 0.2, 1.5), size=(0.4, 2.9))
+    box = Box(center=(truth.pose.x + 0.27 + BOX_DISTANCE + 0.2, 2.25), size=(0.4, 4.5))
     request = ObstacleRequest(action="add", name="barrier", obstacle=Obstacle(box=box))
     assert bus.ask(OBSTACLE, request, Reply).ok
 
 
 def drive(bus, truths, answer):
-    """Drives until the robot stands in front of the box or touches it. Returns the true states.
+    """Drives until the box has been there for `SCANS_WITH_BOX`, or the robot touches it. Returns the true states.
 
     ``answer(truth)`` must publish the message with which the simulation continues.
     """
-    seen, placed = [], False
-    while len(seen) < 600:
+    seen, end = [], 600
+    while len(seen) < end:
         truth = wait_for_message(truths, Truth, lambda _: True)
         seen.append(truth)
-        if not placed and speed(truth) > FAULT_SPEED:
+        if end == 600 and speed(truth) > FAULT_SPEED:
             add_barrier(bus, truth)  # the simulation waits during this call
-            placed = True
-        if truth.contact or (placed and speed(truth) < 1e-3):
-            return seen
+            end = len(seen) + SCANS_WITH_BOX
+        if truth.contact:
+            break
         answer(truth)
-    raise AssertionError("the robot neither stopped nor touched the box")
+    assert end < 600, "the robot never drove at full speed"
+    return seen
 
 
 @pytest.fixture
@@ -71,10 +73,10 @@ def test_obstacle_stop_of_the_base(process, bus, truths, stop):
         bus.put(CMD_VEL, CmdVel(stamp_ns=truth.stamp_ns, twist=Twist(vx=1.0)).encode())
 
     seen = drive(bus, truths, command_full_speed)
-    assert max(map(speed, seen)) > FAULT_SPEED
     # Without the obstacle stop there is contact, so the test is meaningful.
     assert seen[-1].contact == (stop == "--no-obstacle-stop")
     assert seen[-1].stopped == (stop == "--obstacle-stop")
+    assert not seen[-1].stopped or speed(seen[-1]) < 1e-3
     assert simulator.stop() == 0, simulator.output
 
 
@@ -101,9 +103,7 @@ def test_controller_without_obstacle_stop(process, bus, truths, base):
         bus.put(BELIEF, belief.encode())
 
     seen = drive(bus, truths, publish_true_belief)
-    assert max(map(speed, seen)) > FAULT_SPEED
     assert not any(truth.contact for truth in seen)
-    status = wait_for_message(statuses, Status, lambda status: status.stamp_ns == seen[-2].stamp_ns)
-    assert status.reason.startswith("waiting: something")
+    wait_for_message(statuses, Status, lambda status: status.reason.startswith("waiting: something"))
     for running in (simulator, controller):
         assert running.stop() == 0, running.output

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 
+import numpy as np
 import pytest
 import yaml
 
@@ -68,7 +69,7 @@ def test_death_and_restart(process, bus):
     """Started in the order opposite to the data's; then each is killed while the robot drives."""
     running = {}
     for name in ("controller", "estimator", "simulator"):
-        running[name] = process(name, *(("--initial-pose", "3,1.5") if name == "estimator" else ()))
+        running[name] = process(name, *(("--initial-pose", "3,1.5,90") if name == "estimator" else ()))
         assert wait_until(lambda n=name: n in bus.alive(), 60)
     next_message(bus, BELIEF, lambda belief: belief.state == "tracking")
     assert bus.wait_matching(GOAL, 10)
@@ -78,7 +79,8 @@ def test_death_and_restart(process, bus):
     running["estimator"].kill()
     next_message(bus, STATUS, lambda status: "no belief" in status.reason)
     pose = next_message(bus, TRUTH, standing).pose
-    running["estimator"] = process("estimator", "--initial-pose", f"{pose.x:.3f},{pose.y:.3f}")
+    start = f"{pose.x:.3f},{pose.y:.3f},{np.rad2deg(pose.yaw):.1f}"
+    running["estimator"] = process("estimator", "--initial-pose", start)
     next_message(bus, STATUS, lambda status: status.state == "navigating" and "standing" not in status.reason)
     next_message(bus, TRUTH, moving)
 

@@ -39,7 +39,7 @@ def test_demo_reaches_its_goal(process, tmp_path):
     assert numbers["straight_line_m"] >= 12
     assert numbers["localised_after_scans"] >= 1
     assert numbers["localised_error_m"] < 0.5
-    assert numbers["goal_distance_m"] < 0.2 + 0.3
+    assert numbers["goal_distance_m"] < 0.02 + 0.3
     assert numbers["contacts"] == 0
     assert numbers["scans"] > 100
     (path,) = out.glob("presage*.mcap")

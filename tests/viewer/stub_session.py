@@ -109,6 +109,10 @@ class Session:
                     "x": goal[0], "y": goal[1], "yaw": goal[2] if len(goal) > 2 else 0.0, "tolerance": 0.2,
                     "yaw_tolerance": 0.15 if len(goal) > 2 else None,
                 },
+                "energy": {
+                    "risk": 0.12, "ambiguity": 0.002, "pose_information": 0.0001, "place_information": 0.0,
+                    "probability": 0.4,
+                },
             },
             "latency_ms": 6.4 + float(self.rng.normal()),
             "scan": {

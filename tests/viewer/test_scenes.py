@@ -26,7 +26,8 @@ OVERLAPPING = """((boxes) => boxes.filter(([, a], i) => boxes.some(([, b], k) =>
     && b.left < a.right - 1 && a.top < b.bottom - 1 && b.top < a.bottom - 1)).map(([name]) => name))(
     ["#legend", "#zoom", "#why", "#sub", "#toolbar", "#joystick"].map((name) => [name, document.querySelector(name)])
         .filter(([, box]) => box.checkVisibility()).map(([name, box]) => [name, box.getBoundingClientRect()]))"""
-TOOLS = """[...document.querySelectorAll("#toolbar button, #toolbar .speed")].map((tool) => {
+TOOLS = """[...document.querySelectorAll("#toolbar button, #toolbar .speed")]
+    .filter((tool) => tool.checkVisibility()).map((tool) => {
     const { left, right, bottom, height } = tool.getBoundingClientRect(), label = tool.querySelector("span");
     return { left, right, bottom, height, text: label.checkVisibility() ? label.innerText : "" };
 })"""

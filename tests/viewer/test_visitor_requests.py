@@ -27,6 +27,7 @@ GOOD = [
     ({"do": "speed", "factor": 2}, requests.SetSpeed(do="speed", factor=2)),
     ({"do": "drive", "vx": 0.5, "vy": 0, "wz": -1}, requests.DriveByHand(do="drive", vx=0.5, vy=0, wz=-1)),
     ({"do": "record", "action": "start"}, requests.Record(do="record", action="start")),
+    ({"do": "save_map", "name": "here"}, requests.SaveMap(do="save_map", name="here")),
     ({"do": "recordings"}, requests.ListRecordings(do="recordings")),
     ({"do": "open", "name": "run.mcap"}, requests.Open(do="open", name="run.mcap")),
     ({"do": "close"}, requests.Close(do="close")),

@@ -1,12 +1,15 @@
-"""Chooses velocities that help to localise the robot.
+"""Chooses where to drive while the pose is ambiguous or unknown.
 
-While several places are possible, destinations are rated by how well a scan taken there is expected to tell the places
-apart (`epistemic`). While no place is known at all, the robot drives where there is most room, because scans from there
-show the largest part of the surroundings.
+Policies are drives to a place, and their expected free energy is that of `expected_free_energy`: the way to the place
+and from there to the goal, minus what a scan from there is expected to tell. With several possible places, that is how
+well predicted scans tell them apart; with an unknown pose, any scan is taken to tell it. In both cases a scan from near
+a place where the robot has been since tells less, because scans from one place are not independent.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,10 +17,11 @@ import numpy as np
 from common.geometry import se2
 from common.robot.ranges import is_surface
 from common.robot.scan_geometry import Sweep
-from services.controller.policies.action_selection import Surroundings, select_action
+from services.controller.policies import expected_free_energy as efe
 from services.controller.policies.decision import Decision
-from services.controller.policies.epistemic import CandidateMotions, DestinationSelector
+from services.controller.policies.expected_free_energy import NATS_PER_METRE, ExpectedFreeEnergy
 from services.controller.policies.motion_model import turn_to_attractor
+from services.controller.policies.policy_selection import Surroundings, select_policy
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -29,15 +33,71 @@ if TYPE_CHECKING:
 
 MIN_WEIGHT = 0.02  # hypotheses with less weight are ignored
 MAX_HYPOTHESES = 6
-DESTINATION_SPACING_M = 1.0
-MIN_PATH_M, MAX_PATH_M = 0.8, 12.0  # length of the path to a destination
-MAX_DESTINATIONS = 60
-CHOICE_PERIOD_NS = 1_000_000_000  # minimum time between two choices of a destination
+PLACE_SPACING_M = 1.0
+MIN_PATH_M, MAX_PATH_M = 0.8, 12.0  # length of the path to a place
+MAX_PLACES = 60
+CHOICE_PERIOD_NS = 1_000_000_000  # minimum time between two choices of a place
 MAX_SPEED = 0.5  # m/s, because it is not known what is behind and beside the robot
 INITIAL_WAIT_NS = 1_000_000_000  # time for the estimator to localise before the robot moves
+VIEW_LENGTH_M = 1.0  # scans from places this far apart are nearly independent
+MAX_VISITED = 100  # positions kept, VISITED_SPACING_M apart
+VISITED_SPACING_M = 0.25
+STALLED_NS = 3_000_000_000  # time without motion after which a place counts as visited, because no way leads there
 MAX_USEFUL_ROOM_M = 5.0  # more room than this is no advantage
 WINDOW_RAD = 0.35  # to either side of a direction; its room is the shortest range in this window
 MIN_ROOM_M = 0.7  # if every direction has less, the robot turns on the spot
+NOMINAL_SIGMA_M = 0.02  # of a beam whose precision is not in doubt
+
+
+@dataclass(frozen=True)
+class CandidateMotions:
+    """Possible motions under one belief. The first hypothesis is the best one."""
+
+    hypotheses: Array  # (K, 3) base_link in map
+    weights: Array  # (K,)
+    displacements: Array  # (M, 3) places in base_link of the first hypothesis; the same motion applies to each
+    lengths: Array  # (M,) m to drive there
+
+    def poses(self) -> Array:
+        """Poses (K, M, 3) in map after each motion from each hypothesis."""
+        return se2.compose(self.hypotheses[:, None, :], self.displacements[None, :, :])
+
+
+class VisitedPlaces:
+    """Where the robot has been while its pose was not known, by its commands, in the present base_link."""
+
+    def __init__(self) -> None:
+        self.positions = np.zeros((1, 2))  # (V, 2) m
+        self._stamp_ns: int | None = None
+        self._progress = np.zeros(2), 0  # m and ns, where and when the robot last got on
+
+    def move(self, stamp_ns: int, velocity: Array) -> Array:
+        """Advance to a stamp with the latest command (3,). Returns the motion (3,) since the stamp before."""
+        seconds = 0.0 if self._stamp_ns is None else max(0.0, (stamp_ns - self._stamp_ns) * 1e-9)
+        motion = velocity * seconds
+        self.positions = se2.rotate(-motion[2], self.positions - motion[:2])
+        place, since_ns = self._progress
+        self._progress = se2.rotate(-motion[2], place - motion[:2]), since_ns
+        if self._stamp_ns is None or np.hypot(*self._progress[0]) > VISITED_SPACING_M:
+            self._progress = np.zeros(2), stamp_ns
+        self._stamp_ns = stamp_ns
+        if np.hypot(*self.positions.T).min() > VISITED_SPACING_M:
+            self._add(np.zeros(2))
+        return motion
+
+    def give_up(self, place: Array) -> None:
+        """If the robot does not get on, count the place (2,) m that it drives to as visited."""
+        if self._stamp_ns is not None and self._stamp_ns - self._progress[1] > STALLED_NS:
+            self._progress = np.zeros(2), self._stamp_ns
+            self._add(place)
+
+    def _add(self, place: Array) -> None:
+        self.positions = np.concatenate([self.positions, place[None]])[-MAX_VISITED:]
+
+    def novelty(self, places: Array) -> Array:
+        """Share (M,) of the information of a scan that is new at places (M, 2) m in base_link."""
+        distance = np.hypot(*np.moveaxis(places[:, None] - self.positions, -1, 0)).min(axis=1)
+        return np.asarray(-np.expm1(-(distance**2) / (2 * VIEW_LENGTH_M**2)))
 
 
 class ActiveLocaliser:
@@ -50,79 +110,83 @@ class ActiveLocaliser:
         self.may_turn = may_turn
         self.robot = robot.model_copy(update={"max_speed": min(robot.max_speed, MAX_SPEED)})
         self.graph, self.min_point_distance = graph, min_point_distance
-        self.selector = DestinationSelector()
-        self._requested: tuple[int, CandidateMotions] | None = None  # stamp in ns and motions of the last request
-        self._field: tuple[Array, CostField | None] | None = None  # a destination (2,) m and its field
-        self._unknown_since_ns: int | None = None  # stamp since which there are no likely hypotheses
+        area = float((graph.free.clearance > 0).sum()) * graph.grid.resolution**2
+        # Of a pose of which nothing is known, at the resolution of the pose.
+        self._unknown_entropy = float(np.log(max(1.0, 2 * np.pi * area / np.sqrt(np.linalg.det(efe.RESOLUTION)))))
+        self.reset()
 
     def reset(self) -> None:
         """Forget everything. Call it when the pose is known, or the goal has changed."""
-        self.selector.reset()
-        self._requested, self._field, self._unknown_since_ns = None, None, None
+        self._visited = VisitedPlaces()
+        self._requested: tuple[int, CandidateMotions] | None = None  # stamp in ns and motions of the last request
+        self._place: tuple[Array, dict[str, float]] | None = None  # (3,) in base_link, and its expected free energy
+        self._field: tuple[Array, CostField | None] | None = None  # a place (2,) m in map and its field
+        self._unknown_since_ns: int | None = None  # stamp since which there are no likely hypotheses
 
     def prediction_request(self, belief: Belief) -> CandidateMotions | None:
         """Candidate motions; scans must be predicted for their end poses and passed to `use_predictions`.
 
         Returns None if no predictions are needed now.
         """
-        hypotheses = [h for h in belief.hypotheses if h.weight >= MIN_WEIGHT][:MAX_HYPOTHESES]
-        if belief.state != "ambiguous" or len(hypotheses) < 2:
-            return None
+        poses, weights = _likely(belief)
         stamp = belief.stamp_ns
-        if self._requested is not None and 0 <= stamp - self._requested[0] < CHOICE_PERIOD_NS:
+        if len(poses) < 2 or (self._requested is not None and 0 <= stamp - self._requested[0] < CHOICE_PERIOD_NS):
             return None
-        poses, weights = np.array([h.pose.array() for h in hypotheses]), np.array([h.weight for h in hypotheses])
-        displacements, lengths = self._destinations(poses[0])
-        if (kept := self.selector.displacement(poses[0])) is not None:
-            displacements = np.concatenate([kept[None], displacements])
-            lengths = np.concatenate([[np.hypot(*kept[:2])], lengths])
+        displacements, lengths = self._places(poses[0])
+        if self._place is not None:
+            displacements = np.concatenate([self._place[0][None], displacements])
+            lengths = np.concatenate([[np.hypot(*self._place[0][:2])], lengths])
         if not len(lengths):
             return None
         self._requested = (stamp, CandidateMotions(poses, weights, displacements, lengths))
         return self._requested[1]
 
-    def use_predictions(self, reply: PredictReply, range_max: float) -> None:
-        """Choose a destination with the predictions for the last request. Does nothing if the request was refused."""
-        if self._requested is None or not reply.ok:
+    def use_predictions(self, reply: PredictReply, range_max: float, to_goal: Callable[[Array], Array]) -> None:
+        """Choose a place with the predictions for the last request; ``to_goal``: (..., 2) m in map -> (...,) m."""
+        if self._requested is None:
             return
-        stamp, motions = self._requested
+        _, motions = self._requested
         shape = (len(motions.hypotheses), len(motions.displacements), -1)
         ranges = reply.ranges.astype(np.float64).reshape(shape)
         sigma = reply.sigma.astype(np.float64).reshape(shape) if len(reply.sigma) else np.full_like(ranges, 0.05)
-        self.selector.choose(stamp, motions, ranges, sigma, range_max)
+        energy = drive_energy(motions, ranges, sigma, range_max, to_goal, self._visited.novelty)
+        best = int(np.argmin(energy.total))
+        self._place = motions.displacements[best], energy.of(best, energy.total)
 
     def decide(self, belief: Belief, scan: Scan, points: Array, velocity: Array, view: Sector) -> Decision:
         """Choose a velocity; ``points`` (K, 2) m in base_link are obstacles, ``view`` is what the scanner sees."""
+        motion = self._visited.move(belief.stamp_ns, velocity)
+        if self._place is not None:
+            self._place = (se2.between(motion, self._place[0]), self._place[1])
         static = np.zeros(len(points), bool)
         surroundings = Surroundings(
             _no_walls, points, static, 0.0, self.min_point_distance, view=view, may_turn=self.may_turn
         )
-        likely = [h for h in belief.hypotheses if h.weight >= MIN_WEIGHT][:MAX_HYPOTHESES]
-        if belief.state == "ambiguous" and likely:
+        poses, _ = _likely(belief)
+        if len(poses) > 1:
             self._unknown_since_ns = None
-            poses, weights = np.array([h.pose.array() for h in likely]), np.array([h.weight for h in likely])
-            destination = self.selector.follow(belief.stamp_ns, poses, weights)
-            if destination is not None:
-                return self._drive_to(poses[0], destination, surroundings, velocity, len(likely))
-            return Decision(reason=f"{len(likely)} places are possible: looking for where to tell them apart")
+            if self._place is not None:
+                self._visited.give_up(self._place[0][:2])
+                return self._drive_to(poses[0], *self._place, surroundings, velocity, len(poses))
+            return Decision(reason=f"{len(poses)} places are possible: looking for where to tell them apart")
         if self._unknown_since_ns is None or belief.stamp_ns < self._unknown_since_ns:
             self._unknown_since_ns = belief.stamp_ns
         if belief.stamp_ns - self._unknown_since_ns < INITIAL_WAIT_NS:
             return Decision(reason=f"the belief is {belief.state}: looking", state="lost")
-        return self._wander(belief, scan, surroundings, velocity)
+        return self._look_elsewhere(belief, scan, surroundings, velocity)
 
-    def _destinations(self, pose: Array) -> tuple[Array, Array]:
-        """Displacements (M, 3) in base_link and path lengths (M,) m of the destinations around a hypothesis (3,)."""
-        field = self.graph.cost_field(pose[:2], self.min_point_distance + DESTINATION_SPACING_M)
+    def _places(self, pose: Array) -> tuple[Array, Array]:
+        """Displacements (M, 3) in base_link and path lengths (M,) m of the places around a hypothesis (3,)."""
+        field = self.graph.cost_field(pose[:2], self.min_point_distance + PLACE_SPACING_M)
         if field is None:
             return np.zeros((0, 3)), np.zeros(0)
-        step = max(1, round(DESTINATION_SPACING_M / self.graph.grid.resolution))
+        step = max(1, round(PLACE_SPACING_M / self.graph.grid.resolution))
         rows, columns = np.meshgrid(*(np.arange(step // 2, n, step) for n in field.cost.shape), indexing="ij")
         cells = (rows * field.cost.shape[1] + columns).ravel()
         cost = field.cost.ravel()[cells]
         cells, cost = (each[(cost > MIN_PATH_M) & (cost < MAX_PATH_M)] for each in (cells, cost))
-        # Thin out to MAX_DESTINATIONS, evenly over the costs.
-        selected = np.argsort(cost, kind="stable")[:: max(1, -(-len(cost) // MAX_DESTINATIONS))]
+        # Thin out to MAX_PLACES, evenly over the costs.
+        selected = np.argsort(cost, kind="stable")[:: max(1, -(-len(cost) // MAX_PLACES))]
         cells, cost = cells[selected], cost[selected]
         # Paths of the field lead to the hypothesis, so a cell's next cell is the previous one on the way there.
         places, previous = self.graph.grid.centres(cells), self.graph.grid.centres(field.next_cell[cells])
@@ -130,54 +194,106 @@ class ActiveLocaliser:
         return se2.between(pose, np.column_stack([places, heading])), cost
 
     def _drive_to(
-        self, pose: Array, destination: Array, surroundings: Surroundings, velocity: Array, count: int
+        self,
+        pose: Array,
+        place: Array,
+        terms: dict[str, float],
+        surroundings: Surroundings,
+        velocity: Array,
+        count: int,
     ) -> Decision:
-        """Drive from the first of ``count`` hypotheses towards a destination (3,)."""
-        target = destination[:2]
-        if self._field is None or np.hypot(*(self._field[0] - target)) > self.graph.grid.resolution:
-            field = self.graph.cost_field(target, self.min_point_distance + DESTINATION_SPACING_M)
-            self._field = (np.array(target), field)
+        """Drive from the first of ``count`` hypotheses towards a place (3,) in base_link."""
+        target = se2.compose(pose, place)[:2]
+        if self._field is None or np.hypot(*(self._field[0] - target)) > 2 * self.graph.grid.resolution:
+            self._field = (target, self.graph.cost_field(target, self.min_point_distance + PLACE_SPACING_M))
         field = self._field[1]
         path = field.path(pose[:2]) if field is not None else np.zeros((0, 2))
         reason = f"{count} places are possible: going to ({target[0]:.1f}, {target[1]:.1f}) to tell them apart"
         if field is None or not len(path):
-            self.selector.reset()
+            self._place = None
             return Decision(reason="no way to where places could be told apart", state="blocked")
-        point = field.attractor(pose[:2], path)
-        attractor = se2.rotate(-pose[2], point - pose[:2])
-        return self._approach(attractor, surroundings, velocity, reason, path)
+        attractor = se2.rotate(-pose[2], field.attractor(pose[:2], path) - pose[:2])
+        return self._approach(attractor, surroundings, velocity, Decision(reason=reason, path=path, terms=terms))
 
-    def _wander(self, belief: Belief, scan: Scan, surroundings: Surroundings, velocity: Array) -> Decision:
-        """Drive in the direction with the most room, preferring directions ahead."""
-        ranges = np.where(np.isneginf(scan.ranges), 0.0, scan.ranges.astype(np.float64))
-        ranges = np.minimum(ranges, MAX_USEFUL_ROOM_M)
-        # Beams that were not measured, or were cut out, must not limit the room: their neighbours decide.
-        ranges[~is_surface(scan.ranges) & ~np.isinf(scan.ranges)] = np.inf
-        angles = scan.angles() + scan.mount.yaw
-        sweep = Sweep.of(scan)
-        half = max(1, round(WINDOW_RAD / max(sweep.spacing, WINDOW_RAD / 1000)))  # beams
-        # Padding with 0: outside the field of view there is no room.
-        padded = np.pad(ranges, half, mode="wrap") if sweep.all_round else np.pad(ranges, half)
-        room = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1).min(axis=1)
-        room[np.isinf(room)] = 0.0  # no beam in the window measured anything
-        best = int(np.argmax(room + 0.5 * np.cos(angles - surroundings.forward)))
+    def _look_elsewhere(self, belief: Belief, scan: Scan, surroundings: Surroundings, velocity: Array) -> Decision:
+        """Drive straight to where a scan is expected to tell most, by the room that the present scan shows."""
+        bearing, room = _room(scan)
+        length = np.minimum(room - self.min_point_distance, MAX_USEFUL_ROOM_M)
         reason = f"the belief is {belief.state}: going where there is room, to see more"
-        if room[best] < MIN_ROOM_M:
+        if room.max() < MIN_ROOM_M:
             return Decision(np.array([0.0, 0.0, 0.5]), reason.replace("going", "turning to"), "exploring")
-        distance = min(float(room[best]) - self.min_point_distance, 2.0)
-        attractor = distance * np.array([np.cos(angles[best]), np.sin(angles[best])])
-        return self._approach(attractor, surroundings, velocity, reason, np.zeros((0, 2)))
+        direction = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
+        turn = np.abs(se2.wrap(bearing - surroundings.forward)) * self.robot.max_speed / self.robot.max_turn
+        gain = self._unknown_entropy * self._visited.novelty(np.maximum(length, 0.0)[:, None] * direction)
+        nothing = np.zeros(len(gain))
+        energy = ExpectedFreeEnergy(NATS_PER_METRE * (length + turn), nothing, nothing, gain)
+        best = int(np.argmin(energy.total))
+        self._visited.give_up(length[best] * direction[best])
+        attractor = min(float(length[best]), 2.0) * direction[best]
+        return self._approach(
+            attractor, surroundings, velocity, Decision(reason=reason, terms=energy.of(best, energy.total))
+        )
 
-    def _approach(
-        self, attractor: Array, surroundings: Surroundings, velocity: Array, reason: str, path: Array
-    ) -> Decision:
-        selected = select_action(velocity, attractor, surroundings, self.robot)
+    def _approach(self, attractor: Array, surroundings: Surroundings, velocity: Array, decision: Decision) -> Decision:
+        """The ``decision`` with a velocity towards the attractor (2,) m in base_link."""
         action = turn_to_attractor(
-            selected.action, attractor, self.robot, may_turn=self.may_turn, forward=surroundings.forward
+            select_policy(velocity, attractor, surroundings, self.robot).action,
+            attractor,
+            self.robot,
+            may_turn=self.may_turn,
+            forward=surroundings.forward,
         )
         if not action.any() and self.may_turn:  # no free motion: turn to look elsewhere
             action[2] = 0.5 if attractor[1] >= 0 else -0.5
-        return Decision(action, reason, "exploring", path)
+        decision.action, decision.state = action, "exploring"
+        return decision
+
+
+def drive_energy(
+    motions: CandidateMotions,
+    ranges: Array,
+    sigma: Array,
+    range_max: float,
+    to_goal: Callable[[Array], Array],
+    novelty: Callable[[Array], Array],
+) -> ExpectedFreeEnergy:
+    """Expected free energy of M drives under K hypotheses.
+
+    ``ranges`` and ``sigma`` (K, M, B) m are the scans predicted at the ends; ``to_goal`` returns the distance (...,) m
+    to the goal from places (..., 2) m in map, ``novelty`` the new share (M,) of scans at places (M, 2) m in base_link.
+    """
+    onwards = motions.weights @ to_goal(motions.poses()[..., :2]) / motions.weights.sum()
+    noise = NOMINAL_SIGMA_M**2 + efe.ARRIVAL_ERROR_M**2
+    beams = np.log((sigma**2 + efe.ARRIVAL_ERROR_M**2) / noise).mean(axis=2) / 2
+    gain = efe.place_information(motions.weights, ranges, sigma, range_max)
+    return ExpectedFreeEnergy(
+        NATS_PER_METRE * (motions.lengths + onwards),
+        motions.weights @ beams / motions.weights.sum(),
+        np.zeros(len(gain)),
+        gain * novelty(motions.displacements[:, :2]),
+    )
+
+
+def _likely(belief: Belief) -> tuple[Array, Array]:
+    """Poses (K, 3) and weights (K,) of the likely hypotheses of an ambiguous belief, best first."""
+    likely = [h for h in belief.hypotheses if h.weight >= MIN_WEIGHT and belief.state == "ambiguous"][:MAX_HYPOTHESES]
+    poses = np.array([h.pose.array() for h in likely]).reshape(-1, 3)
+    return poses, np.array([h.weight for h in likely])
+
+
+def _room(scan: Scan) -> tuple[Array, Array]:
+    """Bearing (B,) rad in base_link of each beam, and the room in its direction (B,) m: the least range around it."""
+    ranges = np.where(np.isneginf(scan.ranges), 0.0, scan.ranges.astype(np.float64))
+    ranges = np.minimum(ranges, MAX_USEFUL_ROOM_M)
+    # Beams that were not measured, or were cut out, must not limit the room: their neighbours decide.
+    ranges[~is_surface(scan.ranges) & ~np.isinf(scan.ranges)] = np.inf
+    sweep = Sweep.of(scan)
+    half = max(1, round(WINDOW_RAD / max(sweep.spacing, WINDOW_RAD / 1000)))  # beams
+    # Padding with 0: outside the field of view there is no room.
+    padded = np.pad(ranges, half, mode="wrap") if sweep.all_round else np.pad(ranges, half)
+    room = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1).min(axis=1)
+    room[np.isinf(room)] = 0.0  # no beam in the window measured anything
+    return scan.angles() + scan.mount.yaw, room
 
 
 def _no_walls(positions: Array) -> Array:

@@ -30,6 +30,7 @@ class Decision:
     motion: Array = field(default_factory=_no_points)  # (T, 2) m in map, predicted for the action until standstill
     recovering: bool = False  # a recovery motion, which does not lead to the goal
     refused: bool = False  # the goal turned out to be unreachable
+    terms: dict[str, float] | None = None  # of the expected free energy, as in the message PolicyEnergy
 
 
 class Policy(Protocol):
@@ -49,6 +50,9 @@ class Policy(Protocol):
 
     def resume(self) -> None:
         """Undo the last `interrupt`: the simulation was only paused, no simulated time has passed."""
+
+    def prepare(self, scan: Scan) -> None:
+        """Compute what depends on the scanner; called with each scan, before its belief."""
 
     def observe(self, scan: Scan, belief: Belief) -> None:
         """Process a scan and the belief computed from it."""

@@ -90,3 +90,9 @@ class FreeSpace:
     def clearance_at(self, points: Array) -> Array:
         """Interpolated distance (...,) m from points (..., 2) m in map to the nearest wall."""
         return self.grid.interpolate(self.clearance, points)
+
+    def normal_at(self, points: Array) -> Array:
+        """Direction (..., 2) in which the clearance grows at points (..., 2) m: near a wall, its normal."""
+        step = self.grid.resolution / 2 * np.eye(2)
+        slope = np.stack([self.clearance_at(points + e) - self.clearance_at(points - e) for e in step], axis=-1)
+        return np.asarray(slope / np.maximum(np.hypot(slope[..., 0], slope[..., 1]), 1e-9)[..., None])

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 
 WALL_GAP_M = 0.03  # minimum distance between footprint and wall, a little more than the obstacle stop needs
 WALL_COST_RANGE_M = 0.35  # range of clearances beyond the minimum within which a metre costs more
-MAX_WALL_COST = 1.0  # additional cost of a metre at the minimum clearance
+STOP_RANGE_M = 0.05  # and once more within this range, where noise in the scan makes the obstacle stop brake the robot
+MAX_WALL_COST = 1.0  # additional cost of a metre at the minimum clearance, for each of the two ranges
 ATTRACTOR_RANGE_M = 3.0  # length of the path within which the attractor is chosen
 MAX_ATTRACTOR_CANDIDATES = 12
 MAX_LINE_COST_RATIO = 1.02  # cost of the straight line to the attractor, relative to the path on the grid
@@ -53,6 +54,7 @@ class FreeSpaceGraph:
         self._opposite[np.lexsort((self._to, self._from))] = np.lexsort((self._from, self._to))
         self._near_obstacles = np.zeros(self.grid.cells, bool)  # cells whose cost temporary obstacles may change
         self.slowness = np.zeros(self.grid.shape)  # cost of a metre in each cell
+        self._metre_cost = np.zeros(self.grid.cells)  # part of it that does not depend on clearance, above 1
         self._update_weights(~self._near_obstacles)
         _, self.component = connected_components(self._graph, directed=False)  # (cells,), without temporary obstacles
         self._centres = self.grid.centres()
@@ -71,10 +73,15 @@ class FreeSpaceGraph:
             self.clearance = clearance.reshape(self.grid.shape)
         self._update_weights(before | self._near_obstacles)
 
+    def set_metre_cost(self, cost: Array) -> None:
+        """Set an additional cost (cells,) of a metre in each cell."""
+        self._metre_cost = cost
+        self._update_weights(np.ones(self.grid.cells, bool))
+
     def _update_weights(self, changed: npt.NDArray[np.bool_]) -> None:
         """Recompute the weights of all edges of the ``changed`` cells (cells,) bool."""
         clearance, slow = self.clearance.ravel(), self.slowness.ravel()
-        slow[changed] = slowness(clearance[changed], self.min_clearance)
+        slow[changed] = slowness(clearance[changed], self.min_clearance) + self._metre_cost[changed]
         outgoing = np.flatnonzero(changed[self._from])
         edges = np.concatenate([outgoing, self._opposite[outgoing]])
         s = np.where(clearance >= self.min_clearance, slow, np.inf)
@@ -186,9 +193,10 @@ class CostField:
 
 
 def slowness(clearance: Array, min_clearance: float) -> Array:
-    """Cost of a metre at a clearance (N,) m: 1 far from walls, 1 + MAX_WALL_COST at ``min_clearance``."""
-    closeness = np.clip(1 - (clearance - min_clearance) / WALL_COST_RANGE_M, 0, 1)
-    return np.asarray(1 + MAX_WALL_COST * closeness**2)
+    """Cost of a metre at a clearance (N,) m: 1 far from walls, and most at ``min_clearance``."""
+    gap = clearance - min_clearance
+    closeness, tightness = (np.clip(1 - gap / range_m, 0, 1) for range_m in (WALL_COST_RANGE_M, STOP_RANGE_M))
+    return np.asarray(1 + MAX_WALL_COST * (closeness**2 + tightness**2))
 
 
 def _dilate(cells: npt.NDArray[np.bool_], by: int) -> npt.NDArray[np.bool_]:

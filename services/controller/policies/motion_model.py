@@ -1,7 +1,8 @@
-"""Predicted motion under a velocity command, until the robot stands.
+"""Policies, and the motion that they lead to, until the robot stands.
 
-The outcome of an action is defined as the place where the robot would stand if it braked after the action. Acceleration
-limits are thus part of the prediction, and if an action's outcome is free, the robot can always stop in time.
+A policy (5,) is an action, a velocity in m/s, m/s and rad/s in base_link, and two times in s, for which its linear part
+and its turn are held; then the robot brakes them. Acceleration limits are thus part of the prediction, and if a
+policy's motion is free, the robot can always stop in time.
 """
 
 from __future__ import annotations
@@ -14,17 +15,24 @@ from common.geometry import se2
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
+    from common.messages.definitions import Scan
     from common.robot.base import Robot
 
-HOLD_S = 0.4  # how long a prediction holds an action; the next scan leads to a new decision
+HOLD_S = 0.4  # how long most policies hold their action; the next scan leads to a new decision
 STEP_S = 1 / 15
+SHORT_HOLDS_S = STEP_S * np.arange(1, 6)  # of policies that brake, or stop turning, for their target later
 TURN_ACCELERATION_SHARE = 0.4  # share of the acceleration that a turn during motion may use
 NEAR_ATTRACTOR_M = 0.5
 STANDING_SPEED = 0.02  # m/s or rad/s; anything slower counts as standing
 
 
-def rollouts(current: Array, actions: Array, robot: Robot, hold: float = HOLD_S) -> tuple[Array, Array, Array]:
-    """Predict the motion of actions (N, 3) that are held for ``hold`` s and then braked.
+def delay_until_effect(robot: Robot, scan: Scan | None) -> float:
+    """Time in s from a scan's stamp until the command that answers it takes effect."""
+    return robot.latency + (scan.sweep_time if scan is not None else 0.0)
+
+
+def rollouts(current: Array, policies: Array, robot: Robot) -> tuple[Array, Array, Array]:
+    """Predict the motion of policies (N, 5).
 
     ``current`` (3,) is the present velocity in base_link. A holonomic base keeps its direction in the map while it
     turns, because each scan leads to a new command; a differential base drives arcs.
@@ -32,20 +40,26 @@ def rollouts(current: Array, actions: Array, robot: Robot, hold: float = HOLD_S)
     Returns poses (N, T, 3) in the present base_link, their times (T,) s, and the times (N,) s after which the robot
     stands, apart from a turn on the spot.
     """
-    times = np.arange(0, hold + max_braking_time(robot), STEP_S) + STEP_S / 2
-    held = times < hold
+    actions, hold, turn_hold = policies[:, :3], policies[:, 3], policies[:, 4]
+    times = np.arange(0, HOLD_S + max_braking_time(robot), STEP_S) + STEP_S / 2
+    accelerating = np.minimum(times, hold[:, None])  # (N, T)
     change = actions - current
     linear = np.maximum(np.hypot(change[:, 0], change[:, 1]), 1e-12)[:, None]
-    progress = np.minimum(1.0, robot.acceleration * np.minimum(times, hold) / linear)  # (N, T) share of the change
-    max_turn_change = robot.turn_acceleration * np.minimum(times, hold)
+    progress = np.minimum(1.0, robot.acceleration * accelerating / linear)  # share of the change
+    turning = np.minimum(times, turn_hold[:, None])
+    max_turn_change = robot.turn_acceleration * turning
     velocity = np.empty((len(actions), len(times), 3))
     velocity[..., :2] = current[:2] + change[:, None, :2] * progress[..., None]
     velocity[..., 2] = current[2] + np.clip(change[:, None, 2], -max_turn_change, max_turn_change)
-    braking_time = np.where(held, 0.0, times - hold)
+    braking_time = times - accelerating
     speed = np.maximum(np.hypot(velocity[..., 0], velocity[..., 1]), 1e-12)
-    velocity[..., :2] *= np.maximum(0.0, 1 - robot.acceleration * braking_time / speed)[..., None]
-    max_turn_braking = robot.turn_acceleration * braking_time
-    velocity[..., 2] -= np.clip(velocity[..., 2], -max_turn_braking, max_turn_braking)
+    share_left = np.maximum(0.0, 1 - robot.acceleration * braking_time / speed)
+    velocity[..., :2] *= share_left[..., None]
+    least_turn = np.abs(velocity[..., 2]) - robot.turn_acceleration * (times - turning)
+    if robot.drive == "differential":  # it brakes on its arc, if it can brake its turn as fast
+        on_arc = np.abs(velocity[..., 2]) * share_left * (turn_hold >= hold)[:, None]
+        least_turn = np.maximum(least_turn, on_arc)
+    velocity[..., 2] = np.sign(velocity[..., 2]) * np.maximum(0.0, least_turn)
     yaw = np.cumsum(velocity[..., 2], axis=1) * STEP_S
     linear_velocity = velocity[..., :2]
     if robot.drive == "differential":
@@ -54,7 +68,8 @@ def rollouts(current: Array, actions: Array, robot: Robot, hold: float = HOLD_S)
         vx, vy = velocity[..., 0], velocity[..., 1]
         linear_velocity = np.stack([cos * vx - sin * vy, sin * vx + cos * vy], axis=-1)
     poses = np.concatenate([np.cumsum(linear_velocity, axis=1) * STEP_S, yaw[..., None]], axis=-1)
-    top_speed = np.hypot(*(current[:2] + change[:, :2] * np.minimum(1.0, robot.acceleration * hold / linear)).T)
+    share = np.minimum(1.0, robot.acceleration * hold[:, None] / linear)
+    top_speed = np.hypot(*(current[:2] + change[:, :2] * share).T)
     return poses, times + STEP_S / 2, hold + top_speed / robot.acceleration
 
 
@@ -74,9 +89,26 @@ def braking_speed(distance: float, robot: Robot, hold: float = HOLD_S) -> float:
     return min(robot.max_speed, float(a * (np.sqrt(hold**2 + 2 * max(distance, 0.0) / a) - hold)))
 
 
-def turn_rate(angle: float, robot: Robot) -> float:
-    """Turn rate in rad/s towards a heading that is ``angle`` rad away, from which the robot can brake in time."""
-    rate = robot.turn_acceleration * (np.sqrt(STEP_S**2 + 2 * abs(angle) / robot.turn_acceleration) - STEP_S)
+def stopping_action(current: Array, target: Array, robot: Robot, hold: float) -> Array | None:
+    """Action (3,) that, held for ``hold`` s and then braked, ends at a target (2,) m in base_link.
+
+    ``current`` (3,) is the present velocity. Returns None if it is too early to brake even for an action held for
+    `HOLD_S`, or if the target lies beside or behind a differential base.
+    """
+    bearing, distance = float(np.arctan2(target[1], target[0])), float(np.hypot(*target))
+    if braking_speed(distance, robot) >= robot.max_speed:
+        return None
+    # In the first step the speed changes from the present one: (current + v) STEP_S / 2 + v (hold - STEP_S) + v^2 / 2a.
+    speed = braking_speed(distance - float(np.hypot(current[0], current[1])) * STEP_S / 2, robot, hold - STEP_S / 2)
+    if robot.drive == "holonomic":
+        return np.array([speed * np.cos(bearing), speed * np.sin(bearing), 0.0])
+    turn = 2 * speed * np.sin(bearing) / max(distance, 1e-9)
+    return np.array([speed, 0.0, turn]) if np.cos(bearing) > 0 and abs(turn) <= robot.max_turn else None
+
+
+def turn_rate(angle: float, robot: Robot, hold: float = STEP_S) -> float:
+    """Turn rate in rad/s that, held for ``hold`` s and then braked, ends at a heading ``angle`` rad away."""
+    rate = robot.turn_acceleration * (np.sqrt(hold**2 + 2 * abs(angle) / robot.turn_acceleration) - hold)
     return float(np.sign(angle) * min(robot.max_turn, rate))
 
 
@@ -98,10 +130,11 @@ def turn_to_attractor(action: Array, attractor: Array, robot: Robot, *, may_turn
     return np.array([*se2.rotate(-turn * STEP_S / 2, action[:2]), turn])
 
 
-def candidate_actions(current: Array, attractor: Array, robot: Robot) -> Array:
-    """Actions (N, 3) in base_link to choose from: standing, the current one, and a fan around the attractor (2,) m.
+def candidate_policies(current: Array, attractor: Array, robot: Robot) -> Array:
+    """Policies (N, 5) to choose from: standing, the current action, and a fan around the attractor (2,) m in base_link.
 
-    One of the speeds is that which ends at the attractor.
+    One of the speeds is that which ends at the attractor; the last policies reach it faster, and brake later. A
+    differential base may also turn until the attractor lies ahead, and drive straight from then on.
     """
     bearing, distance = float(np.arctan2(attractor[1], attractor[0])), float(np.hypot(*attractor))
     speeds = np.unique([*(robot.max_speed * np.array([0.08, 0.2, 0.4, 0.7, 1.0])), braking_speed(distance, robot)])
@@ -113,8 +146,28 @@ def candidate_actions(current: Array, attractor: Array, robot: Robot) -> Array:
     else:
         turns = robot.max_turn * np.array([0, 0.06, 0.14, 0.25, 0.45, 0.7, 1.0])
         v, w = (each.ravel() for each in np.meshgrid([0.0, *speeds], np.concatenate([turns, -turns[1:]])))
-        # For each speed also the arc through the attractor, and a turn on the spot until the attractor lies ahead.
+        # For each speed also the arc through the attractor.
         arcs = np.clip(2 * speeds * np.sin(bearing) / max(distance, 0.1), -robot.max_turn, robot.max_turn)
-        v, w = np.concatenate([v, speeds, [0.0]]), np.concatenate([w, arcs, [turn_rate(bearing, robot)]])
+        v, w = np.concatenate([v, speeds]), np.concatenate([w, arcs])
         actions = np.stack([v, np.zeros_like(v), w], axis=-1)
-    return np.concatenate([np.zeros((1, 3)), current[None], actions])
+    held = np.pad(np.concatenate([np.zeros((1, 3)), current[None], actions]), ((0, 0), (0, 2)), constant_values=HOLD_S)
+    late = [(stopping_action(current, attractor, robot, hold), hold) for hold in SHORT_HOLDS_S]
+    policies = [[*action, hold, hold] for action, hold in late if action is not None]
+    if robot.drive == "differential":
+        rates = [(turn_rate(bearing, robot, hold), hold) for hold in SHORT_HOLDS_S]
+        policies += [[v, 0.0, rate, HOLD_S, hold] for rate, hold in rates for v in [0.0, *speeds]]
+    return np.concatenate([held, np.reshape(policies, (-1, 5))])
+
+
+def refined_policies(policy: Array, robot: Robot) -> Array:
+    """Policies (N, 5) near a policy (5,): slightly faster or slower, and in slightly other directions."""
+    factor, turn = (each.ravel() for each in np.meshgrid([0.85, 0.93, 1.0, 1.07, 1.15], np.linspace(-1, 1, 7)))
+    actions = factor[:, None] * policy[:3]
+    if robot.drive == "holonomic":
+        actions[:, :2] = se2.rotate(np.deg2rad(4) * turn, actions[:, :2])
+    else:
+        actions[:, 2] += 0.05 * robot.max_turn * turn
+    speed = np.hypot(actions[:, 0], actions[:, 1])
+    actions[:, :2] *= np.minimum(1.0, robot.max_speed / np.maximum(speed, 1e-9))[:, None]
+    actions[:, 2] = np.clip(actions[:, 2], -robot.max_turn, robot.max_turn)
+    return np.column_stack([actions, np.broadcast_to(policy[3:], (len(actions), 2))])

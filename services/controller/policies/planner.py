@@ -13,14 +13,16 @@ import numpy.typing as npt
 from common.geometry import se2
 from common.robot.scan_geometry import ALL_ROUND, Sweep
 from common.runtime import safety
-from services.controller.policies.action_selection import Surroundings, least_distance, select_action
-from services.controller.policies.active_localisation import ActiveLocaliser
-from services.controller.policies.decision import Decision
+from services.controller.policies import expected_free_energy as efe
+from services.controller.policies.active_localisation import ActiveLocaliser, CandidateMotions
+from services.controller.policies.decision import Decision, State
 from services.controller.policies.free_space import FreeSpace
 from services.controller.policies.geodesic_field import WALL_COST_RANGE_M, CostField, FreeSpaceGraph
 from services.controller.policies.goal_check import refusal_text, wall_refusal
-from services.controller.policies.motion_model import is_moving, turn_to_attractor
+from services.controller.policies.motion_model import STEP_S, delay_until_effect, is_moving, turn_to_attractor
 from services.controller.policies.obstacles import TemporaryObstacles
+from services.controller.policies.policy_selection import PoseBelief, Surroundings, least_distance, select_policy
+from services.controller.policies.scan_information import ScanInformation
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -28,7 +30,6 @@ if TYPE_CHECKING:
     from common.messages.definitions import Belief, Scan
     from common.messages.requests import PredictReply
     from common.robot.base import Robot
-    from services.controller.policies.epistemic import CandidateMotions
 
 OBSTACLE_GAP_M = 0.06  # between footprint and unmapped obstacles: the scanner's noise, and half a cell
 REPLAN_PERIOD_NS = 400_000_000  # minimum time between two plans when obstacles near the path change
@@ -36,6 +37,8 @@ REPLAN_PERIOD_FAR_NS = 1_500_000_000  # the same when obstacles change elsewhere
 STUCK_AFTER_NS = 3_000_000_000  # time without motion after which the robot backs off
 BACK_OFF_NS = 3_000_000_000  # how long it backs off
 BLIND_AHEAD = "the scanner does not look ahead, and this base goes nowhere else: mount it so that it does"
+MIN_PROGRESS_M = 0.004  # near the goal, the robot must get nearer by this much to count as not stuck
+UNREACHABLE_M = 100.0  # stands for an infinite distance to the goal
 OBSTACLE_RANGE_M = 3.0  # obstacles farther from the robot do not matter to its next second
 
 
@@ -45,8 +48,8 @@ class GeodesicPolicy:
     def __init__(self, robot: Robot, world: World, *, keep_heading: bool = False, epistemic: bool = True) -> None:
         """Build the graph of the world.
 
-        ``keep_heading``: a holonomic base does not turn into its direction of motion. ``epistemic``: with an ambiguous
-        belief, drive where the possible places can be told apart; otherwise drive on as if the best one were true.
+        ``keep_heading``: a holonomic base does not turn into its direction of motion. ``epistemic``: policies are also
+        judged by the information that they gain; otherwise the robot drives on as if the best hypothesis were true.
         """
         self.epistemic = epistemic
         self.robot, self.world, self.keep_heading = robot, world, keep_heading
@@ -60,11 +63,14 @@ class GeodesicPolicy:
         self._goal: Array | None = None
         self._component: int | None = None  # of the graph, where the robot was when last tracked
         self._scan: Scan | None = None
+        self._information: ScanInformation | None = None  # None before the first scan, and without `epistemic`
         # Stamp at which obstacles were last given to the graph, and their cells; whether the field is older than that.
         self._planned: tuple[int, npt.NDArray[Any]] = (-REPLAN_PERIOD_NS, np.zeros(0, int))
         self._field_outdated = False
         self._vetted_component: int | None = None  # the component from which the goal was found to be reachable
         self._view = ALL_ROUND
+        # Least distance from the goal in m, and the stamp at which the robot got there; None until it is near the goal.
+        self._nearest: tuple[float, int] | None = None
         self._standing_since_ns: int | None = None
         self._backing_off_until_ns: int | None = None
 
@@ -90,10 +96,18 @@ class GeodesicPolicy:
 
     def interrupt(self) -> None:
         """Stop watching for progress: a robot that does not drive to its goal is not stuck."""
-        self._standing_since_ns = self._backing_off_until_ns = None
+        self._standing_since_ns = self._backing_off_until_ns = self._nearest = None
 
     def resume(self) -> None:
         """Do nothing: `interrupt` discarded nothing that has to be restored."""
+
+    def prepare(self, scan: Scan) -> None:
+        """Compute from the first scan where the scanner can tell the robot's pose; metres elsewhere cost more."""
+        if not self.epistemic or self._information is not None:
+            return
+        self._information = ScanInformation.of(self.free, self.robot.radius, scan, 1 / (STEP_S * self.robot.max_speed))
+        grid, cost = self._information.grid, self._information.metre_cost / efe.NATS_PER_METRE
+        self.graph.set_metre_cost(grid.interpolate(cost, self.free.grid.centres()))
 
     def observe(self, scan: Scan, belief: Belief) -> None:
         """Update the scanner's view, and while tracking the obstacles and the component of the graph."""
@@ -109,7 +123,9 @@ class GeodesicPolicy:
 
     def decide(self, belief: Belief, velocity: Array) -> Decision:
         """Choose the velocity of least expected free energy; ``velocity`` (3,) in base_link is the latest command."""
-        pose, stamp_ns = belief.pose.array(), belief.stamp_ns
+        # The pose at which the command takes effect; until then the latest command applies.
+        ahead = velocity * delay_until_effect(self.robot, self._scan)
+        pose, stamp_ns = se2.compose(belief.pose.array(), ahead), belief.stamp_ns
         if self._goal is not None and self._component != self._vetted_component:
             if (refusal := self.refusal(self._goal)) is not None:
                 return Decision(reason=refusal, state="blocked", refused=True)
@@ -123,9 +139,11 @@ class GeodesicPolicy:
         if self._backing_off_until_ns is not None and stamp_ns < self._backing_off_until_ns:
             return self._back_off(pose, velocity, surroundings, path)
         assert self.field is not None  # noqa: S101 - there is a path
-        point = self.field.attractor(pose[:2], path)
-        attractor = se2.rotate(-pose[2], point - pose[:2])
-        selected = select_action(velocity, attractor, surroundings, self.robot)
+        if (stop := self._stop_short(stamp_ns, pose, self.field.goal, surroundings, path)) is not None:
+            return stop
+        attractor = se2.rotate(-pose[2], self.field.attractor(pose[:2], path) - pose[:2])
+        known = PoseBelief(pose, _covariance(belief), self._information)
+        selected = select_policy(velocity, attractor, surroundings, self.robot, known)
         action = turn_to_attractor(
             selected.action, attractor, self.robot, may_turn=surroundings.may_turn, forward=surroundings.forward
         )
@@ -140,7 +158,8 @@ class GeodesicPolicy:
             reason = BLIND_AHEAD
         blocked = bool(reason) and not selected.action.any()
         motion = se2.transform(pose, selected.motion[:, :2])
-        return Decision(action, reason, "blocked" if blocked else "navigating", path, motion)
+        state: State = "blocked" if blocked else "navigating"
+        return Decision(action, reason, state, path, motion, terms=selected.terms)
 
     def prediction_request(self, belief: Belief) -> CandidateMotions | None:
         """Motions for which scans must be predicted before `decide_unlocalised`; None if none are needed."""
@@ -151,7 +170,15 @@ class GeodesicPolicy:
     def use_predictions(self, reply: PredictReply) -> None:
         """Take the predictions for the last `prediction_request`."""
         if self._scan is not None:
-            self.localiser.use_predictions(reply, self._scan.range_max)
+            self.localiser.use_predictions(reply, self._scan.range_max, self._to_goal)
+
+    def _to_goal(self, points: Array) -> Array:
+        """Distance (...,) m to the goal from points (..., 2) m in map."""
+        if self.field is None and self._goal is not None:
+            self.field, self._field_outdated = self.graph.cost_field(self._goal), True
+        if self.field is None:
+            return np.full(points.shape[:-1], UNREACHABLE_M)
+        return np.minimum(self.field.cost.ravel()[self.free.grid.cell_of(points)], UNREACHABLE_M)
 
     def decide_unlocalised(self, belief: Belief, velocity: Array) -> Decision:
         """Move so that the pose becomes known. Without `epistemic`, drive to the goal from the best hypothesis."""
@@ -233,12 +260,36 @@ class GeodesicPolicy:
         elif stamp_ns - self._standing_since_ns > STUCK_AFTER_NS:
             self._standing_since_ns, self._backing_off_until_ns = None, stamp_ns + BACK_OFF_NS
 
+    def _stop_short(
+        self, stamp_ns: int, pose: Array, place: Array, surroundings: Surroundings, path: Array
+    ) -> Decision | None:
+        """The decision to stand short of a goal that is too near to something; None while the robot may get nearer.
+
+        ``place`` (2,) m is the end of the ``path``: the goal, or the free place nearest to it.
+        """
+        assert self._goal is not None  # noqa: S101 - there is a path
+        distance = float(np.hypot(*(self._goal - pose[:2])))
+        if distance > self.robot.radius:
+            self._nearest = None
+        elif self._nearest is None or stamp_ns < self._nearest[1] or distance < self._nearest[0] - MIN_PROGRESS_M:
+            self._nearest = (distance, stamp_ns)
+        # Several cells may be about as near to the goal, so the robot need not stand in a certain one.
+        short = float(np.hypot(*(place - self._goal)))
+        arrived = short > 0 and distance < short + self.free.grid.resolution
+        stuck = self._nearest is not None and stamp_ns - self._nearest[1] > STUCK_AFTER_NS
+        if np.hypot(*surroundings.points.T).min(initial=np.inf) < 2 * self.robot.radius:  # it may go away
+            reason = f"{distance:.2f} m from the goal, {self._hindrance(pose, surroundings, standing=True)}"
+            return Decision(reason=reason, state="blocked", path=path) if arrived else None
+        problem = f"is too near to a wall: stopped {distance:.2f} m from it"
+        reason = refusal_text(self.world, self._goal, problem)
+        return Decision(reason=reason, state="blocked", path=path, refused=True) if arrived or stuck else None
+
     def _back_off(self, pose: Array, velocity: Array, surroundings: Surroundings, path: Array) -> Decision:
         """Recover: drive towards the direction with the largest gap to walls and obstacles."""
         angle = np.arange(16) * np.pi / 8
         targets = 0.4 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         target = targets[int(np.argmax(surroundings.gaps(targets[:, None, :], np.zeros(1))[:, 0]))]
-        selected = select_action(velocity, target, surroundings, self.robot)
+        selected = select_policy(velocity, target, surroundings, self.robot)
         action = turn_to_attractor(
             selected.action, target, self.robot, may_turn=surroundings.may_turn, forward=surroundings.forward
         )
@@ -259,6 +310,11 @@ class GeodesicPolicy:
         """Status text for when obstacles leave no path."""
         place = f" at {_nearest_point(pose, surroundings)[1]}" if len(surroundings.points) else ""
         return f"no way around something that is not in the map{place}: waiting until it clears"
+
+
+def _covariance(belief: Belief) -> Array:
+    """Covariance (3, 3) of x, y, yaw of a belief; zero if the estimator states none."""
+    return np.zeros((3, 3)) if belief.covariance is None else np.asarray(belief.covariance, float)
 
 
 def _nearest_point(pose: Array, surroundings: Surroundings) -> tuple[int, str]:

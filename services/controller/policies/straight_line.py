@@ -48,6 +48,9 @@ class StraightLinePolicy:
         """Restore the sum of equation 4 from before the last `interrupt`."""
         self._action = self._action_before_interrupt
 
+    def prepare(self, scan: Scan) -> None:
+        """Do nothing: this policy uses the belief alone."""
+
     def observe(self, scan: Scan, belief: Belief) -> None:
         """Do nothing: this policy uses the belief alone."""
 

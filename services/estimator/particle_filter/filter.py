@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,7 +13,8 @@ from services.estimator.particle_filter.clusters import hypotheses
 from services.estimator.particle_filter.recovery import Recovery
 from services.estimator.particle_filter.sensor import Sensor
 from services.estimator.particle_filter.settings import Settings
-from services.estimator.shared.interface import Observation, Posterior, Predicted, State
+from services.estimator.shared.interface import Observation, Posterior, Predicted, State, start_belief
+from services.estimator.shared.motion_correction import correct_motion, pose_at_stamp
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -23,6 +25,7 @@ NOMINAL_PERIOD_S = 1 / 15  # between scans without stamps; the settings state th
 MAX_PERIOD_S = 1.0  # for the motion model; after longer gaps recovery must find the robot
 INITIAL_COVARIANCE = np.diag([0.25, 0.25, (np.pi / 12) ** 2])  # nav2's initial_cov
 COMMAND_NOISE = 0.5  # as a share of the recently commanded speed, because the base lags behind its command
+VELOCITY_SHARE = 0.5  # of the motion since the last scan in the average velocity; the rest is that of earlier scans
 COMMAND_MEMORY_S = 0.5  # for which a past command may still have effect
 MAX_CLUSTER_DEVIATION_M = 0.3  # position standard deviation of a cluster that counts as one place
 TRACKING_WEIGHT = 0.95  # minimum weight of the best cluster in state tracking
@@ -62,7 +65,7 @@ class ParticleFilter:
     def restart(self, pose: Array | None = None, covariance: Array | None = None) -> None:
         """Starts from a Gaussian at ``pose`` (3,) with ``covariance`` (3, 3), or from an unknown pose.
 
-        The default covariance is nav2's.
+        A ``pose`` (2,) is a position with an unknown heading. The default covariance is nav2's.
         """
         s = self.settings
         if pose is None:
@@ -70,8 +73,8 @@ class ParticleFilter:
             self.particles = self._anywhere(s.max_particles, self._places[: s.max_particles])
         else:
             count = min(s.max_particles, max(s.min_particles, 2000))
-            spread = INITIAL_COVARIANCE if covariance is None else np.asarray(covariance, float)
-            self.particles = self._rng.multivariate_normal(np.asarray(pose, float), spread, count, method="eigh")
+            mean, spread = start_belief(pose, INITIAL_COVARIANCE if covariance is None else covariance)
+            self.particles = self._rng.multivariate_normal(mean, spread, count, method="eigh")
         self._freeze_heading()
         self.weights = np.full(len(self.particles), 1 / len(self.particles))
         self._recovery = Recovery(s.recovery_alpha_slow, s.recovery_alpha_fast)
@@ -84,26 +87,65 @@ class ParticleFilter:
         self._searching = pose is None and self.sensor.max_sigma > s.sigma_hit
         self._sigma = self.sensor.max_sigma if self._searching else s.sigma_hit
         self._last: Observation | None = None
+        self._tracked: Array | None = None  # (3,) pose in the middle of the last sweep, if in state tracking
+        self._velocity: Array | None = None  # (3,) in base_link, between the last poses; None if unknown
         self._speed = np.zeros(2)  # m/s and rad/s, recently commanded
 
     def update(self, observation: Observation) -> Posterior:
         """Returns the posterior after one more scan."""
-        self._predict(observation)
+        period, odom = self._period(observation), self._odometry_since_last_scan(observation)
+        self._predict(observation, period, odom)
         self._anneal()
+        if self._velocity is None and odom is not None:
+            self._velocity = odom / period
+        corrected = correct_motion(observation, self._velocity, self.mount)
         s, sigma, beams = self.settings, self._sigma, self.settings.max_beams
         share = s.search_share if self._searching else 0.0
         if s.sigma_odometry and observation.odom is not None and sigma <= 1.01 * s.sigma_hit:
             # All beams can be used, because the particles are few and close together.
             sigma, beams, share = s.sigma_odometry, None, s.odometry_share
-        log_weights = self.sensor.weigh(se2.compose(self.particles, self.mount), observation, sigma, beams)
+        log_weights = self.sensor.weigh(se2.compose(self.particles, self.mount), corrected, sigma, beams)
         log_weights += np.log(np.maximum(self.weights, 1e-300))
         self.weights = resampling.tempered(log_weights, share)
-        posterior = self._posterior(observation, hypotheses(self.particles, self.weights))
+        posterior = self._posterior(corrected, hypotheses(self.particles, self.weights))
+        self._update_velocity(posterior, period)
+        posterior = self._at_stamp(posterior, observation, period)
         self._scans += 1
         if self._scans % s.resample_interval == 0:
             self._resample()
         self._last = observation
         return posterior
+
+    def _period(self, now: Observation) -> float:
+        """Time in s since the last scan."""
+        last = self._last
+        if last is None or now.stamp is None or last.stamp is None or now.stamp <= last.stamp:
+            return NOMINAL_PERIOD_S
+        return min(now.stamp - last.stamp, MAX_PERIOD_S)
+
+    def _odometry_since_last_scan(self, now: Observation) -> Array | None:
+        if self._last is None or now.odom is None or self._last.odom is None:
+            return None
+        return se2.between(self._last.odom, now.odom)
+
+    def _update_velocity(self, posterior: Posterior, period: float) -> None:
+        """Averages the velocity over the last poses, while they are tracked."""
+        before, self._tracked = self._tracked, posterior.pose if posterior.state == "tracking" else None
+        if before is None or self._tracked is None:
+            self._velocity = None
+            return
+        velocity = se2.between(before, self._tracked) / period
+        old = velocity if self._velocity is None else self._velocity
+        self._velocity = old + VELOCITY_SHARE * (velocity - old)
+
+    def _at_stamp(self, posterior: Posterior, observation: Observation, period: float) -> Posterior:
+        """The posterior at the stamp, from that in the middle of the sweep."""
+        found = tuple(
+            replace(each, pose=pose_at_stamp(each.pose, self._velocity, period, observation))
+            for each in posterior.hypotheses
+        )
+        laser = se2.compose(found[0].pose, self.mount)
+        return replace(posterior, hypotheses=found, predicted=self.world.ray_distances(laser, observation.angles)[0])
 
     def predict(self, poses: Array, angles: Array) -> Predicted:
         """Predicts scans (see Estimator) by exact rays in the map; sigma is that of a hit while tracking."""
@@ -116,14 +158,11 @@ class ParticleFilter:
             places = self._places[self._rng.integers(len(self._places), size=count)]
         return np.column_stack([places, self._rng.uniform(-np.pi, np.pi, count)])
 
-    def _predict(self, now: Observation) -> None:
-        """Moves the particles by odometry if there is any, else by the last command, else at random."""
-        last, s = self._last, self.settings
-        if last is None:
+    def _predict(self, now: Observation, period: float, odom: Array | None) -> None:
+        """Moves the particles by the odometry ``odom`` (3,) if there is any, else by the command, else at random."""
+        s = self.settings
+        if self._last is None:
             return
-        period = NOMINAL_PERIOD_S
-        if now.stamp is not None and last.stamp is not None and now.stamp >= last.stamp:
-            period = min(now.stamp - last.stamp, MAX_PERIOD_S)
         alphas = (s.alpha1, s.alpha2, s.alpha3, s.alpha4, s.alpha5)
         model = motion.omni if s.robot_model_type == "omni" else motion.differential
         walk = np.array([s.jitter_position, s.jitter_heading]) * period / NOMINAL_PERIOD_S
@@ -134,8 +173,8 @@ class ParticleFilter:
             (s.floor_position, s.floor_heading), (search * s.jitter_position, search * s.jitter_heading)
         )
         moved = self.particles
-        if now.odom is not None and last.odom is not None:
-            moved = model(moved, se2.between(last.odom, now.odom), alphas, self._rng)
+        if odom is not None:
+            moved = model(moved, odom, alphas, self._rng)
         elif now.command is not None:
             speed = np.array([np.hypot(now.command[0], now.command[1]), abs(now.command[2])])
             self._speed = np.maximum(speed, self._speed * np.exp(-period / COMMAND_MEMORY_S))
@@ -204,7 +243,7 @@ class ParticleFilter:
             complexity=0.0,  # not defined, because particles have no density to compare with that of the prior
             xi=explanation.xi,
             curvature=explanation.curvature,
-            predicted=self.world.ray_distances(se2.compose(pose, self.mount), observation.angles)[0],
+            predicted=np.zeros(0),  # of the pose at the stamp, set by _at_stamp
         )
 
     def _resample(self) -> None:

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 SHORT_MISFIT_FACTOR = 0.6  # a beam shorter than expected counts less than a longer one, because it may be blocked
 UNKNOWN_MISFIT = 0.4  # of a beam for which the model has no prediction
 
+# The same for whole steps of range: capped absolute errors, which fit into a byte and into vector registers.
+LONG_MISFIT_STEPS, SHORT_MISFIT_STEPS, UNKNOWN_MISFIT_STEPS = 6, 4, 2
+LANES = 128  # of a vector register for bytes; headings are padded to a multiple
+
 jit = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
@@ -127,3 +131,47 @@ def rank_places(
                 total += misfit if e > 0.0 else SHORT_MISFIT_FACTOR * misfit
                 used += 1
             costs[s, h] = total / max(used, 1)
+
+
+@jit
+def rank_roughly(
+    panoramas: npt.NDArray[np.uint16],
+    bins: npt.NDArray[np.int64],
+    measured: npt.NDArray[np.uint16],
+    range_max: int,
+    shift: int,
+    costs: npt.NDArray[np.uint16],
+) -> None:
+    """Fills costs (S,) of every place with the least sum of capped errors over beams, at any of H headings.
+
+    ``panoramas`` (S, P, H) are ranges in the directions P h + p, 0 if unknown, ``bins`` (B,) the direction of each
+    beam, and ``measured`` (B,) the scan. All ranges are in the same steps, limited to ``range_max``, and compared
+    without their lowest ``shift`` bits. Beams shorter than expected count less, see `SHORT_MISFIT_FACTOR`.
+    """
+    phases, headings = panoramas.shape[1:]
+    lanes = (headings + LANES - 1) // LANES * LANES
+    around = np.zeros((phases, headings + lanes), np.uint8)  # a byte for each direction, more than once around
+    sums = np.empty(lanes, np.uint16)
+    most, long, short, unknown = (
+        np.uint16(min(range_max >> shift, 255)),
+        np.uint8(LONG_MISFIT_STEPS),
+        np.uint8(SHORT_MISFIT_STEPS),
+        np.uint8(UNKNOWN_MISFIT_STEPS),
+    )
+    for s in range(panoramas.shape[0]):
+        for p in range(phases):
+            for h in range(headings):
+                steps = panoramas[s, p, h]
+                around[p, h] = np.uint8(max(min(np.uint16(steps >> shift), most), min(steps, np.uint16(1))))
+            around[p, headings : 2 * headings] = around[p, :headings]
+        sums[:] = 0
+        for b in range(bins.shape[0]):
+            o = np.uint8(min(np.uint16(measured[b] >> shift), most))
+            first = bins[b] // phases
+            expected = around[bins[b] % phases, first : first + lanes]  # a slice, so that the loop is vectorised
+            for h in range(lanes):
+                g = expected[h]
+                higher = max(o, g)
+                misfit = min(np.uint8(higher - g), long) + min(np.uint8(higher - o), short)
+                sums[h] = np.uint16(sums[h] + (misfit if g > 0 else unknown))
+        costs[s] = sums[:headings].min()

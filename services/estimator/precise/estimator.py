@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common.geometry import se2
-from services.estimator.precise.gauss_newton import COARSE_SIGMA_M, GaussNewton, Optimiser, Prior, View, follow
+from services.estimator.precise.gauss_newton import COARSE_SIGMA_M, GaussNewton, Optimiser, Prior, View
 from services.estimator.precise.hypotheses import (
     Mode,
     clip_to_map,
@@ -27,6 +27,7 @@ from services.estimator.precise.motion_model import (
     Candidate,
     fuse,
     limit_to_map,
+    limit_velocity,
     predict_motion,
     reachable_poses,
     widen_unobserved,
@@ -34,7 +35,15 @@ from services.estimator.precise.motion_model import (
 from services.estimator.precise.precision import Precision
 from services.estimator.precise.search import search_around, search_everywhere, search_near
 from services.estimator.precise.settings import Settings
-from services.estimator.shared.interface import Hypothesis, Observation, Posterior, Predicted, State
+from services.estimator.shared.interface import (
+    Hypothesis,
+    Observation,
+    Posterior,
+    Predicted,
+    State,
+    start_belief,
+)
+from services.estimator.shared.motion_correction import correct_motion, pose_at_stamp
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -44,6 +53,7 @@ if TYPE_CHECKING:
     from services.estimator.precise.likelihood import Evidence
     from services.estimator.shared.generative_models import GenerativeModel
 
+START_COVARIANCE = np.diag([0.25, 0.25, 0.09])  # of a pose given without one
 MAX_SEARCH_INTERVAL = 150  # scans between two searches without success; the interval doubles from 1
 CLUTTER = 0.3  # probability that all that is new in a view is clutter
 UNKNOWN_SIGMA_M = 100.0  # published where the model does not know what to expect
@@ -80,12 +90,14 @@ class PreciseEstimator:
         self.restart()
 
     def restart(self, pose: Array | None = None, covariance: Array | None = None) -> None:
-        """Starts from ``pose`` within ``covariance`` (default 0.5 m, 0.5 m, 0.3 rad), or from an unknown pose."""
+        """Starts from ``pose`` within ``covariance`` (default 0.5 m, 0.5 m, 0.3 rad), or from an unknown pose.
+
+        A ``pose`` (2,) is a position with an unknown heading.
+        """
         self.modes: list[Mode] = []
         self._initial: tuple[Array, Array] | None = None
         if pose is not None:
-            spread = np.diag([0.25, 0.25, 0.09]) if covariance is None else np.asarray(covariance, float)
-            self._initial = (np.asarray(pose, float), spread)
+            self._initial = start_belief(pose, START_COVARIANCE if covariance is None else covariance)
         self._was_tracking = False
         self._stamp: float | None = None
         self._odom: Array | None = None
@@ -121,13 +133,20 @@ class PreciseEstimator:
             self._optimiser,
             self._precision.map_error,
             self._precision.changed,
-        ).thinned(TARGET_BEAMS)
+        )
+        velocity = self._velocity(self.modes[0], observation) if self.modes else None
+        view = self._corrected(view, observation, velocity)
         if self.modes:
-            self._follow(view, observation)
+            view = self._follow(view, observation)
         self._scan = view, observation
         if not self.modes or self._needs_search():
             return None
         return self._publish(view, observation)
+
+    def _corrected(self, view: View, observation: Observation, velocity: Array | None) -> View:
+        """The view of the observation, corrected for a motion with ``velocity`` (3,) in base_link, and thinned."""
+        corrected = correct_motion(observation, velocity, self.mount)
+        return replace(view, angles=corrected.angles, ranges=corrected.ranges).thinned(TARGET_BEAMS)
 
     def search(self) -> Posterior:
         """Searches near the initial pose or in the whole map for the scan last given to `track`.
@@ -152,19 +171,38 @@ class PreciseEstimator:
             return None
         return se2.between(self._odom, observation.odom)
 
+    def _velocity(self, mode: Mode, observation: Observation) -> Array | None:
+        """Velocity (3,) in base_link by the last poses, else by odometry; None if unknown."""
+        odom = self._odometry_since_last_scan(observation)
+        if mode.velocity is not None or odom is None:
+            return mode.velocity
+        return odom / self._period(observation.stamp)
+
     def _predict(self, mode: Mode, period: float, odom: Array | None, command: Array | None) -> list[Candidate]:
         """Predicts the motions that the robot may have made since the last scan; the last one is the widest."""
         return predict_motion(
             self.settings.motion, mode.pose, mode.noise_covariance, period, odom, command, mode.velocity
         )
 
-    def _follow(self, view: View, observation: Observation) -> None:
-        """Moves every hypothesis by the motion since the last scan, and fuses it with the scan."""
+    def _follow(self, view: View, observation: Observation) -> View:
+        """Moves every hypothesis by the motion since the last scan, and fuses it with the scan.
+
+        Returns the scan as corrected for that motion.
+        """
         period, odom = self._period(observation.stamp), self._odometry_since_last_scan(observation)
-        motions = [self._predict(mode, period, odom, observation.command) for mode in self.modes]
-        motions, poses, evidence, local = self._match(view, motions, period, odom)
-        modes = [self._fuse(view, k, motions[k], poses[k], evidence, period, odom) for k in range(len(poses))]
+        predicted = [self._predict(mode, period, odom, observation.command) for mode in self.modes]
+        motions, poses, evidence, local = self._match(view, predicted, period, odom)
+        if observation.time_increment:
+            # Once more, corrected for the motion that the match has shown.
+            velocity = limit_velocity(self.settings.motion, -se2.between(poses[0], self.modes[0].pose) / period)
+            view = self._corrected(view, observation, velocity)
+            poses, evidence = view.descend(poses, _prior_of([each[-1] for each in motions]))
+        modes = [
+            self._fuse(view, k, motions[k], predicted[k][-1], poses[k], evidence, observation)
+            for k in range(len(poses))
+        ]
         self._weigh(view, modes, local, period)
+        return view
 
     def _match(
         self, view: View, motions: list[list[Candidate]], period: float, odom: Array | None
@@ -175,14 +213,13 @@ class PreciseEstimator:
         hypothesis, the evidence there, and the pose (3,) in the local frame if recent scans gave it.
         """
         widest = _prior_of([each[-1] for each in motions])
-        poses, evidence = follow(view, np.array([each[-2].mean for each in motions]), widest)
+        poses, evidence = view.descend(np.array([each[-2].mean for each in motions]), widest)
         explained = view.surface_evidence(poses).explained[0]
         if explained < self._explained - self.settings.drop:
             extra_starts = np.zeros((0, 3))
             if odom is None:
                 extra_starts = reachable_poses(self.settings.motion, self.modes[0].pose, period, COARSE_SIGMA_M)
-            wider_poses, _ = search_around(view, poses, widest, extra_starts)
-            wider_poses, wider_evidence = follow(view, wider_poses, widest)
+            wider_poses, wider_evidence = search_around(view, poses, widest, extra_starts)
             before, after = view.surface_evidence(np.stack([poses[0], wider_poses[0]])).log_likelihood
             if after > before:
                 poses, evidence = wider_poses, wider_evidence
@@ -197,7 +234,7 @@ class PreciseEstimator:
         # All hypotheses share the relative motion.
         step = se2.between(self.modes[0].pose, matched.mean)
         motions = [[replace(matched, mean=se2.compose(mode.pose, step))] for mode in self.modes]
-        poses, evidence = follow(view, np.array([each[0].mean for each in motions]), _prior_of([m[0] for m in motions]))
+        poses, evidence = view.descend(np.array([each[0].mean for each in motions]), _prior_of([m[0] for m in motions]))
         return motions, poses, evidence, match.pose
 
     def _fuse(
@@ -205,13 +242,18 @@ class PreciseEstimator:
         view: View,
         k: int,
         candidates: list[Candidate],
+        widest: Candidate,
         pose: Array,
         evidence: Evidence,
-        period: float,
-        odom: Array | None,
+        observation: Observation,
     ) -> Mode:
-        """Fuses the k-th hypothesis with its evidence, which was found at ``pose`` (3,)."""
-        mode = self.modes[k]
+        """Fuses the k-th hypothesis with its evidence, which was found at ``pose`` (3,).
+
+        A motion of which the robot is hardly capable, within the ``widest`` candidate, is evidence against the
+        hypothesis: the robot may have been carried off instead. If the stamp is earlier than that of the last scan,
+        as when a replay starts again, the duration of the motion is unknown, and no motion is such evidence.
+        """
+        mode, period = self.modes[k], self._period(observation.stamp)
         # While a direction is unobserved, a ripple a little larger than the others must not pass for a feature.
         caution = 3 if mode.unobserved_scans else 1
         projection, unobserved = observed_directions(evidence.curvature[k], self.model.ripple * caution)
@@ -220,17 +262,20 @@ class PreciseEstimator:
             projection, unobserved = np.eye(3), None
         project_evidence(evidence, k, projection)
         is_unobserved = unobserved is not None and len(candidates) > 1
-        if unobserved is not None and is_unobserved and odom is None:
-            candidates = [
+        if unobserved is not None and is_unobserved and self._odometry_since_last_scan(observation) is None:
+            *candidates, widest = (
                 widen_unobserved(self.settings.motion, each, unobserved, mode.unobserved_scans, period)
-                for each in candidates
-            ]
+                for each in (*candidates, widest)
+            )
         fused = [
             fuse(limit_to_map(each, self.seeds.spread), pose, evidence.xi[k], evidence.curvature[k])
             for each in candidates
         ]
         best = min(fused, key=lambda each: each.surprise)
-        return update_mode(mode, best, evidence, k, period, unobserved=is_unobserved)
+        updated = update_mode(mode, best, evidence, k, period, unobserved=is_unobserved)
+        if self._went_back(observation.stamp):
+            return updated
+        return replace(updated, log_evidence=mode.log_evidence - widest.excess(best.mean))
 
     def _weigh(self, view: View, modes: list[Mode], local: Array | None, period: float) -> None:
         """Weighs hypotheses by how well the map predicts those surfaces of the scan that are new to the robot.
@@ -253,7 +298,7 @@ class PreciseEstimator:
             replace(mode, explained=float(explained[k]), present=float(present[k])) for k, mode in enumerate(modes)
         ]
         self._local, self._seen, self._change = local, old, change
-        carried_off = max(mode.log_evidence for mode in modes) + float(np.log(self.settings.unknown))
+        carried_off = max(mode.log_evidence for mode in self.modes) + float(np.log(self.settings.unknown))
         self._log_unmapped = max(self._log_unmapped, carried_off + float(np.log(self.settings.unmapped)))
         self._log_unknown = max(self._log_unknown, carried_off)
         self._unknown_present = max(_surprise(view, old) + change, _surprise(view, view.surfaces.small))
@@ -311,7 +356,7 @@ class PreciseEstimator:
 
     def _search_everywhere(self, view: View) -> list[Mode]:
         """Hypotheses in the whole map that predict the scan clearly better than none does; at least one."""
-        found = search_everywhere(view, self.seeds, self.settings, thorough=True)
+        found = search_everywhere(view, self.seeds, self.settings)
         surprise = _ideal(view, view.surfaces.small) + _surprise(view, view.surfaces.small)
         return [mode for mode in found if mode.present > surprise + 1] or found[:1]
 
@@ -360,6 +405,9 @@ class PreciseEstimator:
         self._set([*self.modes, *added])
         self._remember(view)
 
+    def _went_back(self, stamp: float | None) -> bool:
+        return stamp is not None and self._stamp is not None and stamp < self._stamp
+
     def _period(self, stamp: float | None) -> float:
         if stamp is None or self._stamp is None or stamp <= self._stamp:
             return self.settings.motion.period
@@ -368,16 +416,22 @@ class PreciseEstimator:
     def _publish(self, view: View, observation: Observation) -> Posterior:
         """Stores what the next scan needs, and returns the posterior."""
         self.modes = clip_to_map(self.modes, self.bounds)
+        period = self._period(observation.stamp)
+        poses = [
+            pose_at_stamp(mode.pose, self._velocity(mode, observation), period, observation) for mode in self.modes
+        ]
         self._stamp, self._odom = observation.stamp, observation.odom
         if self._local_map.is_new_view(self._local):
             self._remember(view)
         self._last = self._local, view
         best = self.modes[0]
-        predicted = self.predict(best.pose[None], observation.angles)
+        predicted = self.predict(poses[0][None], observation.angles)
         probability = self._probability()
         if probability >= self.settings.tracking_probability:
             self._precision.learn(view, best.pose)
-        hypotheses = tuple(Hypothesis(mode.pose, self._covariance(mode), mode.weight) for mode in self.modes)
+        hypotheses = tuple(
+            Hypothesis(pose, self._covariance(mode), mode.weight) for pose, mode in zip(poses, self.modes, strict=True)
+        )
         return Posterior(
             state=self._state(probability),
             hypotheses=hypotheses,

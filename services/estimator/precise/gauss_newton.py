@@ -1,7 +1,7 @@
 """Gauss-Newton descent on the free energy for many poses at once.
 
-The step is (H + P^-1 + lambda D)^-1 (xi + P^-1 (prior - x)). H is the Gauss-Newton Hessian of accuracy (the Fisher
-information of the density), D its diagonal. A step that does not lower F is undone, and lambda is raised.
+The step is (H + P^-1)^-1 (xi + P^-1 (prior - x)). H is the Gauss-Newton Hessian of accuracy (the Fisher information of
+the density).
 """
 
 from __future__ import annotations
@@ -25,11 +25,9 @@ if TYPE_CHECKING:
     from services.estimator.shared.generative_models import Expected, GenerativeModel
 
 MAX_STEP = np.array([0.5, 0.5, 0.3])  # m, m, rad: beyond this distance the linearisation is not valid
-CONVERGED_STEP = np.array([1e-4, 1e-4, 2e-5])  # m, m, rad: a tenth of the precision of one scan
 SETTLED_STEP = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: this near, F is quadratic and needs no further evaluation
-# Added in quadrature to every beam's standard deviation during a descent from a seed, so that the minimum is wide at
-# first.
-COARSE_SIGMA_M, MEDIUM_SIGMA_M, FINE_SIGMA_M = ANNEALING_SCHEDULE_M = (0.3, 0.1, 0.03)
+# Added in quadrature to every beam's standard deviation during a descent, so that the minimum is wide at first.
+COARSE_SIGMA_M, MEDIUM_SIGMA_M = 0.3, 0.1
 FOLLOWING_SCHEDULE_M = (0.05, 0.0, 0.0, 0.0, 0.0)  # the same, from a predicted pose
 CORRELATED_M = 2.0  # along a surface, on which the errors of a map are alike
 DAMPING = np.diag([1.0, 1.0, 1.0]) * 1e-6  # 1/m², 1/rad²: no step along directions without information
@@ -39,31 +37,24 @@ class Optimiser(Protocol):
     """Finds poses at which a scan has little free energy. F is ``evidence.accuracy``, plus ``prior.energy(poses)``."""
 
     def descend(
-        self, view: View, poses: Array, prior: Prior | None, extra_sigma: float, iterations: int
+        self, view: View, poses: Array, prior: Prior | None, schedule: tuple[float, ...]
     ) -> tuple[Array, Evidence]:
-        """Returns poses (N, 3) with less F than ``poses`` (N, 3), and ``view.evidence(poses, extra_sigma)`` there.
+        """Returns the minima of F near ``poses`` (N, 3), up to half a metre away, and the evidence there.
 
-        Used from seeds up to a metre away. May evaluate each pose about ``iterations`` times.
+        ``schedule`` has the deviation in m to add in quadrature to every beam's, step by step: wide at first, so that
+        the minimum is wide.
         """
-        ...
-
-    def polish(self, view: View, poses: Array, prior: Prior | None, iterations: int) -> tuple[Array, Evidence]:
-        """Returns the minima of F next to ``poses`` (N, 3) to a fraction of a millimetre, and the evidence there."""
         ...
 
 
 class GaussNewton:
-    """The default optimiser: the functions `descend` and `polish` of this module."""
+    """The default optimiser: the function `descend` of this module."""
 
     def descend(
-        self, view: View, poses: Array, prior: Prior | None, extra_sigma: float, iterations: int
+        self, view: View, poses: Array, prior: Prior | None, schedule: tuple[float, ...]
     ) -> tuple[Array, Evidence]:
         """See Optimiser."""
-        return descend(view, poses, prior, extra_sigma, iterations)
-
-    def polish(self, view: View, poses: Array, prior: Prior | None, iterations: int) -> tuple[Array, Evidence]:
-        """See Optimiser."""
-        return polish(view, poses, prior, iterations)
+        return descend(view, poses, prior, schedule)
 
 
 @dataclass(frozen=True)
@@ -89,14 +80,10 @@ class View:
         return replace(self, angles=angles, ranges=ranges)
 
     def descend(
-        self, poses: Array, prior: Prior | None = None, extra_sigma: float = 0.0, iterations: int = 10
+        self, poses: Array, prior: Prior | None = None, schedule: tuple[float, ...] = FOLLOWING_SCHEDULE_M
     ) -> tuple[Array, Evidence]:
-        """Returns poses (N, 3) after the descent from ``poses``, and the evidence there."""
-        return self.optimiser.descend(self, poses, prior, extra_sigma, iterations)
-
-    def polish(self, poses: Array, prior: Prior | None = None, iterations: int = 5) -> tuple[Array, Evidence]:
-        """Returns the minima next to ``poses`` (N, 3), and the evidence there."""
-        return self.optimiser.polish(self, poses, prior, iterations)
+        """Returns the minima near ``poses`` (N, 3), and the evidence there (see Optimiser)."""
+        return self.optimiser.descend(self, poses, prior, schedule)
 
     @cached_property
     def returned(self) -> npt.NDArray[np.bool_]:
@@ -220,40 +207,11 @@ def position_information(curvature: Array) -> Array:
     return np.asarray(curvature[:2, :2] - across / max(float(curvature[2, 2]), 1e-12))
 
 
-def descend(
-    view: View, poses: Array, prior: Prior | None = None, extra_sigma: float = 0.0, iterations: int = 10
-) -> tuple[Array, Evidence]:
-    """Returns poses (N, 3) after the descent from ``poses``, and the evidence there."""
-    best = np.array(poses, float)
-    evidence = view.evidence(best, extra_sigma)
-    energy = evidence.accuracy + (prior.energy(best) if prior else 0.0)
-    damping, active = np.full(len(best), 1e-3), np.ones(len(best), bool)
-    for _ in range(iterations):
-        step = _steps(best, evidence, prior, damping)
-        active &= (np.abs(step) > CONVERGED_STEP).any(axis=1)
-        if not active.any():
-            break
-        trial = best[active] + step[active]
-        trial[:, 2] = se2.wrap(trial[:, 2])
-        trial_evidence = view.evidence(trial, extra_sigma)
-        trial_prior = Prior(prior.mean[active], prior.information[active]) if prior else None
-        trial_energy = trial_evidence.accuracy + (trial_prior.energy(trial) if trial_prior else 0.0)
-        better = trial_energy < energy[active]
-        rows = np.flatnonzero(active)[better]
-        best[rows], energy[rows] = trial[better], trial_energy[better]
-        for name in vars(evidence):
-            getattr(evidence, name)[rows] = getattr(trial_evidence, name)[better]
-        damping[active] = np.where(better, damping[active] * 0.1, damping[active] * 30)
-        active &= damping < 1e4
-    return best, evidence
-
-
-def _steps(poses: Array, evidence: Evidence, prior: Prior | None, damping: Array) -> Array:
+def _steps(poses: Array, evidence: Evidence, prior: Prior | None) -> Array:
     H, slope = evidence.curvature + DAMPING, evidence.xi
     if prior:
         H = H + prior.information
         slope = slope + np.einsum("nij,nj->ni", prior.information, difference(prior.mean, poses))
-    H = H + damping[:, None, None] * H * np.eye(3)
     return limit_steps(np.linalg.solve(H, slope[..., None])[..., 0], MAX_STEP)
 
 
@@ -262,17 +220,18 @@ def limit_steps(steps: npt.NDArray[np.floating[Any]], largest: Array) -> Array:
     return np.asarray(steps / np.maximum((np.abs(steps) / largest).max(axis=-1, keepdims=True), 1.0))
 
 
-def follow(
+def descend(
     view: View, poses: Array, prior: Prior | None, schedule: tuple[float, ...] = FOLLOWING_SCHEDULE_M
 ) -> tuple[Array, Evidence]:
-    """Finds the minima next to predicted ``poses`` (N, 3), with only those beams that end at surfaces of the map.
+    """Finds the minima near ``poses`` (N, 3), with only those beams that end at surfaces of the map.
 
-    This is expectation maximisation: each step minimises F with the states of the beams held constant.
+    This is expectation maximisation: each step minimises F with the states of the beams held constant. ``schedule`` has
+    the deviation in m that is added to every beam's at each step.
     """
     poses = np.array(poses, float)
     for extra_sigma in schedule:
         evidence = view.evidence(poses, extra_sigma, view.surface_evidence(poses, extra_sigma).weights)
-        step = _steps(poses, evidence, prior, np.zeros(len(poses)))
+        step = _steps(poses, evidence, prior)
         if extra_sigma == 0.0 and (np.abs(step) < SETTLED_STEP).all():
             return poses, evidence
         poses = poses + step
@@ -290,7 +249,7 @@ def polish(view: View, poses: Array, prior: Prior | None = None, iterations: int
     poses = np.array(poses, float)
     evidence = view.evidence(poses)
     for _ in range(iterations - 1):
-        step = _steps(poses, evidence, prior, np.zeros(len(poses)))
+        step = _steps(poses, evidence, prior)
         if (np.abs(step) < SETTLED_STEP).all():
             break
         poses = poses + step

@@ -248,12 +248,13 @@ def _beams_towards(
 ) -> tuple[Array, npt.NDArray[np.intp], npt.NDArray[np.bool_]]:
     """Distances (K,) in m of points (K, 2) from a laser pose, their beams (K,), and whether they are in its view."""
     local = se2.transform(se2.inverse(laser), points)
-    first, last, count = view.angles[0], view.angles[-1], len(view.angles)
-    increment = abs(last - first) / max(1, count - 1)
-    turned = np.sign(last - first) * (np.arctan2(local[:, 1], local[:, 0]) - first) % (2 * np.pi)
-    beam = np.round(turned / max(increment, 1e-9)).astype(np.intp)
-    inside = (beam > 0) & (beam < count - 1)
-    return np.hypot(*local.T), np.where(inside, beam, 0), inside
+    # The beams of a scan that was corrected for motion are not evenly spaced, and a few have changed places.
+    order = np.argsort(view.angles, kind="stable")
+    angles = view.angles[order]
+    turned = angles[0] + (np.arctan2(local[:, 1], local[:, 0]) - angles[0]) % (2 * np.pi)
+    place = np.searchsorted((angles[1:] + angles[:-1]) / 2, turned)
+    inside = (place > 0) & (place < len(angles) - 1)
+    return np.hypot(*local.T), np.where(inside, order[place], 0), inside
 
 
 def _nearest_of_neighbours(ranges: Array, beam: npt.NDArray[np.intp]) -> Array:

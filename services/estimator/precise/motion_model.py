@@ -63,6 +63,10 @@ class Candidate:
         off[2] = se2.wrap(off[2])
         return float(off @ np.linalg.solve(self.covariance, off))
 
+    def excess(self, pose: Array) -> float:
+        """Nats by which ``pose`` (3,) is less probable than the farthest one that is attributed to the motion."""
+        return 0.5 * max(0.0, self.squared_distance(pose) - MAX_MOTION_SIGMAS**2)
+
 
 def predict_motion(
     noise: MotionNoise,
@@ -94,12 +98,17 @@ def predict_motion(
             change = change + noise.command_share * np.abs(command) * period
             found.append(_propagate("commanded", pose, covariance, command * period, change, rest / 2))
         elif velocity is not None:
-            velocity = limit_steps(velocity, MAX_MOTION_SIGMAS * np.array([noise.speed, noise.speed, noise.turn]))
+            velocity = limit_velocity(noise, velocity)
             deviation = np.sqrt(change**2 + _velocity_variance(pose, covariance, period))
             found.append(_propagate("going on", pose, covariance, velocity * period, deviation, rest / 2))
     centre = odom if odom is not None else np.zeros(3)
     found.append(_propagate("any motion", pose, covariance, centre, max_motion + np.abs(centre), noise.surprise))
     return found
+
+
+def limit_velocity(noise: MotionNoise, velocity: Array) -> Array:
+    """The velocity (3,), reduced to one that is attributed to the robot."""
+    return limit_steps(velocity, MAX_MOTION_SIGMAS * np.array([noise.speed, noise.speed, noise.turn]))
 
 
 def smooth_velocity(previous: Array | None, current: Array, period: float) -> Array:

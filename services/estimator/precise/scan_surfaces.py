@@ -30,6 +30,7 @@ NO_RETURN = 0.05  # probability that a surface begins from which no beam returns
 CHANGES = 1.0  # of what is seen per radian of the scan, without the start of another surface
 MIN_BEAMS = 3
 OUTLIER = 0.01  # share of single beams with arbitrary ranges
+EDGE_M = 0.02  # an edge of the map may be misplaced by this, and by one beam more
 
 jit = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -42,6 +43,7 @@ class ScanSurfaces:
     starts: npt.NDArray[np.bool_]  # (B,) whether another surface begins at this beam
     ideal: Array  # (B,) nats, ln p(range) if the surface had been known
     small: npt.NDArray[np.bool_]  # (B,) beams on surfaces of less than `MIN_BEAMS` beams: often dust, or mixed pixels
+    edges: npt.NDArray[np.int64]  # (B,) beams by which the map may misplace an edge near this one; 0: no edge
     change: float  # probability that something else is seen from one beam to the next on the same surface
 
     @classmethod
@@ -53,7 +55,24 @@ class ScanSurfaces:
         increment = abs(float(angles[-1] - angles[0])) / max(1, count - 1)
         surface = np.cumsum(starts)
         small = np.bincount(surface)[surface] < MIN_BEAMS if count else starts
-        return cls(density, starts, ideal, small, min(0.5, CHANGES * increment))
+        edges = np.zeros(count, np.int64)
+        _mark_edges(ranges, starts, increment, edges)
+        return cls(density, starts, ideal, small, edges, min(0.5, CHANGES * increment))
+
+
+@jit
+def _mark_edges(ranges: Array, starts: npt.NDArray[np.bool_], increment: float, edges: npt.NDArray[np.int64]) -> None:
+    """Fills ``edges`` of `ScanSurfaces`."""
+    last = -1
+    for b in range(ranges.shape[0]):
+        if np.isnan(ranges[b]) or ranges[b] == -np.inf:
+            continue
+        if starts[b] and last >= 0:
+            near = min(ranges[b], ranges[last])  # the edge belongs to the nearer of the two surfaces
+            reach = 1 + int(EDGE_M / (near * increment))
+            for at in range(max(0, last + 1 - reach), min(ranges.shape[0], b + reach)):
+                edges[at] = max(edges[at], reach)
+        last = b
 
 
 @jit

@@ -12,10 +12,8 @@ class Settings:
     """Parameters of the precise estimator; the defaults hold for every shipped world."""
 
     # Search
-    search_seeds: int = 48  # poses from which the first round of a global search descends
-    thorough_search_seeds: int = 240  # the same for the second round, if the first explains too little
+    search_seeds: int = 48  # poses from which a search descends
     search_beams: int = 150  # beams used by the first descents of a search; the last ones use all beams
-    conclusive_share: float = 0.9  # share of explained beams that ends a search
     max_hypotheses: int = 8
 
     # Following
@@ -24,7 +22,7 @@ class Settings:
     min_constraining_ratio: float = 0.004  # share of beams needed to fix the position along a corridor
 
     # Belief
-    unknown: float = 1e-8  # probability that the robot is at none of the hypotheses: never less than this
+    unknown: float = 1e-5  # probability that the robot is at none of the hypotheses: never less than this
     all_changed: float = 1e-2  # probability that nothing around the start is as the map shows it
     unmapped: float = 1e-3  # of that, the probability that the robot is at no place that a search of the map finds
     change_rate: float = 0.015  # 1/s, at which a surface in view is taken away or put there

@@ -78,7 +78,9 @@ class SurfaceEvidence:
             likelihood.relative,
             range_max,
             surfaces.density,
+            surfaces.ideal,
             surfaces.starts,
+            surfaces.edges,
             skipped,
             prior,
             surfaces.change,
@@ -90,17 +92,17 @@ class SurfaceEvidence:
 
 
 @jit
-def _log_density(error: float, variance: float, own: float, keep: float) -> float:
+def _log_density(error: float, variance: float, ideal: float, keep: float) -> float:
     """Log density of a range that differs by ``error`` m from that of a surface of the map.
 
     Beyond the first beam on a surface, the beams before it predict the range better than a map with errors does
-    (density ``own``). The map only says whether it is plausible.
+    (density ``ideal``, because the map shows the corners). The map only says whether it is plausible.
     """
     square = error * error / variance
     if keep == 0.0:
         return math.log((1 - OUTLIER) * math.exp(-0.5 * square) / math.sqrt(2 * math.pi * variance) + OUTLIER / FAR_M)
     excess = 0.5 * max(0.0, square - PLAUSIBLE_SIGMAS**2) - PLAUSIBLE_MEAN
-    return float(max(own - excess, math.log(OUTLIER / FAR_M)))
+    return float(max(ideal - excess, math.log(OUTLIER / FAR_M)))
 
 
 @jit
@@ -113,13 +115,14 @@ def _emit(
     relative: float,
     range_max: float,
     own: float,
+    ideal: float,
     keep: float,
     log_densities: Array,
 ) -> None:
     """Fills the log density (4,) in nats of a range in each state.
 
-    ``own`` is that on a surface that the map lacks; ``keep`` is the probability of the same state as at the beam
-    before, 0 where a surface begins.
+    ``own`` is that on a surface that the map lacks, ``ideal`` on one that it shows; ``keep`` is the probability of the
+    same state as at the beam before, 0 where a surface begins.
     """
     outlier = math.log(OUTLIER / FAR_M)
     log_densities[:] = outlier
@@ -139,7 +142,7 @@ def _emit(
         noise = sigma * sigma + relative * relative * surface * surface
         error = r - surface
         near = error * error < NEAR_SIGMAS**2 * (noise + model)
-        log_densities[0] = _log_density(error, noise + model, own, keep)
+        log_densities[0] = _log_density(error, noise + model, ideal, keep)
     coincidence = math.log(COINCIDENCE) if near else 0.0
     if error < 0 or near:
         log_densities[1] = own + coincidence
@@ -147,7 +150,7 @@ def _emit(
         log_densities[2] = own + coincidence
     if behind < range_max:
         noise = sigma * sigma + relative * relative * behind * behind
-        log_densities[3] = _log_density(r - behind, noise + model, own, keep)
+        log_densities[3] = _log_density(r - behind, noise + model, ideal, keep)
 
 
 @jit
@@ -160,7 +163,9 @@ def _sum(
     relative: float,
     range_max: float,
     own: Array,
+    ideal: Array,
     starts: npt.NDArray[np.bool_],
+    edges: npt.NDArray[np.int64],
     skip: npt.NDArray[np.bool_],
     prior: Array,
     change: float,
@@ -172,26 +177,24 @@ def _sum(
     used = np.flatnonzero(~np.isnan(ranges) & (ranges > -np.inf))
     size, states = len(used), len(prior)
     forward, emitted, keep = np.empty((size, states)), np.empty((size, states)), np.empty(size)
-    edge = np.zeros(size, np.bool_)  # next to where a surface begins
     for n in range(size):
         keep[n] = 0.0 if n == 0 or starts[used[n]] else 1 - change
-        if keep[n] == 0.0:
-            edge[max(0, n - 1) : n + 1] = True
     for k in range(expected.shape[0]):
         total[k], explained[k] = 0.0, 0.0
         weights[k] = 0.0
         for n in range(size):
             b = used[n]
-            at = _nearest_beam(ranges[b], expected[k], b) if edge[n] else b
+            at, surface = _nearest_surface(ranges[b], expected[k], b, edges[b])
             _emit(
                 ranges[b],
-                expected[k, at],
+                surface,
                 behind[k, at],
                 scale[k, at],
                 sigma,
                 relative,
                 range_max,
                 own[b],
+                ideal[b],
                 keep[n],
                 emitted[n],
             )
@@ -210,16 +213,21 @@ def _sum(
 
 
 @jit
-def _nearest_beam(r: float, expected: Array, b: int) -> int:
-    """The beam among b and two neighbours on each side for which the map expects the range nearest to r (m).
+def _nearest_surface(r: float, expected: Array, b: int, reach: int) -> tuple[int, float]:
+    """The expected range nearest to r (m), and its beam, if edges may be misplaced by ``reach`` beams.
 
-    The map has edges at places known to a beam or two only.
+    Up to there, the surfaces that the map shows at the neighbouring beams continue straight.
     """
-    best = b
-    for other in (b - 1, b + 1, b - 2, b + 2):
-        if 0 <= other < expected.shape[0] and abs(r - expected[other]) < abs(r - expected[best]):
-            best = other
-    return best
+    beam, best = b, expected[b]
+    for step in (-1, 1):
+        for away in range(1, reach + 1):
+            other = b + step * away
+            if not 0 <= other + step < expected.shape[0]:
+                break
+            u = (away + 1) / expected[other] - away / expected[other + step]  # 1 / range is linear along a wall
+            if u > 0 and abs(r - 1 / u) < abs(r - best):
+                beam, best = other, 1 / u
+    return beam, best
 
 
 @jit

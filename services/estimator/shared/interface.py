@@ -24,6 +24,16 @@ class Observation:
     odom: Array | None = None  # (3,) base_link in odom at the stamp
     command: Array | None = None  # (3,) the last velocity command: m/s, m/s, rad/s in base_link
     goal: Array | None = None  # (3,) preferred pose, base_link in map; used only by the paper's equation 3
+    time_increment: float = field(default=0.0, kw_only=True)  # s between beams, as in a scan message
+
+
+def start_belief(pose: Array, covariance: Array) -> tuple[Array, Array]:
+    """Mean (3,) and covariance (3, 3) near ``pose`` (3,); all headings are equally likely if it is (2,)."""
+    if len(pose) == 3:
+        return np.asarray(pose, float), np.asarray(covariance, float)
+    spread = np.diag([0.0, 0.0, np.pi**2 / 3])
+    spread[:2, :2] = np.asarray(covariance)[:2, :2]
+    return np.array([*pose, 0.0]), spread
 
 
 @dataclass(frozen=True)
@@ -95,7 +105,10 @@ class Estimator(Protocol):
         ...
 
     def restart(self, pose: Array | None = None, covariance: Array | None = None) -> None:
-        """Discards the belief, and starts near ``pose`` (3,) with ``covariance`` (3, 3), or from an unknown pose."""
+        """Discards the belief, and starts near ``pose`` (3,) with ``covariance`` (3, 3), or from an unknown pose.
+
+        A ``pose`` (2,) is a position with an unknown heading.
+        """
         ...
 
 

@@ -15,7 +15,21 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from common.messages.definitions import Belief, CmdVel, Goal, Odom, Plan, Pose, Prediction, Scan, Status, Truth, Twist
+from common.geometry.world import World
+from common.messages.definitions import (
+    Belief,
+    CmdVel,
+    Goal,
+    Map,
+    Odom,
+    Plan,
+    Pose,
+    Prediction,
+    Scan,
+    Status,
+    Truth,
+    Twist,
+)
 
 Json = dict[str, Any]
 COMPACT = (",", ":")
@@ -106,7 +120,27 @@ def status_of(status: Status | None, goals: Mapping[int, Goal]) -> Json | None:
     message = goals.get(status.goal_seq)
     if goal is not None and message is not None and message.pose == status.goal:
         goal |= {"tolerance": message.tolerance, "yaw_tolerance": message.yaw_tolerance}
-    return {"state": status.state, "reason": status.reason[:500], "distance": status.distance, "goal": goal}
+    energy = None if status.energy is None else status.energy.model_dump()
+    return {
+        "state": status.state,
+        "reason": status.reason[:500],
+        "distance": status.distance,
+        "goal": goal,
+        "energy": energy,
+    }
+
+
+def map_of(message: Map, robot: str) -> str:
+    """A map as a message of type ``map``: a world, the path of the key scans, and the ends of loop closures, in m."""
+    world = World.model_validate({"name": "map", "grid": message.grid})
+    parts = {
+        "type": "map",
+        "robot": robot,
+        "world": world.model_dump(mode="json"),
+        "path": message.poses[:, :2].round(3).tolist(),
+        "closures": message.closures.astype(float).round(3).reshape(-1, 2, 2).tolist(),
+    }
+    return json.dumps(parts, separators=COMPACT)
 
 
 def scan_of(scan: Scan) -> Json:

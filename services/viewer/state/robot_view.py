@@ -16,6 +16,7 @@ from common.messages.definitions import (
     Belief,
     CmdVel,
     Goal,
+    Map,
     Odom,
     Plan,
     Prediction,
@@ -30,6 +31,7 @@ from common.messages.topics import (
     CMD_VEL,
     GOAL,
     HEALTH,
+    MAP,
     ODOM,
     PLAN,
     PREDICTION,
@@ -48,7 +50,7 @@ from services.viewer.state.replay_moments import ReplayMoments
 ANSWER_TIMEOUT_S = 0.05  # wall time for which a frame waits for the answers to its scan
 SILENCE_TIMEOUT_S = 2.0  # behind the scan, by stamps and by wall time; older messages are not waited for and not shown
 ALWAYS_READ_TOPICS = (BELIEF, TRUTH, STATUS, GOAL, HEALTH)  # decoded even if no visitor watches the robot
-SHOWN_TOPICS = (*ALWAYS_READ_TOPICS, SCAN, ODOM, PREDICTION, CMD_VEL, PLAN, PREFERENCE)
+SHOWN_TOPICS = (*ALWAYS_READ_TOPICS, SCAN, ODOM, PREDICTION, MAP, CMD_VEL, PLAN, PREFERENCE)
 SENSOR_TOPICS = (ODOM, TRUTH, SCAN)  # the first messages of a new stamp
 ANSWER_TOPICS = (ODOM, TRUTH, BELIEF, PREDICTION, CMD_VEL, PLAN)
 MAX_TRUTHS = 256  # kept, because a belief arrives later than the truth of its stamp
@@ -76,6 +78,7 @@ class RobotView:
         self.time_restarted = False  # stamps went back; reset by the caller once visitors have the new history
         self.journal_changed = False  # the journal has new rows; reset by the caller once visitors have them
         self.frame: bytes | None = None  # the last frame
+        self.map: str | None = None  # the last map of the mapper, as a message for the page
         self._received: dict[str, ReceivedMessage] = {}  # the last message by topic name
         self._truths: OrderedDict[int, Truth] = OrderedDict()  # by stamp
         self._goals: OrderedDict[int, Goal] = OrderedDict()  # by sequence number
@@ -91,6 +94,11 @@ class RobotView:
         if isinstance(message, Preference | Goal):
             self._store_goal(message)
             return None
+        if isinstance(message, Map):
+            self._store_map(message)
+            return None
+        if isinstance(message, Truth) and self.map is not None:
+            return None  # it is in the frame of the simulator's world, not of the map
         last, frame = self._received.get(topic.name), None
         if topic in SENSOR_TOPICS and last is not None and message.stamp_ns < last.message.stamp_ns:
             self._restart()
@@ -157,6 +165,15 @@ class RobotView:
         self.history.clear()
         self.journal.clear()
         self._waiting, self._latency_ms, self.time_restarted, self.journal_changed = None, None, True, True
+
+    def _store_map(self, message: Map) -> None:
+        """Stores the map. Forgets the truth when the first one comes, because its frame is another one."""
+        if self.map is None:
+            self._received.pop(TRUTH.name, None)
+            self._truths.clear()
+            self.history.clear()
+            self.time_restarted = True
+        self.map = frames.map_of(message, self.robot)
 
     def _store_goal(self, message: Preference | Goal) -> None:
         """Stores a message that does not belong to a scan."""

@@ -8,8 +8,9 @@ import numpy as np
 import yaml
 
 from common.geometry.occupancy_grid import FREE, OCCUPIED, UNKNOWN
+from common.geometry.ros_map_writer import DEFAULT_KEYS, write_map
 from common.geometry.world import World
-from presage.learning.grid_map import DEFAULT_KEYS, rooms, write_map
+from lab.benchmarks.maps import rooms
 
 __all__ = ["HUT", "ROOM", "TURNED", "rooms", "speckled", "values_of", "write_map", "write_yaml"]
 

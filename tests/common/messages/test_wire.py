@@ -180,7 +180,7 @@ def test_the_error_names_the_field():
 
 def test_unknown_and_missing_fields():
     assert CmdVel.decode(changed(COMMAND, colour="red")) == COMMAND
-    assert Scan.decode(changed(a_scan(), scan_time=..., mount=..., seq=...)) == a_scan()
+    assert Scan.decode(changed(a_scan(), scan_time=..., time_increment=..., mount=..., seq=...)) == a_scan()
 
 
 @settings(max_examples=2000)

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from common.bus.bus import DEFAULT_ENDPOINT, Link
 from common.errors import UserError
-from common.geometry.pose_text import POSE_TEXT, pose_of_text
+from common.geometry.pose_text import POSE_TEXT, pose_of_text, start_of_text
 from common.router.router import RouterSettings
 from common.runtime.config import ServiceSettings, load_settings, split_endpoints
 
@@ -79,6 +79,8 @@ def test_pose_texts(text, pose):
     assert re.match(POSE_TEXT, text)
     if pose is not None:
         np.testing.assert_allclose(pose_of_text(text, "--start"), pose)
+        heading = text.count(",") == 2  # without it, a start has an unknown one
+        np.testing.assert_allclose(start_of_text(text, "--start"), pose if heading else pose[:2])
 
 
 @pytest.mark.parametrize("text", ["1.2.3,1", "1", ".,1", "nan,1", "1,2,3,4", "1,,2", "-,1", "1e3,1"])

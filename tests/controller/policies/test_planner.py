@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,7 @@ from common.robot.base import Robot
 from services.controller.policies.planner import GeodesicPolicy
 from services.controller.policies.straight_line import StraightLinePolicy
 from tests.common.geometry.maps import rooms
-from tests.controller.driving import KINDS, belief, box, drive, goal, path_length, room, scan, shipped
+from tests.controller.driving import KINDS, SCANNER, belief, box, drive, goal, path_length, room, scan, shipped
 
 HALL = room(10, 5)
 WALLS = box(5, 1, 0.2, 2, "left"), box(5, 4.1, 0.2, 1.8, "right")
@@ -29,7 +31,7 @@ def test_drives_around_walls(name, kind):
         poses, statuses, contacts = drive(world, robot, (*start, rng.uniform(-3, 3)), goal(*end), seed=seed)
         assert statuses[-1].state == "reached", (start, end, statuses[-1])
         assert contacts == 0
-        assert np.hypot(*(poses[-1][:2] - end)) <= 0.2
+        assert np.hypot(*(poses[-1][:2] - end)) <= 0.02
         assert path_length(poses) <= 1.1 * shortest + 0.2
 
 
@@ -41,6 +43,28 @@ def test_turns_to_the_heading_of_the_goal(kind):
     assert abs(poses[-1][2] - 2.0) <= 0.1
     turning = [status.state for status in statuses if "turning into" in status.reason]
     assert set(turning) == {"navigating"}  # the goal is not reached before the turn ends
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("goal_y", "changed", "reason"),
+    [
+        (
+            2.5,
+            room(10, 5, box(7.5, 3.0, 0.6, 0.6)),
+            r"0\.\d\d m from the goal, waiting: something that is not in the map",
+        ),
+        (0.29, HALL, r"goal refused: .* is too near to a wall: stopped 0\.\d\d m from it"),
+    ],
+)
+def test_stops_short_of_the_goal(kind, goal_y, changed, reason):
+    """The box stands 0.2 m from the goal; the wall is 0.02 m from the footprint at the goal."""
+    start, to = (7.5, 1.5, -1.5), goal(7.5, goal_y)
+    poses, statuses, contacts = drive(changed, Robot(drive=kind), start, to, 240, known=HALL)
+    assert (statuses[-1].state, contacts) == ("blocked", 0)
+    assert re.match(reason, statuses[-1].reason)
+    assert not any("backing off" in status.reason for status in statuses)
+    assert np.ptp(poses[-60:, :2], axis=0).max() < 0.01
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -126,6 +150,16 @@ def test_empty_map_without_obstacle_stop(kind):
         assert contacts == 0, (start, end)
         fastest = max(fastest, np.hypot(*np.diff(poses[:, :2], axis=0).T).max() * 15)
     assert fastest > 0.9  # m/s, so braking was necessary
+
+
+@pytest.mark.parametrize(("epistemic", "low", "high"), [(True, 0.0, 0.1), (False, 0.4, 1.0)])
+def test_route_in_a_wide_hall(epistemic, low, high):
+    """Share of the route on which a scanner with 4 m of range sees no wall (coastal navigation)."""
+    hall = room(24, 16)
+    policy = GeodesicPolicy(Robot(), hall, epistemic=epistemic)
+    policy.prepare(scan(0, [2.0, 2.0, 0.0], hall, SCANNER.model_copy(update={"range_max": 4.0})))
+    route = policy.graph.cost_field(np.array([22.0, 14.0])).path(np.array([2.0, 2.0]))
+    assert low <= np.mean(policy.free.clearance_at(route) > 4.0) <= high
 
 
 def test_backing_off():

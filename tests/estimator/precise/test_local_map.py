@@ -12,7 +12,7 @@ from common.geometry.world import World
 from lab.accuracy.scenes import Scene
 from services.estimator.precise.gauss_newton import View
 from services.estimator.precise.likelihood import Likelihood
-from services.estimator.precise.local_map import MIN_DISTANCE_M, KeyScan, LocalMap
+from services.estimator.precise.local_map import MIN_DISTANCE_M, KeyScan, LocalMap, _beams_towards
 from services.estimator.precise.motion_model import Candidate
 from services.estimator.shared.generative_models import RayCaster
 from tests.estimator.models import ROOM
@@ -125,3 +125,12 @@ def test_changes_between_scans():
         assert counts[0] == 0 < counts[1] < counts[2]
     step = se2.compose(HERE, [0.05, 0.0, 0.1])
     assert made.count_changes((HERE, first), (step, view(scene, step)), 0.1) == 0
+
+
+def test_beams_of_a_corrected_scan():
+    """Each point belongs to its own beam, although the beams are not evenly spaced."""
+    angles = np.linspace(-2, 2, 50) + 0.03 * np.sin(np.linspace(0, 6, 50))
+    uneven = View(RayCaster(HALL), Likelihood(), np.zeros(3), angles, np.full(50, 2.0), 25.0)
+    _, beam, inside = _beams_towards(uneven, HERE, se2.transform(HERE, uneven.points))
+    assert inside.sum() == 48
+    assert (beam[inside] == np.arange(1, 49)).all()

@@ -100,30 +100,73 @@ def test_forward_and_backward_algorithm(seed):
     chosen = rng.integers(0, 5, BEAMS)
     ranges = np.choose(chosen, [surface, behind, rng.uniform(0.5, 2, BEAMS), surface + 0.3, np.full(BEAMS, np.inf)])
     ranges = ranges + 0.05 * rng.standard_normal(BEAMS)
-    density, starts, change = rng.normal(0, 1, BEAMS), rng.random(BEAMS) < 0.3, rng.uniform(0.01, 0.3)
+    (density, ideal), starts = rng.normal(0, 1, (2, BEAMS)), rng.random(BEAMS) < 0.3
+    change = rng.uniform(0.01, 0.3)
     skip = rng.random(BEAMS) < 0.3
     starts[0] = True
-    # Next to where a surface begins, the beam expected nearest to the range counts.
-    edge = starts | np.append(starts[1:], False)
+    edges = rng.integers(0, 2, BEAMS)
     emitted = np.empty((BEAMS, len(PRIOR)))
     for b in range(BEAMS):
-        near = [k for k in range(max(0, b - 2), min(BEAMS, b + 3)) if edge[b] or k == b]
-        at = min(near, key=lambda k, b=b: abs(ranges[b] - surface[k]))
+        at, expected_range = surface_evidence._nearest_surface(ranges[b], surface, b, edges[b])
         surface_evidence._emit(
-            ranges[b], surface[at], behind[at], scale[at], 0.05, 0.0, RANGE_MAX, density[b], 1.0 - starts[b], emitted[b]
+            ranges[b],
+            expected_range,
+            behind[at],
+            scale[at],
+            0.05,
+            0.0,
+            RANGE_MAX,
+            density[b],
+            ideal[b],
+            1.0 - starts[b],
+            emitted[b],
         )
     total, weights = by_enumeration(np.exp(emitted), starts, change, skip)
-    made = ScanSurfaces(density, starts, np.zeros(BEAMS), np.zeros(BEAMS, np.bool_), change)
+    made = ScanSurfaces(density, starts, ideal, np.zeros(BEAMS, np.bool_), edges, change)
     expected = Expected(surface[None], scale[None], np.zeros((1, BEAMS, 3)))
     found = SurfaceEvidence.of(ranges, RANGE_MAX, expected, behind[None], made, likelihood, SHARE, skip=skip)
     assert found.log_likelihood[0] == pytest.approx(total, abs=1e-9)
     assert found.weights[0] == pytest.approx(weights, abs=1e-9)
 
 
+@pytest.mark.parametrize("reach", [0, 1, 3])
+def test_misplaced_edges(reach):
+    """An edge of a slanting wall may be ``reach`` beams nearer to the end of the wall than in the map."""
+    near = 1 / (0.3 + 0.5 * ANGLES)[100:141]  # a straight wall at small angles
+    expected = np.concatenate([np.full(20, 9.0), near[20:]])
+    beams = np.arange(18, 22)
+    found = [surface_evidence._nearest_surface(near[b], expected, b, reach)[1] for b in beams]
+    assert np.isclose(found, near[beams], rtol=1e-3).tolist() == (20 - beams <= reach).tolist()
+
+
+def test_beams_near_edges():
+    """An edge at 2 m may be misplaced by 2 cm and one beam; each of these 240 beams covers 17 mm there."""
+    ranges = np.full(len(ANGLES), 5.0)
+    ranges[100:140] = 2.0
+    edges = ScanSurfaces.of(ranges, ANGLES, Likelihood(SIGMA_M)).edges
+    assert np.flatnonzero(edges).tolist() == [98, 99, 100, 101, 138, 139, 140, 141]
+    assert set(edges[edges > 0]) == {2}
+
+
+def test_corners_of_the_map():
+    """At the true pose, a corner that the map shows costs nothing, although the scan alone does not predict it."""
+    angles = np.linspace(-np.pi, np.pi, 400, endpoint=False)
+    mapped = World(name="square", boundary=SQUARE).ray_distances(WALL, angles)
+    ranges = mapped[0] + SIGMA_M * np.random.default_rng(0).standard_normal(400)
+    surfaces = ScanSurfaces.of(ranges, angles, Likelihood(SIGMA_M))
+    expected = Expected(mapped, np.full((1, 400), 1e-3), np.zeros((1, 400, 3)))
+    found = SurfaceEvidence.of(
+        ranges, RANGE_MAX, expected, np.full((1, 400), np.inf), surfaces, Likelihood(SIGMA_M), SHARE
+    )
+    assert surfaces.density.sum() < surfaces.ideal.sum() - 20
+    assert found.log_likelihood[0] > surfaces.ideal.sum() - 10
+
+
 def test_unused_beams():
     """A beam that measured nothing is no evidence, and has no weight."""
     ranges, rng = scan(WALL), np.random.default_rng(1)
-    ranges[rng.choice(len(ranges), 20, replace=False)] = np.nan
+    away_from_edges = np.flatnonzero(surfaces_of(ranges).edges == 0)
+    ranges[rng.choice(away_from_edges, 20, replace=False)] = np.nan
     used = ~np.isnan(ranges)
     world = World(name="square", boundary=SQUARE)
     found = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from common.geometry import se2
+from common.geometry.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from common.messages.definitions import (
     Belief,
     CmdVel,
@@ -12,6 +13,7 @@ from common.messages.definitions import (
     Goal,
     Health,
     Hypothesis,
+    Map,
     Odom,
     Plan,
     Pose,
@@ -30,6 +32,7 @@ from common.messages.topics import (
     DRIVE,
     GOAL,
     HEALTH,
+    MAP,
     ODOM,
     PLAN,
     PREDICTION,
@@ -56,6 +59,11 @@ PREFERRED = Preference(
     stamp_ns=GOAL_AT * PERIOD_NS, goal=Pose(x=8.0, y=1.0), origin=Pose(x=0.5, y=0.25), resolution=0.5, width=3,
     height=2, distance=[0.0, 0.5, np.inf, 0.5, 1.0, np.inf],
 )  # fmt: skip
+GROWN = Map(
+    stamp_ns=GOAL_AT * PERIOD_NS,
+    grid=OccupancyGrid.of(np.array([[FREE, OCCUPIED, UNKNOWN]], np.uint8), 0.05, (1.0, 2.0, 0.0)),
+    poses=[(1, 1, 0)],
+)
 
 
 def true(i):
@@ -107,6 +115,7 @@ def events(robot="rob"):
             yield GOAL, GOAL.key(robot), Goal(stamp_ns=0, pose=Pose(x=8.0, y=1.0), tolerance=0.25), at + BELIEVED_NS
             yield PLAN, PLAN.key(robot), PLANNED, at + BELIEVED_NS
             yield PREFERENCE, PREFERENCE.key(robot), PREFERRED, at + BELIEVED_NS
+            yield MAP, MAP.key(robot), GROWN, at + BELIEVED_NS
             yield DRIVE, DRIVE.key(robot), Drive(stamp_ns=stamp, twist=twist), at + BELIEVED_NS
         state, distance = ("navigating", 3.5) if i >= GOAL_AT else ("idle", None)
         status = Status(stamp_ns=stamp, seq=i, state=state, reason="on the way" * (i >= GOAL_AT), distance=distance)

@@ -177,12 +177,16 @@ def test_page_from_results(tmp_path):
         page.fill_tables(text.replace("e2", "e1"), tmp_path)
 
 
-@pytest.mark.parametrize("name", ["experiments", "real_logs", "navigation"])
+DOCS = ("experiments", "real_logs", "navigation", "results", "integrity")
+PAGES = ["README.md", *(f"docs/{name}.md" for name in DOCS)]
+
+
+@pytest.mark.parametrize("name", PAGES)
 def test_tables_of_a_page(name):
-    docs = Path(__file__).resolve().parents[3] / "docs"
-    text = (docs / f"{name}.md").read_text(encoding="utf-8")
+    root = Path(__file__).resolve().parents[3]
+    text = (root / name).read_text(encoding="utf-8")
     assert "<!-- table " in text
-    assert page.fill_tables(text, docs / "experiments") == text
+    assert page.fill_tables(text, root / "docs" / "experiments") == text
 
 
 def test_files_of_e1(presage, monkeypatch, tmp_path):

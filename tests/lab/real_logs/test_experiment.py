@@ -51,12 +51,12 @@ def folder(tmp_path_factory):
 
 
 def test_card(folder):
-    _, places, card = weights.load(folder / "before-precise.safetensors")
+    _, seeds, card = weights.load(folder / "before-precise.safetensors")
     assert card.source == "100 posed scans of drive.npz; elsewhere 100 simulated scans in map before"
     assert card.calibration is not None
     assert card.calibration.scans == 20
     assert card.test_range_error_median_m < 0.03
-    assert len(places) > 50
+    assert len(seeds.places) > 50
     assert (folder / "before-precise.png").stat().st_size > 10_000
     raw = json.loads((folder / "before-precise.json").read_text(encoding="utf-8"))
     assert raw["calibration"]["log_likelihood"] == pytest.approx(card.calibration.log_likelihood)

@@ -11,6 +11,7 @@ from presage.logs.options import LogSettings
 from services.bridge_ros2.settings import BridgeRos2Settings
 from services.controller.settings import ControllerSettings
 from services.estimator.settings import EstimatorSettings
+from services.mapper.settings import MapperSettings
 from services.recorder.settings import RecorderSettings
 from services.simulator.settings import SimulatorSettings
 from services.viewer.settings import ViewerSettings
@@ -18,7 +19,8 @@ from tests.conftest import ROOT
 
 FILE = ROOT / "docs" / "settings.yaml"
 SERVICES = [
-    SimulatorSettings, EstimatorSettings, ControllerSettings, RecorderSettings, ViewerSettings, BridgeRos2Settings,
+    SimulatorSettings, EstimatorSettings, ControllerSettings, MapperSettings, RecorderSettings, ViewerSettings,
+    BridgeRos2Settings,
 ]  # fmt: skip
 
 

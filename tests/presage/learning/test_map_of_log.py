@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from rich.console import Console
 
 from common.errors import UserError
+from common.geometry import se2
 from common.geometry.occupancy_grid import FREE, OCCUPIED, UNKNOWN
+from common.geometry.ros_map_writer import write_grid
 from common.geometry.world import load_world
-from presage.learning.map_of_log import MapOptions, cells_of, map_command
+from lab.accuracy.motion_distortion import observations
+from lab.accuracy.scenes import Scene
+from presage.learning.map_of_log import MapOptions, map_command
+from presage.learning.train_drive import drive_of
 from presage.logs.log import Reading
-from services.estimator.precise.learning.calibration import Drive
+from presage.logs.scan_files import Scans
+from services.estimator.factory import EstimatorOptions, Geometry, prepare
 from services.estimator.shared.generative_models import RayCaster
+from services.estimator.shared.interface import Observation
+from services.mapper.slam.drive import Laser
+from services.mapper.slam.grid import grid_of_scans
 from tests.lab.real_logs import drives as real_drive
 from tests.recorder import sessions as recorded
 
@@ -59,12 +69,10 @@ def test_who_walks_through_is_not_in_the_map():
     ranges = np.full((count, len(angles)), 4.0)
     for k in range(count):
         ranges[k, 8 * k : 8 * k + 8] = 2.0
-    drive = Drive(np.arange(count) * 0.1, np.zeros((count, 3)), ranges, angles, np.zeros(3), 30.0)
-    cells, (x0, y0) = cells_of(drive, 0.05)
+    grid = grid_of_scans(np.zeros((count, 3)), ranges, Laser(angles, np.zeros(3), 30.0), 0.05)
 
     def at(radius):
-        column, row = np.floor((radius * np.array([np.cos(angles), np.sin(angles)]) - [[x0], [y0]]) / 0.05).astype(int)
-        return cells[row, column]
+        return grid.values_at(radius * np.column_stack([np.cos(angles), np.sin(angles)]))
 
     assert (at(4.0) == OCCUPIED).mean() > 0.95
     assert (at(2.0) == FREE).all()
@@ -85,8 +93,9 @@ def test_what_cannot_be_is_said(log, tmp_path):
     real_drive.save(bare, real_drive.drive(20), reference=False)
     with pytest.raises(UserError, match="no reference poses"):
         map_command(MapOptions(bare, tmp_path / "b.yaml", reading=HERE, poses="reference"), QUIET, QUIET)
+    drive = real_drive.drive(20)
     with pytest.raises(UserError, match="larger --cell"):
-        cells_of(real_drive.drive(20), 0.0005)
+        grid_of_scans(drive.poses, drive.ranges, Laser(drive.angles, drive.mount, drive.range_max), 0.0005)
     assert not list(tmp_path.glob("*.yaml"))
 
 
@@ -122,3 +131,34 @@ def test_map_without_reference_poses(log, tmp_path, odometry):
     assert sorted((width, height)) == pytest.approx([6, 9], abs=1.0)
     assert len(np.loadtxt(tmp_path / "own.tum")) == 200
     assert (tmp_path / "own.png").exists()
+
+
+def test_swept_scans():
+    """The ranges that are drawn are nearer to those of instantaneous scans."""
+    scene = Scene.of(load_world("office"), 300, 5)
+    path = scene.path(5, at_full_speed=True)
+    observed = observations(scene, path, "corrected", "laser only")
+    ranges, stamps = np.array([each.ranges for each in observed]), np.arange(len(observed)) / scene.scanner.rate
+    geometry, increment = Geometry.of(scene.scanner), observed[0].time_increment
+    swept = Scans(geometry, ranges, stamps, truth=path[:-1], time_increment=increment)
+    errors = []
+    for each in (swept, replace(swept, time_increment=0.0)):
+        off = np.abs(drive_of(each, Path("drive.bag")).ranges - scene.clean(path[:-1]))
+        errors.append(np.quantile(off[np.isfinite(off)], 0.9))
+    assert errors[0] < 0.5 * errors[1]
+
+
+def test_refined_map_keeps_the_rough_frame(log, tmp_path):
+    truth = real_drive.drive(200)
+    turned = se2.compose([3.0, -1.0, 0.7], truth.poses)  # the frame of the rough map
+    rough = grid_of_scans(turned, truth.ranges, Laser(truth.angles, truth.mount, truth.range_max), 0.05)
+    file = write_grid(tmp_path, "rough", rough)
+    options = MapOptions(log, tmp_path / "fine.yaml", reading=HERE, refine=str(file), models=tmp_path)
+    map_command(options, QUIET, QUIET)
+    placed = np.loadtxt(tmp_path / "fine.tum")[:, 1:3]
+    assert (placed - turned[:, :2]).mean(axis=0) == pytest.approx(0, abs=0.01)
+    fine = EstimatorOptions(str(tmp_path / "fine.yaml"), models=tmp_path)
+    estimator = prepare(fine)(Geometry(truth.angles, truth.mount, truth.range_max))
+    estimator.restart(turned[0])
+    posterior = estimator.update(Observation(truth.ranges[0], truth.angles, truth.range_max, 0.0))
+    assert posterior.pose[:2] == pytest.approx(turned[0, :2], abs=0.05)

@@ -86,6 +86,12 @@ def test_reference(tmp_path):
     assert sweeps[0].reference is None
 
 
+@pytest.mark.parametrize(("upside_down", "expected"), [(False, 1e-5), (True, -1e-5)])
+def test_times_of_beams(tmp_path, upside_down, expected):
+    log, _ = read(write_bag(tmp_path, Bag(upside_down=upside_down, scan={"time_increment": 1e-5})))
+    assert log.time_increment == pytest.approx(expected)
+
+
 def test_odometry_from_tf(tmp_path):
     log, sweeps = read(write_bag(tmp_path, Bag(odom=False)))
     assert log.odometry == "tf odom -> base_link, interpolated"

@@ -91,7 +91,7 @@ def test_secure_commands(tmp_path):
     folder = str(tmp_path / "keys")
     made = run.invoke(app, ["secure", "init", folder, "--robots", "one,two", "--days", "90"])
     assert made.exit_code == 0, made.output
-    assert "12 members" in made.output
+    assert "14 members" in made.output
     added = run.invoke(app, ["secure", "add", folder, "observer", "guest", "--days", "10"])
     assert added.exit_code == 0, added.output
     shown = run.invoke(app, ["secure", "show", folder])

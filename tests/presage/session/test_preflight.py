@@ -9,8 +9,8 @@ from common.geometry.world import load_world, save_world
 from presage.session.preflight import plan_session
 
 
-def plan(world="", drive="", simulator=(), estimator=(), *, config=None, simulated=True):
-    return plan_session(config, world, drive, simulator, estimator, simulated=simulated)
+def plan(world="", drive="", simulator=(), estimator=(), *, config=None, mapping=False):
+    return plan_session(config, world, drive, simulator, estimator, mapping=mapping)
 
 
 def test_arguments_of_services(tmp_path, monkeypatch):
@@ -64,3 +64,6 @@ def test_a_world_without_a_model(tmp_path):
     with pytest.raises(UserError, match=r"presage train --world .*mine\.yaml .*--model exact"):
         plan(str(path))
     plan(str(path), estimator=["--model", "exact"])
+    planned = plan(str(path), mapping=True)
+    assert "--preset=manual" in planned.controller
+    assert "--hide-world" in planned.simulator

@@ -9,8 +9,9 @@ from random import Random
 import numpy as np
 import pytest
 
-from common.messages.definitions import Goal, Plan, Pose, Twist
-from common.messages.topics import BELIEF, CMD_VEL, GOAL, ODOM, PLAN, PREDICTION, PREFERENCE, SCAN, STATUS, TRUTH
+from common.geometry.occupancy_grid import OccupancyGrid
+from common.messages.definitions import Goal, Map, Plan, Pose, Twist
+from common.messages.topics import BELIEF, CMD_VEL, GOAL, MAP, ODOM, PLAN, PREDICTION, PREFERENCE, SCAN, STATUS, TRUTH
 from services.viewer.state.frames import encode
 from services.viewer.state.history import ChartSample, History
 from services.viewer.state.replay_moments import QUIET_TIME_S
@@ -27,6 +28,17 @@ def feed(view, stamp, now=None, *leave_out, **how):
     now = stamp if now is None else now
     sent = [view.add(t, m, now, round(now * 1e9)) for t, m in at(stamp, **how).items() if t not in leave_out]
     return [read_frame(frame) for frame in sent if frame is not None]
+
+
+def test_no_truth_beside_a_growing_map():
+    view, grid = RobotView("robot"), OccupancyGrid.of(np.zeros((2, 3), np.uint8), 0.5, (1.0, 2.0, 0.0))
+    feed(view, 1.0)
+    view.add(MAP, Map(stamp_ns=10**9, grid=grid, poses=np.zeros((1, 3)), closures=[[0.0, 1.0], [2.0, 3.0]]), 1.0)
+    (frame,) = feed(view, 1.0 + PERIOD)
+    assert frame.header["truth"] is frame.header["error"] is None
+    shown = json.loads(view.map)
+    assert shown["closures"] == [[[0.0, 1.0], [2.0, 3.0]]]
+    assert shown["world"]["grid"]["cells"] == grid.cells
 
 
 def test_frames():
@@ -50,6 +62,7 @@ def test_frames():
     assert header["odom"]["x"] == 3.0
     assert header["status"] == {
         "state": "navigating", "reason": "", "distance": 8.0, "goal": {"x": 9.0, "y": 2.0, "yaw": 0.0},
+        "energy": None,
     }  # fmt: skip
     assert header["cmd"] == {"vx": 0.3, "vy": 0.4, "wz": 0.0}
     assert header["error"] == pytest.approx(0.5)

@@ -54,7 +54,6 @@ class Calibration:
         """Parameters of the estimator, with shares of explained beams relative to the usual one in this place."""
         default = Settings()
         return Settings(
-            conclusive_share=0.93 * self.usual,
             matching_share=0.77 * self.usual,
             drop=max(default.drop, self.usual - self.unusual),
             inflation=self.inflation,

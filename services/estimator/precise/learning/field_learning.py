@@ -13,9 +13,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from scipy import ndimage
 
 from common.geometry.se2 import Array, compose, wrap
+from common.robot.stray_beams import has_neighbours
 from services.estimator.precise.field import CLASSES, SEEN_CELL_M, DistanceField, Floats, Seen
 from services.estimator.precise.global_seeds import SEED_SPACING_M, thin_places
 from services.estimator.precise.learning.beam_cells import mark_seen_cells
@@ -25,13 +27,13 @@ from services.estimator.precise.learning.surfaces import (
     PASSED_DEPTH_M,
     Beams,
     field_of_surfaces,
-    has_neighbours,
 )
 from services.estimator.shared.generative_models import CORNER_ANGLE_RAD
 
 CARVED_DISTANCE_CELLS = 0.5  # minimum of phi at a node through which beams pass
 EM_STEPS = 15
 OUTLIER_SHARE, OUTLIER_RANGE_M = 0.1, 25.0  # weight and width of the uniform part of the density
+BEAMS_AT_ONCE = 2_000_000  # in a sweep, which limits memory
 MAX_ERROR_M = 0.1  # a larger error means that the beam ended at another surface
 MIN_FACING = 0.15  # minimum of |n . u| of a beam that shapes the field
 PRIOR_COUNT, PRIOR_SCALE_M = 20, 0.05  # pseudo-count of each class, and its error, for classes that are seldom seen
@@ -63,7 +65,7 @@ def learn_field(
         report("prediction errors", sweep / recipe.sweeps)
         sample = rng.integers(0, len(beams.ranges), min(recipe.beams_per_sweep, len(beams.ranges)))
         rate = 1 / (1 + sweep / 2)  # decreases, so that the noise averages out in the last sweeps
-        phi = _descend(DistanceField(phi, field.origin, field.resolution), beams.part(sample), rate)
+        phi = _descend(DistanceField(phi, field.origin, field.resolution), beams, sample, rate)
     return DistanceField(phi, field.origin, field.resolution)
 
 
@@ -112,49 +114,42 @@ def measure_ripple(field: DistanceField, lasers: Array, angles: Array, apart: in
     return float(np.sqrt(np.mean(((left + right)[flat] / 2) ** 2) / 1.5)) if flat.any() else 0.0
 
 
-def _descend(field: DistanceField, beams: Beams, rate: float) -> Floats:
-    """One sweep of prediction.
+def _descend(field: DistanceField, beams: Beams, sample: npt.NDArray[np.intp], rate: float) -> Floats:
+    """One sweep of prediction over a sample of the beams.
 
     Since dr = dphi / |n . u|, an error e = o - r requires dphi = e |n . u| where the beam ends, with weight 1 / |n .
-    u|².
+    u|². Surfaces that most beams passed through are removed: planes extended past an edge, things that moved away.
     """
+    ended, passed, up, norm = np.zeros((4, field.phi.size))
+    for begin in range(0, len(sample), BEAMS_AT_ONCE):
+        part = beams.part(sample[begin : begin + BEAMS_AT_ONCE])
+        _add_errors(field, part, ended, passed, up, norm)
+    absent = (passed >= MIN_POINTS_PER_CELL) & (ended < MIN_PRESENT_SHARE * (ended + passed))
+    phi = np.where(absent, np.maximum(field.phi.ravel(), CARVED_DISTANCE_CELLS * field.resolution), field.phi.ravel())
+    step = np.divide(up, norm + 1.0, out=np.zeros_like(up))
+    return np.asarray(phi.astype(np.float32) + rate * step, np.float32).reshape(field.phi.shape)
+
+
+def _add_errors(field: DistanceField, beams: Beams, ended: Array, passed: Array, up: Array, norm: Array) -> None:
+    """Adds to each node (ny * nx,) the beams that ended and passed there, their weighted errors and their weights."""
     traced = field.trace(np.column_stack([beams.starts, beams.directions]), np.zeros(1))
     ranges, facing = traced.ranges[:, 0], traced.facing[:, 0]
     error = beams.ranges - ranges
     good = np.isfinite(ranges) & (np.abs(error) < MAX_ERROR_M) & (facing > MIN_FACING)
-    field = _carve(field, beams, ranges, good, np.where(np.isfinite(ranges), error, 0.0) * facing)
+    behind = np.where(np.isfinite(ranges), error, 0.0) * facing  # m, perpendicular to the surface
+    ny, nx = field.phi.shape
+    for counts, which in ((ended, good), (passed, np.isfinite(ranges) & (behind > PASSED_DEPTH_M))):
+        where = (beams.starts[which] + ranges[which, None] * beams.unit()[which] - field.origin) / field.resolution
+        node = np.clip(np.round(where).astype(int), 0, [nx - 1, ny - 1])
+        np.add(counts, np.bincount(node[:, 1] * nx + node[:, 0], minlength=ny * nx), out=counts)
     facing = facing[good]
     where = (beams.starts[good] + ranges[good, None] * beams.unit()[good] - field.origin) / field.resolution
-    node = np.minimum(np.maximum(where.astype(int), 0), np.array(field.phi.shape)[::-1] - 2)
+    node = np.minimum(np.maximum(where.astype(int), 0), [nx - 2, ny - 2])
     u, v = (where - node).T
-    ny, nx = field.phi.shape
-    up, norm = np.zeros(ny * nx), np.zeros(ny * nx)
     for di, dj, w in ((0, 0, (1 - u) * (1 - v)), (0, 1, u * (1 - v)), (1, 0, (1 - u) * v), (1, 1, u * v)):
         index = (node[:, 1] + di) * nx + node[:, 0] + dj
         up += np.bincount(index, w * error[good] / facing, ny * nx)
         norm += np.bincount(index, w / facing**2, ny * nx)
-    step = np.divide(up, norm + 1.0, out=np.zeros_like(up))
-    return np.asarray(field.phi + rate * step.reshape(ny, nx), np.float32)
-
-
-def _carve(field: DistanceField, beams: Beams, ranges: Array, hit: np.ndarray, behind: Array) -> DistanceField:
-    """Removes surfaces that most beams passed through: planes extended past an edge, things that moved away.
-
-    ``hit`` (R,) is a mask of the beams that ended at the surface. ``behind`` (R,) m is how far behind the surface,
-    perpendicular to it, a beam ended.
-    """
-    through = np.isfinite(ranges) & (behind > PASSED_DEPTH_M)
-    counts = []
-    for which in (hit, through):
-        where = (beams.starts[which] + ranges[which, None] * beams.unit()[which] - field.origin) / field.resolution
-        node = np.clip(np.round(where).astype(int), 0, np.array(field.phi.shape)[::-1] - 1)
-        counts.append(np.bincount(node[:, 1] * field.phi.shape[1] + node[:, 0], minlength=field.phi.size))
-    ended, passed = (count.reshape(field.phi.shape) for count in counts)
-    absent = (passed >= MIN_POINTS_PER_CELL) & (ended < MIN_PRESENT_SHARE * (ended + passed))
-    phi = np.where(absent, np.maximum(field.phi, CARVED_DISTANCE_CELLS * field.resolution), field.phi).astype(
-        np.float32
-    )
-    return DistanceField(phi, field.origin, field.resolution)
 
 
 def learn_scales(field: DistanceField, poses: Array, mount: Array, angles: Array, ranges: Array, sigma: float) -> Array:

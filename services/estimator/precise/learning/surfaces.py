@@ -17,7 +17,6 @@ ELEMENT_RADIUS_CELLS = 2.0  # around a surface element, within which it shapes t
 MIN_POINTS_PER_CELL = 3  # cells with fewer points are no surface
 PASSED_DEPTH_M = 0.06  # a beam that ends farther behind a surface has passed through it
 MIN_PRESENT_SHARE = 0.3  # a surface is removed if a smaller share of the beams that meet it end there
-STRAY_CELL_M = 1.0
 
 
 @dataclass(frozen=True)
@@ -52,17 +51,6 @@ class Beams:
         """Returns these beams and those of ``other``."""
         mine, theirs = (vars(each).values() for each in (self, other))
         return Beams(*(np.concatenate(pair) for pair in zip(mine, theirs, strict=True)))
-
-
-def has_neighbours(ends: Array) -> np.ndarray:
-    """Mask (R,) of the end points (R, 2) that have others near them.
-
-    Without this filter a few stray beams would make the grid as large as the scanner's range.
-    """
-    cell = np.floor(ends / STRAY_CELL_M).astype(np.int64)
-    cell -= cell.min(axis=0)
-    index = cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1]
-    return np.asarray(np.bincount(index)[index] >= MIN_POINTS_PER_CELL)
 
 
 def field_of_surfaces(beams: Beams, h: float) -> DistanceField:

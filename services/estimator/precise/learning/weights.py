@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ from common.errors import UserError, first_fault
 from common.geometry.world import World
 from common.robot.scanner import Scanner
 from services.estimator.precise.field import CLASSES, DistanceField, FieldModel, Seen
+from services.estimator.precise.global_seeds import PANORAMA_PHASES, RANKED_HEADINGS, Seeds
 from services.estimator.precise.learning.calibration import Calibration
 from services.estimator.shared.digest import check_digest, sha256
 from services.estimator.shared.model_folder import SHIPPED, training_folder
@@ -58,15 +60,20 @@ def path_of(folder: Path, world: str) -> Path:
 
 
 def save(path: Path, model: FieldModel, places: Array, card: FieldCard) -> None:
-    """Writes the field and its card atomically.
+    """Writes the field, the seeds of a search at ``places`` (S, 2) m, and the card, atomically.
 
     The field is stored in half precision, whose resolution is finest near zero, at surfaces.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
+    # Rounded as they will be stored and read.
+    phi, places = model.field.phi.astype(np.float16), np.asarray(places, np.float32).astype(np.float64)
+    field = replace(model.field, phi=phi.astype(np.float32)).with_solids(places)
+    seeds = Seeds.at(replace(model, field=field), places)
     tensors: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.generic]]] = {
-        "phi": model.field.phi.astype(np.float16),
+        "phi": field.phi.astype(np.float16),
         "scales": model.scales.astype(np.float32),
-        "places": np.asarray(places, np.float32),
+        "places": places.astype(np.float32),
+        "panoramas": seeds.panoramas,
     }
     if model.seen is not None:
         tensors |= {"seen": model.seen.cells.astype(np.uint8), "seen_origin": np.array(model.seen.origin)}
@@ -80,32 +87,48 @@ def save(path: Path, model: FieldModel, places: Array, card: FieldCard) -> None:
     partial.replace(path.with_suffix(".json"))
 
 
-def load(path: Path) -> tuple[FieldModel, Array, FieldCard]:
-    """Returns the model, positions (S, 2) m in free space where the laser can be, and the card.
+def load(path: Path) -> tuple[FieldModel, Seeds, FieldCard]:
+    """Returns the model, the seeds of a search, and the card.
 
     Raises UserError if a file is missing, damaged or inconsistent.
     """
+    card = _load_card(path)
     try:
-        card = FieldCard.model_validate_json(path.with_suffix(".json").read_text(encoding="utf-8"))
         data = path.read_bytes()
         check_digest(path, data, card.weights_sha256, card.command)
         tensors = safetensors.numpy.load(data)
         phi, scales, places = tensors["phi"], tensors["scales"], tensors["places"]
     except OSError as error:
         raise UserError(f"weights {path}: cannot be read ({error})") from None
-    except ValidationError as error:
-        raise UserError(f"model card {path.with_suffix('.json')}: {first_fault(error)}") from None
     except (safetensors.SafetensorError, KeyError, ValueError) as error:
         raise UserError(
             f"weights {path}: this is not a file of field weights ({' '.join(str(error).split())[:200]})"
         ) from None
-    if phi.ndim != 2 or min(phi.shape) < 2 or scales.shape != (int(np.prod(CLASSES)),) or places.shape[1:] != (2,):
+    panoramas = tensors.get("panoramas")  # files written by older versions have none
+    if (
+        phi.ndim != 2
+        or min(phi.shape) < 2
+        or scales.shape != (int(np.prod(CLASSES)),)
+        or places.shape[1:] != (2,)
+        or (panoramas is not None and panoramas.shape != (len(places), PANORAMA_PHASES, RANKED_HEADINGS))
+    ):
         raise UserError(f"weights {path}: an array does not have the shape that a field needs")
     if not all(np.isfinite(a).all() for a in (phi, scales, places)):
         raise UserError(f"weights {path}: the file contains numbers that are not finite")
-    field = DistanceField(phi.astype(np.float32), card.origin, card.resolution).with_solids(places)
+    field, places = DistanceField(phi.astype(np.float32), card.origin, card.resolution), places.astype(np.float64)
+    if panoramas is None:
+        field = field.with_solids(places)
     model = FieldModel(field, scales.astype(np.float64), card.ripple, _seen(tensors, path))
-    return model, places.astype(np.float64), card
+    return model, Seeds.at(model, places) if panoramas is None else Seeds(places, panoramas), card
+
+
+def _load_card(path: Path) -> FieldCard:
+    try:
+        return FieldCard.model_validate_json(path.with_suffix(".json").read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UserError(f"weights {path}: cannot be read ({error})") from None
+    except ValidationError as error:
+        raise UserError(f"model card {path.with_suffix('.json')}: {first_fault(error)}") from None
 
 
 def _seen(tensors: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.generic]]], path: Path) -> Seen | None:
@@ -135,8 +158,7 @@ def find(folder: Path, world: World, world_argument: str) -> Path:
             f"no field of world {world.name!r} in {folder}; train it with: {train_command(world_argument, folder)}; "
             "or use --model exact, which casts rays in the world itself and needs no training"
         )
-    _, _, card = load(path)
-    if not same_walls(card.world, world):
+    if not same_walls(_load_card(path).world, world):
         raise UserError(
             f"{path} was trained in another world of the same name {world.name!r}: its walls differ. Rename your "
             f"world, or train it again with: {train_command(world_argument, folder)}"
@@ -147,7 +169,7 @@ def find(folder: Path, world: World, world_argument: str) -> Path:
 def refuse_to_overwrite(path: Path, world: World) -> None:
     """Raises UserError if ``path`` holds the field of another world with the same name."""
     try:
-        _, _, card = load(path)
+        card = _load_card(path)
     except UserError:
         return
     if not same_walls(card.world, world):

@@ -92,6 +92,10 @@ export class Actions {
     this.changed();
   }
 
+  saveMap(name) {
+    return this.ask("save_map", { name }, "Map saved");
+  }
+
   drive(twist) {
     return this.connection.ask("drive", twist);
   }

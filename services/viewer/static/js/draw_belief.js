@@ -144,7 +144,7 @@ export function drawGoal(ctx, camera, goal, from, colours, { planned = false } =
     ctx.setLineDash([]);
   }
   ctx.beginPath();
-  ctx.arc(px, py, Math.max((goal.tolerance ?? 0.2) * camera.scale, 8), 0, 2 * Math.PI);
+  ctx.arc(px, py, Math.max((goal.tolerance ?? 0) * camera.scale, 8), 0, 2 * Math.PI);
   ctx.globalAlpha = 0.14;
   ctx.fill();
   ctx.globalAlpha = 1;

@@ -65,7 +65,7 @@ setInterval(() => {
 function take(message) {
   const known = {
     hello: takeHello, world: takeWorld, services: takeServices, history: takeHistory, player: takePlayer, closed: takeClosed,
-    journal: takeJournal, field: takeField,
+    journal: takeJournal, field: takeField, map: takeMap,
   }[message.type];
   known?.(message);
 }
@@ -90,8 +90,8 @@ function takeHello(hello) {
   redraw();
 }
 
-function takeWorld({ world, scanner, robot }) {
-  const before = store.world;
+function takeWorld({ world: told, scanner, robot }) {
+  const before = store.world, world = store.map?.world ?? told; // the map has another frame than the simulator's world
   Object.assign(store, { world, scanner, robot });
   if (view.gesture.selected && !modes.selected) modes.select("");
   redraw(); // first, for the view is fitted clear of the tools
@@ -99,6 +99,17 @@ function takeWorld({ world, scanner, robot }) {
     arrange();
     view.fit();
   }
+}
+
+function takeMap(map) {
+  const first = !store.map;
+  Object.assign(store, { map, world: map.world });
+  if (first || view.camera.fitted) view.fit();
+  if (first) {
+    modes.set("look"); // no goal can be set before there is a map
+    redraw();
+  }
+  view.invalidate();
 }
 
 function takeServices({ services: rows, missing }) {

@@ -4,6 +4,7 @@ import { Camera } from "./camera.js";
 import { eachPicture, sharp } from "./canvas.js";
 import { $, h, remembered, stillness } from "./dom.js";
 import * as robot from "./draw_belief.js";
+import { drawMapping } from "./draw_mapping.js";
 import * as scan from "./draw_scan.js";
 import * as way from "./draw_way.js";
 import * as ground from "./draw_world.js";
@@ -22,6 +23,7 @@ const LAYERS = [
   { key: "goal", label: "goal", tone: "goal", mark: "disc" },
   { key: "plan", label: "planned path", tone: "goal", mark: "plain" },
   { key: "field", label: "distance to the goal", tone: "goal", mark: "rings" },
+  { key: "mapping", label: "key scans, loop closures", tone: "hypothesis", mark: "line" },
   { key: "unmapped", label: "obstacles not in the map", tone: "unmapped", mark: "diamond" },
 ];
 
@@ -130,6 +132,8 @@ export class MapView {
     const pose = frame ? scan.scannerPose(frame) : null;
     if (pose && shown.measured) scan.drawFan(ctx, camera, frame, pose, colours);
     if (world) ground.drawWalls(ctx, camera, world, colours, gesture, () => this.invalidate());
+    $("legend").querySelector("[data-layer=mapping]").hidden = !store.map;
+    if (store.map && shown.mapping) drawMapping(ctx, camera, store.map, colours);
     if (frame) this.drawRobot(ctx, frame, pose, colours);
     this.drawGesture(ctx, colours);
     ctx.globalAlpha = 1;

@@ -15,7 +15,7 @@ export class Panels {
     this.store = store;
     const chart = (id, series, options) => new Chart($(id), store, series, options);
     this.charts = [
-      chart("c-energy", [{ key: "accuracy", tone: "measured", width: 1 }, { key: "free_energy", tone: "predicted" }], { axis: false, nothing: "no belief yet" }),
+      chart("c-energy", [{ key: "accuracy", tone: "measured", width: 1 }, { key: "free_energy", tone: "predicted" }], { axis: false, nothing: "no free energy yet" }),
       chart("c-complexity", [{ key: "complexity", tone: "goal", fill: true }], { low: 0, high: 1 }),
       chart("c-error", [{ key: "error", tone: "predicted", fill: true }], { log: true, low: 0.0001, high: 0.01, nothing: "no true pose: only a simulator knows it" }),
       chart("c-speed", [{ key: "speed", tone: "measured", fill: true }], { low: 0, high: 0.5 }),
@@ -25,6 +25,8 @@ export class Panels {
       free_energy: key("k-energy", "predicted", "F"), accuracy: key("k-energy", "measured", "accuracy"),
       complexity: key("k-energy", "goal", "complexity"), error: key("k-error", "predicted", ""), speed: key("k-speed", "measured", ""),
     };
+    this.policy = Object.fromEntries(["risk", "ambiguity", "pose_information", "place_information"]
+      .map((term) => [term, key("k-policy", "predicted", term.replace("_information", ""))]));
     this.badges = { estimator: badge("estimator-badge", "estimator"), controller: badge("controller-badge", "controller") };
     this.wordsAt = -Infinity;
     cursor.changed = () => {
@@ -65,6 +67,10 @@ export class Panels {
     setText($("v-rate"), rate ? `${rate.toFixed(1)} Hz` : this.store.paused && frame ? "paused" : "–");
     setText($("v-latency"), frame?.latency_ms != null ? `${number(frame.latency_ms, frame.latency_ms < 10 ? 1 : 0)} ms` : "–");
     setText($("v-error"), metres(frame?.error));
+    for (const [term, show] of Object.entries(this.policy)) {
+      const energy = frame?.status?.energy;
+      show(energy ? number(energy[term], 4) : "–");
+    }
   }
 
   /** The values now, or under the pointer. */

@@ -23,6 +23,10 @@ export class Toolbar {
       event.preventDefault();
       this.submit();
     });
+    $("save-map").addEventListener("submit", (event) => {
+      event.preventDefault();
+      actions.saveMap(new FormData($("save-map")).get("name"));
+    });
     modes.changed = () => this.draw();
     actions.changed = () => this.draw();
     this.draw();
@@ -46,6 +50,8 @@ export class Toolbar {
     for (const id of ["pause", "step", "reset", "speed", "localise", "record"]) $(id).disabled = !can;
     for (const button of document.querySelectorAll("[data-mode]")) button.disabled = !can && button.dataset.mode !== "look";
     $("open").disabled = !store.connected || !store.control;
+    $("save-map").hidden = !store.map;
+    $("save-button").disabled = !can;
     $("step").disabled = !can || !this.standing;
     setIcon($("pause"), this.standing ? "i-play" : "i-pause");
     setText($("pause-label"), this.standing ? "Resume" : "Pause");

@@ -8,7 +8,8 @@ import pytest
 from common.errors import UserError
 from common.geometry.world import World
 from services.estimator.precise.field import FieldModel
-from services.estimator.precise.learning import weights
+from services.estimator.precise.global_seeds import Seeds
+from services.estimator.precise.learning import field_learning, weights
 from services.estimator.precise.learning.evaluation import evaluate
 from services.estimator.precise.learning.field_learning import Recipe, learn_field, learn_scales
 from services.estimator.precise.learning.surfaces import Beams
@@ -58,6 +59,11 @@ def test_stated_precision(model):
 
 def test_seed():
     assert np.array_equal(learned().phi, learned().phi)
+
+
+def test_beams_in_parts(model, monkeypatch):
+    monkeypatch.setattr(field_learning, "BEAMS_AT_ONCE", 7000)
+    assert np.allclose(learned().phi, model.field.phi, atol=1e-6)
     assert not np.array_equal(learned().phi, learned(seed=5).phi)
 
 
@@ -98,9 +104,10 @@ def saved(model, folder):
 
 def test_saved_and_loaded(model, tmp_path):
     path = saved(model, tmp_path)
-    back, places, read = weights.load(path)
+    back, seeds, read = weights.load(path)
     assert read == card(model).model_copy(update={"weights_sha256": sha256(path.read_bytes())})
-    assert np.array_equal(places, PLACES)
+    assert np.array_equal(seeds.places, PLACES)
+    assert np.array_equal(seeds.panoramas, Seeds.at(back, PLACES).panoramas)
     assert np.array_equal(np.abs(back.field.phi), np.abs(model.field.phi).astype(np.float16).astype(np.float32))
     poses, _ = scans(20, 6, 0.0)
     off = np.abs(back.expect(poses, ANGLES).ranges - model.expect(poses, ANGLES).ranges)

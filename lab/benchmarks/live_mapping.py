@@ -1,0 +1,110 @@
+"""Drives the simulated robot of a session that maps, and measures the errors: `python -m lab.benchmarks.live_mapping`.
+
+The driver knows the world and the true pose, and drives by hand as the page does: it publishes `drive` messages.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from itertools import pairwise
+
+import numpy as np
+
+from common.bus.bus import Bus, open_bus
+from common.errors import UserError
+from common.geometry import se2
+from common.geometry.se2 import Array
+from common.geometry.world import load_world
+from common.messages.definitions import Belief, Drive, Health, Map, Truth, Twist
+from common.messages.topics import BELIEF, DRIVE, HEALTH, MAP, TRUTH
+from lab.accuracy.scenes import Scene
+from lab.benchmarks.mapping import trajectory_errors
+from presage.live.bus_watch import Watch
+from presage.session.running import link_of
+
+GAIN, REACH_M = 3.0, 0.25  # 1/s, of the distance from a point of the path; where the next one is due
+MAX_SPEED, MAX_TURN = 0.7, 1.0  # m/s, rad/s
+STEP_M = 0.05  # between the points of a route
+TIMEOUT_S = 5.0
+STUCK_NS = 60_000_000_000
+
+
+def random_path(world: str, seconds: float, seed: int, start: Array) -> Array:
+    """Poses (N, 3) of a drive between random places of a world, from ``start`` (3,)."""
+    return Scene.of(load_world(world), 2, seed).path(seconds, MAX_SPEED, start)
+
+
+def path_of_route(route: str, start: Array) -> Array:
+    """Poses (N, 3) along lines between places ``x,y x,y ...`` in m from ``start`` (3,), with its heading."""
+    places = np.array([[0.0, 0.0], *(np.array(place.split(","), float) for place in route.split())])
+    legs = [np.linspace(a, b, 2 + int(np.hypot(*(b - a)) / STEP_M)) for a, b in pairwise(places)]
+    return np.array([[*(start[:2] + place), start[2]] for place in np.concatenate(legs)])
+
+
+def drive_path(bus: Bus, path: Array) -> tuple[Array, Array]:
+    """Drives along poses (N, 3); waits at each until the robot is near.
+
+    Returns beliefs and true poses (M, 3) of the same scans, each in its own frame. Raises UserError if no truth comes.
+    """
+    watch, truths, pairs, k = Watch(bus, TRUTH, BELIEF), dict[int, Array](), [], 0
+    progress_ns = 0  # stamp at which the robot was last near a new point of the path
+    while k + 1 < len(path):
+        message = watch.next(TIMEOUT_S)
+        if message is None:
+            raise UserError(f"no message came for {TIMEOUT_S:g} s: is a simulator running?")
+        if isinstance(message, Belief) and message.stamp_ns in truths:
+            pairs.append((message.pose.array(), truths[message.stamp_ns]))
+        if not isinstance(message, Truth):
+            continue
+        truths[message.stamp_ns] = pose = message.pose.array()
+        progress_ns = progress_ns or message.stamp_ns
+        while k + 1 < len(path) and np.hypot(*(path[k] - pose)[:2]) < REACH_M:
+            k, progress_ns = k + 1, message.stamp_ns
+        if message.stamp_ns - progress_ns > STUCK_NS:
+            raise UserError(f"the robot is stuck at ({pose[0]:.2f}, {pose[1]:.2f})")
+        vx, vy, wz = GAIN * se2.between(pose, path[k])
+        slower = min(1.0, MAX_SPEED / max(float(np.hypot(vx, vy)), 1e-9))
+        twist = Twist(vx=slower * vx, vy=slower * vy, wz=float(np.clip(wz, -MAX_TURN, MAX_TURN)))
+        bus.put(DRIVE, Drive(stamp_ns=message.stamp_ns, seq=k, twist=twist).encode())
+    beliefs, true = (np.array(each) for each in zip(*pairs, strict=True))
+    return beliefs, true
+
+
+def main() -> None:
+    """Drives, and prints errors and dropped scans."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--world", default="office", help="the world of the simulator, for random places")
+    parser.add_argument("--seconds", type=float, default=600.0)
+    parser.add_argument("--route", default="", help="places x,y x,y ... in m from the start; defaults to random ones")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--connect", default="")
+    args = parser.parse_args()
+    with open_bus(link_of(args.connect, "")) as bus:
+        began = time.monotonic()
+        first = Watch(bus, TRUTH).until(Truth, lambda _: True, TIMEOUT_S)
+        if first is None:
+            raise UserError("no truth comes: is a simulator running?")
+        start = first.pose.array()
+        if args.route:
+            path = path_of_route(args.route, start)
+        else:
+            path = random_path(args.world, args.seconds, args.seed, start)
+        position, heading = trajectory_errors(*drive_path(bus, path))
+        print(
+            f"{len(position)} beliefs in {time.monotonic() - began:.0f} s: "
+            f"{np.sqrt((position**2).mean()) * 1e3:.1f} mm RMS, at most {position.max() * 1e3:.0f} mm; "
+            f"{np.rad2deg(heading).mean():.3f} degrees in the mean"
+        )
+        watch = Watch(bus, MAP, HEALTH)
+        health = watch.until(Health, lambda message: message.service == "mapper", TIMEOUT_S)
+        if health is not None:
+            dropped = {row.key.rpartition("/")[2]: row.dropped for row in health.topics if row.dropped}
+            print(f"mapper: dropped {dropped or 'nothing'}, counters {health.counters}")
+        grown = watch.until(Map, lambda _: True, 2 * TIMEOUT_S)
+        if grown is not None:
+            print(f"{len(grown.poses)} key scans, {len(grown.closures) // 2} loop closures")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,59 @@
+"""The tables of README.md: selected rows of the experiments' JSON."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from lab.accuracy.report import cell
+from lab.experiments.results import markdown, number, read
+
+PRESETS = {"precise": "presage", "particle-filter": "particle filter, tuned", "amcl-defaults": "AMCL-like defaults"}
+# Labels in README, and the tasks of `presage bench accuracy`
+TASKS = {
+    "unknown start, 1 scan": "from nothing, 1 scan",
+    "30 % blocked, 20 scans": "30 % blocked, 20 scans",
+    "kidnapped, 20 scans": "kidnapped, 20 scans",
+    "tracking, no odometry": "tracking, no odometry",
+}
+MOVED = "half of the furniture moved"
+
+
+def real_logs(folder: Path) -> str:
+    """A real log, for each estimator."""
+    summary = read(folder / "real-fr079_exchanged.json")["summary"]
+    odometry, laser, unknown = (
+        [summary[f"{task}, {name}"] for name in PRESETS]
+        for task in ("a: tracking with odometry", "b: tracking without", "c: from nothing")
+    )
+    wrong = [f"{100 * row['wrong_claims_share']:.1f} %; {row['wrong_claim_longest_s']:.1f} s" for row in odometry]
+    return markdown(
+        ["", *PRESETS.values()],
+        [
+            ["tracked, with odometry", *(f"{100 * row['tracked_share']:.1f} %" for row in odometry)],
+            ["tracked, laser alone", *(f"{100 * row['tracked_share']:.1f} %" for row in laser)],
+            ["wrong poses reported as `tracking`; longest (odometry)", *wrong],
+            ["unknown start found within 40 scans", *(f"{row['found']} of {row['trials']}" for row in unknown)],
+        ],
+    )
+
+
+def simulation(folder: Path) -> str:
+    """Some tasks of the accuracy benchmark, and moved furniture, for presage and the particle filter."""
+    rows = {(row["task"], row["estimator"]): row for row in read(folder / "accuracy.json")["rows"]}
+    lines = []
+    for label, task in TASKS.items():
+        both = [rows[task, name] for name in ("precise", "particle-filter")]
+        bound = both[0]["bound_rms_m"]
+        lines.append([label, *(cell(row, nees=False) for row in both), f"{number(1e3 * bound, 2)} mm" if bound else ""])
+    moved = read(folder / "integrity-moved-50.json")["summary"]
+    lines.append([MOVED, *(_integrity(moved[name]["moved-50"]) for name in ("precise", "particle-filter")), ""])
+    return markdown(["", "presage", "particle filter", "bound (RMS)"], lines)
+
+
+def _integrity(row: dict[str, Any]) -> str:
+    tracking, wrong = (100 * row[name]["count"] / row[name]["of"] for name in ("tracking", "wrong"))
+    return f"{tracking:.1f} % `tracking`, of which {wrong:.1f} % wrong"
+
+
+TABLES = {"readme-real": real_logs, "readme-simulation": simulation}

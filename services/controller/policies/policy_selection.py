@@ -1,0 +1,256 @@
+"""Selects the policy of least expected free energy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from common.geometry import se2
+from common.robot.scan_geometry import ALL_ROUND, Sector
+from services.controller.policies import expected_free_energy as efe
+from services.controller.policies import motion_model as motion
+from services.controller.policies.expected_free_energy import NATS_PER_METRE, ExpectedFreeEnergy
+from services.controller.policies.geodesic_field import MAX_WALL_COST, WALL_COST_RANGE_M
+
+if TYPE_CHECKING:
+    from common.geometry.se2 import Array
+    from common.robot.base import Robot
+    from services.controller.policies.scan_information import ScanInformation
+
+HEADING_FADE_M = 0.3  # closer to the attractor, the cost of turning towards it fades out
+BLIND_SPEED = 0.25  # m/s into directions that the scanner does not see, for a base that may not turn; others turn first
+VIEW_MARGIN_RAD = np.pi / 4  # the view must extend this far beyond the direction of motion, because the body is wide
+MIN_VIEW_DIVISOR = 3  # with a narrow view, motion is still allowed in this fraction of it around its centre
+CHANGE_COST_S = 0.02  # m to go that a change of the velocity by 1 m/s must gain, so that policies do not alternate
+LINE_SAMPLES = (np.arange(6) + 0.5) / 6  # shares of the line to the attractor at which its information is looked up
+MOTION_SAMPLES = 5  # every so many steps of a motion
+HINDERED_M = 0.05  # m to go that obstacles must cost before the status says so
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """Walls and obstacles that a motion must keep away from, in the present base_link."""
+
+    wall_distance: Callable[[Array], Array]  # (..., 2) m -> (...,) m to the nearest mapped wall; inf without a map
+    points: Array  # (K, 2) m, obstacles that are not in the map
+    moving: Array  # (K,) bool, points that may approach
+    min_wall_distance: float  # m from the robot's centre
+    min_point_distance: float  # m from the robot's centre
+    walking_speed: float = 1.0  # m/s assumed for moving points
+    view: Sector = ALL_ROUND  # directions that the scanner sees
+    may_turn: bool = True  # if the base may turn, it never has to move into a direction that the scanner does not see
+
+    def sees(self, bearings: Array | float) -> npt.NDArray[np.bool_]:
+        """Whether the scanner sees all that the body can meet on the way into ``bearings`` (...,) rad; (...,) bool."""
+        if self.view.half >= np.pi:
+            return np.ones(np.shape(bearings), bool)
+        off_centre = np.abs(se2.wrap(bearings - self.view.centre))
+        max_off_centre = max(self.view.half - VIEW_MARGIN_RAD, self.view.half / MIN_VIEW_DIVISOR)
+        return np.asarray(off_centre <= max_off_centre + 1e-9)
+
+    @property
+    def forward(self) -> float:
+        """Bearing in rad to turn towards a target: 0 if the scanner sees ahead, otherwise the middle of its view."""
+        return 0.0 if bool(self.sees(0.0)) else self.view.centre
+
+    def gaps(
+        self, poses: Array, times: Array, standing_after: Array | float = np.inf, max_gap: float = np.inf
+    ) -> Array:
+        """Gap (N, T) m between footprint and nearest obstacle at poses (N, T, 3), reached at ``times`` (T,) s.
+
+        Moving obstacles are assumed to approach at walking speed, until the robot stands after ``standing_after`` (N,)
+        s: people do not walk into a standing robot (passive safety). Gaps are clipped at ``max_gap`` m, which saves
+        most of the work.
+        """
+        shape = poses.shape[:-1]
+        times = np.broadcast_to(times, shape)
+        until = np.broadcast_to(np.asarray(standing_after)[..., None], shape)
+        relevant = times <= until + motion.STEP_S  # the robot does not move after that
+        positions, times, in_motion = poses[relevant][:, :2], times[relevant], (times <= until)[relevant]
+        gap = np.minimum(self.wall_distance(positions) - self.min_wall_distance, max_gap)
+        reach = float(np.hypot(*positions.T).max(initial=0.0)) + self.min_point_distance + max_gap
+        distance = np.hypot(*self.points.T)
+        static = self.points[(distance < reach) & np.logical_not(self.moving)]
+        if len(static):
+            gap = np.minimum(gap, least_distance(positions, static) - self.min_point_distance)
+        approach = self.walking_speed * times[in_motion]
+        moving = self.points[self.moving & (distance < reach + approach.max(initial=0.0))]
+        if len(moving):
+            remaining = least_distance(positions[in_motion], moving) - self.min_point_distance - approach
+            gap[in_motion] = np.minimum(gap[in_motion], remaining)
+        gaps = np.full(shape, max_gap)
+        gaps[relevant] = gap
+        return gaps
+
+
+def least_distance(positions: Array, points: Array) -> Array:
+    """Distance (N,) m from each of ``positions`` (N, 2) to the nearest of ``points`` (K, 2), all near the origin.
+
+    Computed as one matrix product, which for a few hundred points is several times faster than a tree.
+    """
+    p = np.vstack([positions.T, np.ones(len(positions))])
+    q = np.column_stack([-2 * points, np.sum(points**2, axis=1)])
+    return np.asarray(np.sqrt(np.maximum((q @ p).min(axis=0) + np.sum(positions**2, axis=1), 0.0)))
+
+
+@dataclass(frozen=True)
+class PoseBelief:
+    """The belief about the pose, and what scans are expected to tell. By default the pose is known."""
+
+    pose: Array = field(default_factory=lambda: np.zeros(3))  # (3,) base_link in map
+    covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))  # (3, 3) in map
+    scans: ScanInformation | None = None
+
+    @property
+    def variance(self) -> float:
+        """Variance of the position, m², over both axes."""
+        return float(self.covariance[0, 0] + self.covariance[1, 1])
+
+    def outlook(self, motions: Array, attractor: Array, seconds: float) -> tuple[Array, Array]:
+        """Ambiguity and information gain (N,) nats about the pose, of motions (N, T, 3) and the line to the attractor.
+
+        The motions and the attractor (2,) m are in base_link, and take ``seconds``.
+        """
+        if self.scans is None:
+            return np.zeros(len(motions)), np.zeros(len(motions))
+        ends, length = motions[:, -1, :2], np.hypot(*np.diff(motions[..., :2], axis=1).T).sum(axis=0)
+        line = ends[:, None] + LINE_SAMPLES[:, None] * (attractor - ends)[:, None]
+        points = se2.transform(self.pose, np.concatenate([motions[:, ::MOTION_SAMPLES, :2], line], axis=1))
+        onwards = np.hypot(*(attractor - ends).T)
+        metres = np.full(points.shape[:2], 1.0)  # that each point stands for
+        metres[:, -len(LINE_SAMPLES) :] *= onwards[:, None] / len(LINE_SAMPLES)
+        metres[:, : -len(LINE_SAMPLES)] *= length[:, None] / (points.shape[1] - len(LINE_SAMPLES))
+        ambiguity = np.sum(metres * self.scans.grid.interpolate(self.scans.ambiguity, points), axis=1)
+        loss = metres * self.scans.grid.interpolate(self.scans.loss, points)
+        predicted = self.covariance + efe.MOTION_NOISE * length[:, None, None]
+        information = (
+            self.scans.matrix[self.scans.grid.cell_of(se2.transform(self.pose, ends))] * seconds / motion.STEP_S
+        )
+        before = efe.remaining_entropy(self.covariance, np.zeros((3, 3)))
+        gain = before - efe.remaining_entropy(predicted, information)
+        return ambiguity, gain - np.sum(loss[:, -len(LINE_SAMPLES) :], axis=1)
+
+
+@dataclass(frozen=True)
+class SelectedPolicy:
+    """The best policy."""
+
+    action: Array  # (3,) m/s, m/s, rad/s in base_link
+    motion: Array  # (T, 3) predicted poses in the present base_link, until standstill
+    terms: dict[str, float]  # of its expected free energy, nats, and its probability
+    hindered: bool  # an obstacle, or one that may approach, ruled out a better policy
+
+
+def select_policy(
+    current: Array, attractor: Array, surroundings: Surroundings, robot: Robot, belief: PoseBelief | None = None
+) -> SelectedPolicy:
+    """The policy of least expected free energy, the most probable one under `efe.policy_posterior`.
+
+    ``current`` (3,) is the present velocity and ``attractor`` (2,) m the target, both in base_link. Policies are
+    sampled once around the attractor, and once more around the best of them. One whose motion is not free, or may not
+    stay free until the robot stands, is excluded: its risk is infinite.
+    """
+    belief = belief or PoseBelief()
+    policies = _visible_policies(motion.candidate_policies(current, attractor, robot), surroundings)
+    sampled = _evaluate(current, policies, attractor, surroundings, robot, belief)
+    near = _visible_policies(motion.refined_policies(policies[sampled.best], robot), surroundings)
+    refined = _evaluate(current, near, attractor, surroundings, robot, belief, braking_is_free=False)
+    policies, chosen = (policies, sampled) if sampled.least <= refined.least else (near, refined)
+    hindered = sampled.least_if_free < chosen.least - HINDERED_M * NATS_PER_METRE
+    best = chosen.best
+    return SelectedPolicy(policies[best, :3], chosen.poses[best], chosen.terms, hindered=hindered)
+
+
+@dataclass(frozen=True)
+class _Evaluation:
+    poses: Array  # (N, T, 3)
+    energy: ExpectedFreeEnergy
+    free: npt.NDArray[np.bool_]  # (N,)
+
+    @property
+    def allowed(self) -> Array:
+        return np.where(self.free, self.energy.total, np.inf)
+
+    @property
+    def best(self) -> int:
+        return int(np.argmin(self.allowed))
+
+    @property
+    def least(self) -> float:
+        return float(self.allowed.min())
+
+    @property
+    def terms(self) -> dict[str, float]:
+        return self.energy.of(self.best, self.allowed)
+
+    @property
+    def least_if_free(self) -> float:
+        return float(self.energy.total.min())
+
+
+def _evaluate(
+    current: Array,
+    policies: Array,
+    attractor: Array,
+    surroundings: Surroundings,
+    robot: Robot,
+    belief: PoseBelief,
+    *,
+    braking_is_free: bool = True,
+) -> _Evaluation:
+    """Expected free energy of policies (N, 5).
+
+    The risk is the distance to go, on average on the way and at the end, where the last pose stands for all that
+    follows; the metres of the motion, more if its narrowest gap is small; and the change of velocity.
+    """
+    poses, times, standing_after = motion.rollouts(current, policies, robot)
+    deviation = np.sqrt(belief.variance / 2)
+    gaps = surroundings.gaps(poses, times, standing_after, WALL_COST_RANGE_M + 2 * deviation)
+    free = _is_free(gaps, surroundings)
+    if braking_is_free:  # policy 0, braking, is always allowed, even if an obstacle may approach meanwhile
+        free[0] = True
+    distance = efe.expected_distance(remaining_distance(poses, attractor, robot), belief.variance)
+    length = np.hypot(*np.diff(poses[..., :2], axis=1).T).sum(axis=0)
+    closeness = efe.expected_square(1 - gaps.min(axis=1) / WALL_COST_RANGE_M, deviation / WALL_COST_RANGE_M)
+    effort = CHANGE_COST_S * np.hypot(*(policies[:, :2] - current[:2]).T)
+    metres = distance.mean(axis=1) + distance[:, -1] + MAX_WALL_COST * closeness * length + effort
+    ambiguity, information = belief.outlook(poses, attractor, float(times[-1]))
+    energy = ExpectedFreeEnergy(NATS_PER_METRE * metres, ambiguity, information, np.zeros(len(policies)))
+    return _Evaluation(poses, energy, free)
+
+
+def _is_free(gaps: Array, surroundings: Surroundings) -> npt.NDArray[np.bool_]:
+    """Whether motions with these gaps (N, T) m are free, (N,) bool.
+
+    If the robot is too close to something already, every motion that leads away from it counts as free.
+    """
+    present_gap = float(surroundings.gaps(np.zeros((1, 1, 3)), np.zeros(1), max_gap=WALL_COST_RANGE_M)[0, 0])
+    return np.asarray(np.all(gaps >= min(0.0, present_gap) - 1e-3, axis=1))
+
+
+def remaining_distance(poses: Array, attractor: Array, robot: Robot) -> Array:
+    """Distance (...,) m from poses (..., 3) to the attractor.
+
+    For a differential base it includes the distance that could be driven in the time that the turn takes.
+    """
+    offset = attractor - poses[..., :2]
+    distance = np.hypot(offset[..., 0], offset[..., 1])
+    if robot.drive == "holonomic":
+        return np.asarray(distance)
+    turn = np.abs(se2.wrap(np.arctan2(offset[..., 1], offset[..., 0]) - poses[..., 2]))
+    return np.asarray(distance + turn * robot.max_speed / robot.max_turn * np.minimum(1.0, distance / HEADING_FADE_M))
+
+
+def _visible_policies(policies: Array, surroundings: Surroundings) -> Array:
+    """Removes policies (N, 5) into directions that the scanner does not see, or slows them if the base may not turn."""
+    speed = np.hypot(policies[:, 0], policies[:, 1])
+    too_fast = speed > BLIND_SPEED if not surroundings.may_turn else speed > motion.STANDING_SPEED
+    blind = ~surroundings.sees(np.arctan2(policies[:, 1], policies[:, 0])) & too_fast
+    if surroundings.may_turn:
+        return policies[~blind]
+    scale = np.where(blind, BLIND_SPEED / np.maximum(speed, 1e-9), 1.0)
+    return np.column_stack([policies[:, :2] * scale[:, None], policies[:, 2:]])

@@ -1,0 +1,1 @@
+"""Maps while driving: scans in, map and belief out."""

@@ -1,0 +1,190 @@
+"""The mapper service: scans in; the map so far and the robot's pose in it out."""
+
+from __future__ import annotations
+
+import re
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from common.errors import UserError
+from common.geometry.ros_map_writer import write_grid
+from common.geometry.tum import write_tum
+from common.geometry.world import known_worlds
+from common.messages.definitions import Belief, Hypothesis, Map, Odom, Pose, Scan, Stamped
+from common.messages.requests import Reply, Request, SaveMapReply, SaveMapRequest
+from common.messages.topics import BELIEF, MAP, ODOM, SAVE_MAP, SCAN, Query, Topic
+from common.robot.motion_distortion import evenly_spaced
+from common.robot.ranges import ranges_for_localisation
+from common.robot.scan_geometry import Sweep
+from common.runtime.service import Service
+from services.mapper.settings import MapperSettings
+from services.mapper.slam.drive import Laser
+from services.mapper.slam.elements import elements_of_scan
+from services.mapper.slam.front_end import Place
+from services.mapper.slam.mapper import GrownMap, Mapper
+from services.mapper.slam.search import search
+
+MAP_NAME = r"[A-Za-z0-9_-]{1,64}"
+UPDATE_PERIOD_NS = 1_000_000_000  # between the beginnings of two updates of the map, which leaves time for the scans
+REPEAT_PERIOD_NS = 5_000_000_000  # an unchanged map is published again after this time, for subscribers that came later
+ODOMETRY_TIMEOUT_NS = 1_000_000_000  # scans wait for their odometry unless there was none for this time
+
+
+class MapperService(Service):
+    """Publishes a belief for each scan, and the map whenever it has grown.
+
+    Loop closing and the map take seconds in a large building. They run in a thread, one update at a time; scans that
+    are dropped meanwhile are counted in the health message.
+    """
+
+    name: ClassVar[str] = "mapper"
+    single: ClassVar[bool] = True
+    inputs: ClassVar[tuple[Topic, ...]] = (SCAN, ODOM)
+    queries: ClassVar[tuple[Query, ...]] = (SAVE_MAP,)
+
+    settings: MapperSettings
+
+    def __init__(self, settings: MapperSettings) -> None:
+        super().__init__(settings)
+        self.mapper: Mapper | None = None
+        self._belief: Belief | None = None  # of the latest scan
+        self._odom: Odom | None = None
+        self._waiting_scan: Scan | None = None  # waits for the odometry of its stamp
+        self._pool = ThreadPoolExecutor(1, "update")
+        self._update: Future[GrownMap] | None = None
+        self._update_ns = self._published_ns = -UPDATE_PERIOD_NS  # stamps of the last update and of the last map
+
+    def open(self) -> None:
+        """Compiles the search now, so that no scan has to wait for it."""
+        wall = elements_of_scan(np.full(9, 2.0), np.linspace(-0.1, 0.1, 9), np.zeros(3), 10.0)
+        search(wall, wall, np.zeros(3), np.full(3, 0.1))
+
+    def close(self) -> None:
+        """Waits for the present update."""
+        self._pool.shutdown(cancel_futures=True)
+
+    def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
+        """Maps a scan together with its odometry, if there is any."""
+        if isinstance(message, Odom):
+            self._odom = message
+            if self._waiting_scan is not None and message.stamp_ns >= self._waiting_scan.stamp_ns:
+                self._add_waiting()
+        elif isinstance(message, Scan):
+            self._add_waiting()  # without its odometry, which did not come in time
+            self._waiting_scan = message
+            late = self._odom is not None and 0 < message.stamp_ns - self._odom.stamp_ns < ODOMETRY_TIMEOUT_NS
+            if not late:
+                self._add_waiting()
+
+    def _add_waiting(self) -> None:
+        scan, self._waiting_scan = self._waiting_scan, None
+        if scan is not None:
+            self._add(scan)
+
+    def _add(self, scan: Scan) -> None:
+        if self._belief is not None and self._belief.stamp_ns == scan.stamp_ns:
+            self.publish(BELIEF, self._belief)  # a repeated scan gets the same belief again
+            return
+        mapper, angles = self._mapper_for(scan), scan.angles()
+        ranges = ranges_for_localisation(scan.ranges)
+        if not np.array_equal(angles, mapper.laser.angles):  # some scanners' numbers of beams vary from turn to turn
+            ranges = evenly_spaced(ranges, angles, Sweep.of_angles(mapper.laser.angles), -np.inf)
+        odom = self._odom.pose.array() if self._odom is not None and self._odom.stamp_ns == scan.stamp_ns else None
+        place = mapper.add(scan.stamp_ns * 1e-9, ranges, odom)
+        if not place.matched:
+            self.counters["unmatched_scans"] += 1
+        self._belief = belief_message(scan, place)
+        self.publish(BELIEF, self._belief)
+        if self._update is None and mapper.outdated and scan.stamp_ns - self._update_ns >= UPDATE_PERIOD_NS:
+            self._update_ns = scan.stamp_ns
+            self._update = self._pool.submit(mapper.update, mapper.key_scans())
+            self._update.add_done_callback(lambda _: self.loop.inbox.wake())
+        if scan.stamp_ns - self._published_ns >= REPEAT_PERIOD_NS:
+            self._publish_map(mapper)
+
+    def _mapper_for(self, scan: Scan) -> Mapper:
+        """The mapper; a new one if time has gone back or the scanner was moved, as then no scan fits the map."""
+        mount = scan.mount.array()
+        restarted = self._belief is not None and scan.stamp_ns < self._belief.stamp_ns
+        if self.mapper is None or restarted or not np.allclose(mount, self.mapper.laser.mount, atol=1e-4):
+            if self.mapper is not None:
+                self.log.warning("time went back or the scanner's mount changed: mapping starts again")
+                self._finish_update()
+            self.mapper = Mapper(Laser(scan.angles(), mount, scan.range_max, scan.time_increment), self.settings.cell)
+            self._update_ns = self._published_ns = scan.stamp_ns - UPDATE_PERIOD_NS
+        return self.mapper
+
+    def due(self) -> float | None:
+        """Returns 0 if an update is done."""
+        return 0.0 if self._update is not None and self._update.done() else None
+
+    def on_timer(self) -> None:
+        """Uses and publishes the updated map."""
+        self._finish_update()
+
+    def _finish_update(self) -> None:
+        assert self.mapper is not None  # noqa: S101 - updates begin with it
+        update, self._update = self._update, None
+        if update is None:
+            return
+        try:
+            self.mapper.use(update.result())
+            self.note = ""
+        except UserError as error:
+            self.note = str(error)
+        self._publish_map(self.mapper)
+
+    def _publish_map(self, mapper: Mapper) -> None:
+        if mapper.map is not None and self._belief is not None:
+            self._published_ns = self._belief.stamp_ns
+            self.publish(MAP, map_message(self._belief.stamp_ns, mapper.map))
+
+    def on_request(self, query: Query, request: Request) -> Reply:
+        """Saves the map as it was published last."""
+        if not isinstance(request, SaveMapRequest):
+            return super().on_request(query, request)
+        if self.mapper is None:
+            raise UserError("there is no map yet: no scan has come")
+        path = save_map(self.settings.maps, request.name, self.mapper)
+        self.log.info("map saved", file=str(path))
+        return SaveMapReply(file=str(path))
+
+
+def save_map(folder: Path, name: str, mapper: Mapper) -> Path:
+    """Writes map and trajectory; returns the path of NAME.yaml. Raises UserError if that fails."""
+    if mapper.map is None:
+        raise UserError("there is no map yet: do scans arrive?")
+    if re.fullmatch(MAP_NAME, name) is None or name in known_worlds():
+        raise UserError(f"name {name!r}: give up to 64 letters, digits, - and _, and not the name of a shipped world")
+    path = folder.resolve() / f"{name}.yaml"
+    files = [path.with_suffix(suffix) for suffix in (".yaml", ".pgm", ".tum")]
+    if existing := next((file for file in files if file.exists()), None):
+        raise UserError(f"{existing} exists already: choose another name")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_tum(path.with_suffix(".tum"), *mapper.trajectory())
+        return write_grid(path.parent, name, mapper.map.grid)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written ({error.strerror}): choose another folder with --maps") from None
+
+
+def belief_message(scan: Scan, place: Place) -> Belief:
+    """The place of a scan as a message."""
+    pose, covariance = Pose.of(place.pose), place.covariance if place.matched else None
+    return Belief(
+        stamp_ns=scan.stamp_ns,
+        state="tracking" if place.matched else "lost",
+        pose=pose,
+        covariance=covariance,
+        hypotheses=[Hypothesis(pose=pose, covariance=covariance, weight=1.0)],
+        estimator="mapper",
+    )
+
+
+def map_message(stamp_ns: int, grown: GrownMap) -> Map:
+    """The map as a message."""
+    ends = grown.poses[grown.closures.ravel(), :2].astype(np.float32)
+    return Map(stamp_ns=stamp_ns, grid=grown.grid, poses=grown.poses, closures=ends)

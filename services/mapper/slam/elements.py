@@ -1,0 +1,89 @@
+"""Surface elements of a scan: short pieces of surface with a position and a normal.
+
+A piece is a line fitted to neighbouring beams, so it carries their information with less noise, and it has a front: its
+normal points to the scanner. The two sides of a thin wall therefore stay apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from common.geometry import se2
+from common.geometry.se2 import Array
+from common.robot.ranges import is_surface
+
+HALF_WIDTH_M = 0.06  # of a piece, across the beams
+SPACING_M = 0.1  # between pieces, across the beams
+MIN_GAP_M, GAP_BEAMS = 0.12, 6.0  # neighbours farther apart than both, in m and in distances between beams, are apart
+MAX_ROUGHNESS_M = 0.03  # standard deviation of the points across the piece; rougher ones are corners
+MIN_POINTS = 3
+
+
+@dataclass(frozen=True)
+class Elements:
+    """K surface elements in one frame."""
+
+    points: Array  # (K, 2) m
+    normals: Array  # (K, 2) unit vectors towards free space
+    lengths: Array  # (K,) m along the surface, up to the neighbours
+
+    def moved(self, pose: Array) -> Elements:
+        """The elements in the parent frame of the frame with ``pose`` (3,)."""
+        return Elements(se2.transform(pose, self.points), se2.rotate(float(pose[2]), self.normals), self.lengths)
+
+    def part(self, which: npt.NDArray[np.integer | np.bool_]) -> Elements:
+        """Some of the elements."""
+        return Elements(self.points[which], self.normals[which], self.lengths[which])
+
+    def divided(self) -> Elements:
+        """The same surfaces in pieces of at most `SPACING_M`; those of far ones are as long as the beams are apart."""
+        count = np.maximum(np.ceil(self.lengths / SPACING_M), 1).astype(int)
+        which = np.repeat(np.arange(len(self)), count)
+        number = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
+        along = ((number + 0.5) / count[which] - 0.5) * self.lengths[which]
+        x, y = self.normals[which].T
+        points = self.points[which] + along[:, None] * np.column_stack([-y, x])
+        return Elements(points, self.normals[which], self.lengths[which] / count[which])
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def joined(elements: list[Elements]) -> Elements:
+    """All elements of a list, in one frame."""
+    points, normals, lengths = zip(*((e.points, e.normals, e.lengths) for e in elements), strict=True)
+    return Elements(np.concatenate(points), np.concatenate(normals), np.concatenate(lengths))
+
+
+def elements_of_scan(ranges: Array, angles: Array, mount: Array, range_max: float) -> Elements:
+    """Surface elements in base_link of a scan ``ranges`` (B,) m at ``angles`` (B,) rad."""
+    hit = np.flatnonzero(is_surface(ranges) & (ranges < range_max))
+    if len(hit) < MIN_POINTS:
+        return Elements(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
+    r, angle = ranges[hit], angles[hit]
+    points = r[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    step = abs(angles[-1] - angles[0]) / (len(angles) - 1)
+    apart = np.hypot(*np.diff(points, axis=0).T) > np.maximum(MIN_GAP_M, GAP_BEAMS * np.minimum(r[1:], r[:-1]) * step)
+    surface = np.concatenate([[0], np.cumsum(apart)])
+    # Distance along the scan across the beams, with a jump from one surface to the next.
+    along = np.concatenate([[0.0], np.cumsum((r[1:] + r[:-1]) / 2 * np.diff(hit) * step + apart * 10 * HALF_WIDTH_M)])
+    middle = np.flatnonzero(np.diff(np.floor(along / SPACING_M), prepend=-1.0) > 0)
+    first = np.minimum(np.searchsorted(along, along[middle] - HALF_WIDTH_M), middle - 1)
+    last = np.maximum(np.searchsorted(along, along[middle] + HALF_WIDTH_M, side="right"), middle + 2)
+    first = np.maximum(first, np.searchsorted(surface, surface[middle]))
+    last = np.minimum(last, np.searchsorted(surface, surface[middle], side="right"))
+    x, y = points.T
+    sums = np.concatenate([np.zeros((1, 5)), np.cumsum(np.stack([x, y, x * x, x * y, y * y], axis=-1), axis=0)])
+    count = last - first
+    mx, my, xx, xy, yy = ((sums[last] - sums[first]) / np.maximum(count, 1)[:, None]).T
+    xx, xy, yy = xx - mx**2, xy - mx * my, yy - my**2
+    across = np.arctan2(2 * xy, xx - yy) / 2 + np.pi / 2
+    normals = np.column_stack([np.cos(across), np.sin(across)])
+    normals *= -np.sign(normals[:, 0] * mx + normals[:, 1] * my)[:, None]  # towards the scanner
+    smallest = (xx + yy) / 2 - np.sqrt(((xx - yy) / 2) ** 2 + xy**2)
+    flat = (count >= MIN_POINTS) & (smallest < MAX_ROUGHNESS_M**2)
+    lengths = np.hypot(*(points[last - 1] - points[first]).T) / 2
+    return Elements(np.column_stack([mx, my])[flat], normals[flat], lengths[flat]).moved(mount)

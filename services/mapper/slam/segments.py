@@ -1,0 +1,79 @@
+"""Segments: some metres of the drive as one rigid piece, with more surroundings than a single scan."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from common.geometry import se2
+from common.geometry.se2 import Array
+from common.robot.ranges import is_surface
+from common.robot.scan_geometry import Sweep
+from services.mapper.slam.elements import Elements, joined
+
+KEYS = 8  # key scans of a segment
+PASSED_M = 0.3  # behind an element, along its normal, from where a beam has passed through it
+
+
+@dataclass(frozen=True)
+class Views:
+    """What the scanner saw from several places."""
+
+    poses: Array  # (V, 3) of the laser
+    ranges: Array  # (V, B) m
+    angles: Array  # (B,) rad
+
+    def see_through(self, elements: Elements) -> npt.NDArray[np.bool_]:
+        """Mask (K,) of elements in places that some scan saw to be free."""
+        through = np.zeros(len(elements), np.bool_)
+        sweep = Sweep.of_angles(self.angles)
+        for pose, ranges in zip(self.poses, self.ranges, strict=True):
+            local = elements.moved(se2.inverse(pose))
+            x, y = local.points.T
+            beam, distance = sweep.beams_at(np.arctan2(y, x)), np.hypot(x, y)
+            inside = (beam > 0) & (beam < len(ranges) - 1)
+            around = np.where(inside, beam, 1)[:, None] + np.arange(-1, 2)
+            nearest = np.where(is_surface(ranges), ranges, 0.0)[around].min(axis=1)  # without return: no evidence
+            depth = np.abs(np.einsum("ki,ki->k", local.normals, local.points)) * (nearest / distance - 1)
+            through |= inside & (depth > PASSED_M)
+        return through
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Successive key scans, in the frame of the one in their middle, the reference."""
+
+    reference: int  # number of the key scan
+    elements: Elements
+    views: Views
+
+
+def segments_of(
+    poses: Array, elements: Sequence[Elements], ranges: Array, angles: Array, mount: Array
+) -> list[Segment]:
+    """Divides key scans at ``poses`` (N, 3), with ``ranges`` (N, B), into segments."""
+    found = []
+    for first in range(0, len(poses), KEYS):
+        keys = np.arange(first, min(first + KEYS, len(poses)))
+        reference = int(keys[len(keys) // 2])
+        local = se2.between(poses[reference], poses[keys])
+        placed = joined([elements[key].moved(pose) for key, pose in zip(keys.tolist(), local, strict=True)])
+        found.append(Segment(reference, placed, Views(se2.compose(local, mount), ranges[keys], angles)))
+    return found
+
+
+def submap(segments: Sequence[Segment], middle: int, poses: Array) -> Segment:
+    """A segment and its neighbours in time, in its frame; ``poses`` (N, 3) are of all key scans."""
+    around = segments[max(0, middle - 1) : middle + 2]
+    reference = segments[middle].reference
+    offsets = [se2.between(poses[reference], poses[each.reference]) for each in around]
+    views = Views(
+        np.concatenate([se2.compose(off, each.views.poses) for off, each in zip(offsets, around, strict=True)]),
+        np.concatenate([each.views.ranges for each in around]),
+        around[0].views.angles,
+    )
+    placed = [each.elements.moved(off) for off, each in zip(offsets, around, strict=True)]
+    return Segment(reference, joined(placed), views)

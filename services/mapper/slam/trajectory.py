@@ -1,0 +1,59 @@
+"""Builds a trajectory from a drive: front end, loop closures, joint refinement."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.geometry import se2
+from common.geometry.se2 import Array
+from services.mapper.slam.back_end import BackEnd
+from services.mapper.slam.drive import RawDrive
+from services.mapper.slam.front_end import Track, track
+from services.mapper.slam.loop_closure import Closure
+
+WINDOWS_M = (1.0, 1.0, 3.0, 3.0, 10.0, 10.0, 30.0, 30.0, 1.0, 1.0)  # of the rounds of loop closing
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses of all scans of a drive."""
+
+    poses: Array  # (N, 3) base_link in map
+    keys: list[int]  # key scans
+    closures: list[Closure]
+    lost: int  # scans that did not match the ones before
+
+
+def build_trajectory(drive: RawDrive, report: Callable[[str, float], None] = lambda _t, _d: None) -> Trajectory:
+    """The poses from which all scans of a drive agree best."""
+    tracked = track(drive, lambda done: report("tracking", done))
+    back_end = BackEnd(drive.laser)
+    back_end.extend(tracked.key_scans)
+    for number, window in enumerate(WINDOWS_M):
+
+        def report_round(done: float, before: int = number) -> None:
+            report("closing loops", (before + done) / len(WINDOWS_M))
+
+        back_end.close_loops(tracked.key_scans, window, report_round)
+    return Trajectory(spread(tracked, back_end.poses), tracked.keys, back_end.closures, tracked.lost)
+
+
+def spread(tracked: Track, poses: Array) -> Array:
+    """Poses (N, 3) of all scans, from the corrected ``poses`` (K, 3) of the key scans.
+
+    Between two key scans, the correction changes from that of the first to that of the second.
+    """
+    keys = np.array(tracked.keys)
+    number = np.arange(len(tracked.poses))
+    before = np.clip(np.searchsorted(keys, number, side="right") - 1, 0, len(keys) - 1)
+    after = np.minimum(before + 1, len(keys) - 1)
+    sides = [se2.compose(poses[k], se2.between(tracked.poses[keys[k]], tracked.poses)) for k in (before, after)]
+    share = (number - keys[before]) / np.maximum(keys[after] - keys[before], 1)
+    off = sides[1] - sides[0]
+    off[:, 2] = se2.wrap(off[:, 2])
+    result = sides[0] + share[:, None] * off
+    result[:, 2] = se2.wrap(result[:, 2])
+    return np.asarray(result)

@@ -1,0 +1,221 @@
+"""Expected free energy against brute force, finite differences, and its limit, equation 4 of the paper."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from common.geometry import se2
+from common.robot.base import Robot
+from common.robot.scanner import SCANNERS
+from services.controller.policies import expected_free_energy as efe
+from services.controller.policies.active_localisation import CandidateMotions, VisitedPlaces, drive_energy
+from services.controller.policies.expected_free_energy import entropy, place_information
+from services.controller.policies.free_space import FreeSpace
+from services.controller.policies.paper_action import ActionParameters, action_gradient
+from services.controller.policies.scan_information import DIRECTIONS, MAP_ERROR_M, ScanInformation
+from tests.controller.driving import box, room, scan, shipped
+
+R = 25.0
+
+
+def gain_of(ranges, sigma=0.02, weights=None, **trust):
+    """Gain for ranges (K, M, B)."""
+    weights = np.ones(len(ranges)) if weights is None else weights
+    return place_information(weights, ranges, np.full(ranges.shape, sigma), R, **trust)
+
+
+@st.composite
+def predictions(draw):
+    """Weights (K,), ranges (K, M, B), some of them without return, and sigma (K, M, B)."""
+    count = draw(st.integers(1, 5))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    shape = (count, int(rng.integers(1, 5)), int(rng.integers(1, 40)))
+    ranges = rng.uniform(0, 30, shape)
+    ranges[rng.random(shape) < 0.1] = np.inf
+    ranges = np.where(rng.random(shape) < rng.random(), ranges[:1], ranges)  # a random share of the beams is equal
+    weights = rng.random(count) * (rng.random(count) < 0.8)
+    assume(weights.sum() > 0)
+    return weights, ranges, rng.uniform(0.001, 2, shape)
+
+
+@given(predictions())
+def test_gain_is_between_zero_and_the_entropy(predicted):
+    weights, ranges, sigma = predicted
+    gain = place_information(weights, ranges, sigma, R)
+    assert gain.shape == ranges.shape[1:2]
+    assert (gain >= 0).all()
+    assert (gain <= entropy(weights) + 1e-12).all()
+    equal = np.broadcast_to(ranges[:1], ranges.shape)  # no gain for any sigma
+    assert place_information(weights, equal, sigma, R) == pytest.approx(0, abs=1e-12)
+
+
+@pytest.mark.parametrize("beams", [61, 811])
+@pytest.mark.parametrize("outliers", [0.25, 0.0])
+def test_gain_of_different_scans(beams, outliers):
+    weights, ranges = np.array([0.5, 0.3, 0.2]), np.array([1.0, 4.0, 9.0])[:, None, None] * np.ones((3, 1, beams))
+    gain = gain_of(ranges, weights=weights, outliers=outliers)
+    assert gain == pytest.approx(entropy(weights), rel=2e-3)
+
+
+def test_gain_by_number_of_beams():
+    """The numbers in the docstring."""
+    gain = gain_of(np.stack([np.full((61, 61), 5.0), 5.0 + 3.0 * np.tri(61, 61, -1)]))
+    assert (np.diff(gain) > 0).all()
+    assert gain[3] < 0.2
+    assert gain[8] == pytest.approx(0.4, abs=0.05)
+    assert gain[20] > 0.6
+
+
+@pytest.mark.parametrize(("first", "low", "high"), [(5.0, 0.6, 0.7), (np.inf, 0, 1e-12), (R - 1e-3, 0, 1e-3)])
+def test_no_return(first, low, high):
+    assert low <= gain_of(np.array([first, np.inf])[:, None, None] * np.ones((2, 1, 61)))[0] <= high
+
+
+@pytest.mark.parametrize(("sigma", "share"), [(0.02, 0.85), (0.05, 0.8), (0.2, 0.65)])
+def test_gain_and_mutual_information(sigma, share):
+    """Against Monte Carlo with the same model, including outliers, and as many beams as sectors.
+
+    With predictions about three deviations apart the gain is at least ``share`` of it, with eight at least 0.9.
+    """
+    rng = np.random.default_rng(5)
+    weights, offsets = np.array([0.5, 0.3, 0.2]), rng.uniform(-1, 1, (3, 6))
+    for spread in (0.0, 0.3, 1.0, 3.0, 8.0):
+        ranges = 9 + 1.4 * spread * sigma * offsets
+        true = mutual_information(weights, ranges, sigma, 0.25, rng)
+        (found,) = gain_of(ranges[:, None], sigma, weights, arrival_error=0.0, sectors=6)
+        assert found <= true + 0.008, spread  # sampling error of 40 000 draws
+        assert found >= {3.0: share, 8.0: 0.9}.get(spread, 0) * true, spread
+
+
+def mutual_information(weights, ranges, sigma, outliers, rng, draws=40_000):
+    """H(k) - E[H(k | o)] in nats for independent beams with density (1 - e) N + e / R; ranges (K, B)."""
+    k = rng.choice(len(weights), draws, p=weights)
+    o = ranges[k] + sigma * rng.standard_normal((draws, ranges.shape[1]))
+    wild = rng.random(o.shape) < outliers
+    o[wild] = rng.uniform(0, R, wild.sum())
+    core = np.exp(-0.5 * ((o[:, None] - ranges) / sigma) ** 2) / np.sqrt(2 * np.pi * sigma**2)
+    log = np.log((1 - outliers) * core + outliers / R).sum(axis=2) + np.log(weights)
+    posterior = np.exp(log - log.max(axis=1, keepdims=True))
+    posterior /= posterior.sum(axis=1, keepdims=True)
+    left = -np.sum(posterior * np.log(np.maximum(posterior, 1e-300)), axis=1)
+    return entropy(weights) - left.mean()
+
+
+def test_identical_rooms():
+    """World `twins` with exact rays; places are spread over the room and the corridor outside."""
+    world, scanner, twin = shipped("twins"), SCANNERS["tim571"].with_beams(61), np.array([6.0, 0.0, 0.0])
+    here, door = np.array([2.0, 2.2, 0.3]), np.array([2.95, 4.5])
+    places = np.stack(np.meshgrid(np.arange(0.4, 5.8, 0.5), np.arange(0.4, 6.2, 0.5)), axis=-1).reshape(-1, 2)
+    places = places[(world.clearance(places) > Robot().radius) & (world.clearance(places + twin[:2]) > Robot().radius)]
+    outside = places[:, 1] > door[1]
+    through_the_door = np.hypot(*(door - here[:2])) + np.hypot(*(places - door).T)
+    lengths = np.where(outside, through_the_door, np.hypot(*(places - here[:2]).T))
+    moves = se2.between(here, np.column_stack([places, np.full(len(places), here[2])]))
+    goal = np.array([4.5, 3.0])  # in the first room
+    for first, second in ((here, here + twin), (here + twin, here)):
+        motions = CandidateMotions(np.array([first, second]), np.array([0.5, 0.5]), moves, lengths)
+        poses = se2.compose(motions.poses().reshape(-1, 3), np.array(scanner.mount))
+        ranges = world.ray_distances(poses, scanner.angles()).reshape(2, len(places), 61)
+        gain = gain_of(ranges)
+        assert np.median(gain[places[:, 1] < 3.5]) < 0.01
+        assert gain[outside].max() > 0.6
+        energy = drive_energy(
+            motions,
+            ranges,
+            np.full(ranges.shape, 0.02),
+            scanner.range_max,
+            lambda points: np.hypot(*np.moveaxis(points - goal, -1, 0)),
+            VisitedPlaces().novelty,
+        )
+        assert places[np.argmin(energy.total), 1] > 4.5
+
+
+def test_visited_places():
+    visited, far = VisitedPlaces(), np.array([[0.0, 0.0], [3.0, 0.0], [-3.0, 0.0]])
+    assert visited.novelty(far) == pytest.approx([0, 0.99, 0.99], abs=0.01)
+    for number in range(50):  # 3 m ahead, then it turns round
+        visited.move(number * 10**9 // 15, np.array([1.0, 0, 0]) if number < 46 else np.array([0, 0, np.pi * 15 / 4]))
+    assert visited.novelty(far) == pytest.approx([0, 0, 0.99], abs=0.02)
+    for stamp, novelty in [(5, 0.99), (7, 0.0)]:  # it has stood since 3.3 s
+        visited.move(stamp * 10**9, np.zeros(3))
+        visited.give_up(far[2])
+        assert visited.novelty(far)[2] == pytest.approx(novelty, abs=0.02)
+
+
+def test_policy_posterior():
+    assert efe.policy_posterior(np.array([0.3, 0.1, np.inf]), 5.0) == pytest.approx([0.2689, 0.7311, 0], abs=1e-4)
+
+
+def test_one_step_and_a_known_pose():
+    """The risk's gradient is that of the paper's equation 4, with the precision that a linear preference has there."""
+    action, yaw, step, preferred = np.array([0.4, -0.1]), 0.7, 1e-6, np.array([3.0, 1.0])
+    observed = np.array([1.0, 2.0])
+
+    def distance(a):
+        return np.hypot(*(observed + se2.rotate(yaw, a) - preferred))
+
+    def risk(a):
+        return efe.NATS_PER_METRE * efe.expected_distance(distance(a), 0.0)
+
+    numeric = [(risk(action + e) - risk(action - e)) / (2 * step) for e in step * np.eye(2)]
+    parameters = ActionParameters(horizon=1.0, action_precision=0.0)
+    exact = action_gradient(action, observed, preferred, yaw, parameters)
+    assert numeric == pytest.approx(efe.NATS_PER_METRE / distance(action) * exact, rel=1e-6)
+
+
+@pytest.mark.parametrize(("deviation", "noise"), [(0.3, 0.1), (0.05, 0.2), (0.2, 0.01)])
+def test_pose_information(deviation, noise):
+    """The gain by measuring x is the mutual information of the measurement and the blurred x, by enumeration."""
+    blur = np.sqrt(efe.RESOLUTION[0, 0])
+    x = np.linspace(-4, 4, 801) * np.hypot(deviation, max(noise, blur))
+    joint = np.exp(-(x**2) / (2 * deviation**2))[:, None] * np.exp(-((x - x[:, None]) ** 2) / (2 * noise**2))
+    blurred = np.exp(-((x - x[:, None]) ** 2) / (2 * blur**2)) @ joint  # (x at the resolution, measurement)
+    p = blurred / blurred.sum()
+    independent = np.outer(p.sum(axis=1), p.sum(axis=0))
+    mutual = np.sum(p * np.log(np.where(p > 0, p / np.maximum(independent, 1e-300), 1.0)))
+    covariance, information = np.diag([deviation**2, 0, 0]), np.diag([noise**-2, 0, 0])
+    gain = efe.remaining_entropy(covariance, np.zeros((3, 3))) - efe.remaining_entropy(covariance, information)
+    assert gain == pytest.approx(mutual, abs=0.01)
+
+
+def test_information_loss():
+    """It is the slope of the entropy that motion adds, and an upper bound."""
+    information, step = np.array([np.zeros((3, 3)), np.diag([400.0, 0, 50])]), 1e-6
+    # Scans over a part of a metre tell as much per metre of motion as those over the whole.
+    slope = efe.remaining_entropy(step * efe.MOTION_NOISE, information / step) / step
+    assert efe.information_loss(information) == pytest.approx(slope, rel=1e-4)
+    assert (efe.remaining_entropy(efe.MOTION_NOISE, information) < efe.information_loss(information)).all()
+
+
+def test_expected_square():
+    rng = np.random.default_rng(3)
+    for value, deviation in [(0.5, 0.0), (0.5, 0.1), (-0.2, 0.3), (0.9, 0.5)]:
+        sampled = np.mean(np.clip(value + deviation * rng.standard_normal(100_000), 0, 1) ** 2)
+        assert efe.expected_square(np.array(value), deviation) == pytest.approx(sampled, abs=0.05)
+
+
+def test_information_of_scans():
+    """In the middle of a room, against finite differences of exact ranges; and without a wall in range."""
+    hall, step = room(8, 6), 1e-5
+    observed = scan(0, [4.0, 3.0, 0.0], hall)
+    found = ScanInformation.of(FreeSpace.of(hall), 0.27, observed, 15.0)
+    pose = np.array([4.25, 3.25, 0.0])  # the centre of a cell
+    (cell,) = found.grid.cell_of(pose[None, :2])
+    angles = np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS
+    differences = [
+        hall.ray_distances((pose + e)[None], angles)[0] - hall.ray_distances((pose - e)[None], angles)[0]
+        for e in step * np.eye(3)
+    ]
+    J = np.transpose(differences) / (2 * step)
+    incidence = 1 / np.hypot(J[:, 0], J[:, 1])
+    variance = 0.02**2 + (MAP_ERROR_M / incidence) ** 2
+    exact = len(observed.ranges) / DIRECTIONS * np.einsum("b,bi,bj->ij", 1 / variance, J, J)
+    np.testing.assert_allclose(found.matrix[cell], exact, rtol=0.15, atol=0.03 * exact.max())
+    short = ScanInformation.of(FreeSpace.of(hall), 0.27, observed.model_copy(update={"range_max": 1.0}), 15.0)
+    assert short.matrix[cell] == pytest.approx(0)
+    assert short.metre_cost.ravel()[cell] > 100 * found.metre_cost.ravel()[cell]
+    block = FreeSpace.of(room(8, 6, box(4, 3, 1.2, 1.2)))  # no scan is possible from the cells inside
+    assert ScanInformation.of(block, 0.27, observed, 15.0).metre_cost.max() < 3 * found.metre_cost.max()

@@ -1,0 +1,65 @@
+"""Mapping while driving."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from common.geometry import se2
+from common.geometry.world import load_world
+from lab.accuracy.scenes import Scene
+from services.mapper.slam.mapper import Mapper
+from services.mapper.slam.segments import KEYS
+from services.mapper.slam.trajectory import build_trajectory
+from services.simulator.odometry import Drift, Odometer
+from tests.mapper.drives import driven
+
+OFFICE = load_world("office")
+
+
+def odometry(truth):
+    odometer, poses = Odometer(Drift(), np.random.default_rng(0)), [np.zeros(3)]
+    for before, after in pairwise(truth):
+        odometer.move(before, after)
+        poses.append(odometer.pose)
+    return np.array(poses)
+
+
+def mapped(drive):
+    """A mapper after a drive, updated after every segment, and the places of the scans when they came."""
+    mapper, places = Mapper(drive.laser, 0.05), []
+    for k, (stamp, ranges) in enumerate(zip(drive.stamps, drive.ranges, strict=True)):
+        places.append(mapper.add(stamp, ranges, None if drive.odom is None else drive.odom[k]))
+        scans = mapper.key_scans()
+        if mapper.outdated and len(scans.poses) % KEYS == 0:
+            mapper.use(mapper.update(scans))
+    mapper.use(mapper.update(mapper.key_scans()))
+    return mapper, places
+
+
+@pytest.mark.parametrize("with_odometry", [True, False])
+def test_live_map_is_that_of_the_log(with_odometry):
+    truth = Scene.of(OFFICE, 300, 5).path(40)
+    drive = driven(OFFICE, truth)
+    if with_odometry:
+        drive = replace(drive, odom=odometry(truth))
+    mapper, places = mapped(drive)
+    assert len(mapper.map.closures)
+    assert all(place.matched for place in places)
+    _, poses = mapper.trajectory()
+    batch = build_trajectory(drive)
+    assert np.abs(poses - batch.poses)[:, :2].max() < 0.005
+    error = se2.compose(truth[0], poses)[:, :2] - truth[:, :2]
+    assert np.hypot(*error.T).max() < 0.1
+
+
+def test_gap_in_the_scans():
+    truth = Scene.of(OFFICE, 300, 5).path(20)
+    drive = driven(OFFICE, truth)
+    kept = np.r_[0:100, 105 : len(truth)]
+    _, places = mapped(replace(drive, stamps=drive.stamps[kept], ranges=drive.ranges[kept]))
+    error = se2.compose(truth[0], np.array([place.pose for place in places]))[:, :2] - truth[kept, :2]
+    assert np.hypot(*error.T).max() < 0.1

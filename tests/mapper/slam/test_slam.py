@@ -1,0 +1,86 @@
+"""Mapping without reference poses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from common.geometry import se2
+from common.geometry.world import load_world
+from lab.accuracy.motion_distortion import observations
+from lab.accuracy.scenes import TWIN_OFFSET, TWINS, Scene
+from services.mapper.slam.drive import Laser, RawDrive
+from services.mapper.slam.pose_graph import Link, LinkTable, optimise
+from services.mapper.slam.trajectory import build_trajectory
+from tests.mapper.drives import driven
+
+
+def test_jacobians_of_links():
+    rng = np.random.default_rng(0)
+    poses = rng.normal(size=(3, 3))
+    table = LinkTable([Link(0, 1, rng.normal(size=3), np.eye(3)), Link(2, 1, rng.normal(size=3), np.eye(3))])
+    for sides, jacobian in zip((table.first, table.second), table.jacobians(poses), strict=True):
+        for link, pose in enumerate(sides):
+            for axis in range(3):
+                moved = poses.copy()
+                moved[pose, axis] += 1e-6
+                change = (table.errors(moved) - table.errors(poses))[link] / 1e-6
+                assert jacobian[link, :, axis] == pytest.approx(change, abs=1e-5)
+
+
+def test_consistent_graph_is_solved():
+    rng = np.random.default_rng(0)
+    truth = rng.normal(size=(20, 3))
+    pairs = [(i, j) for i in range(20) for j in (i + 1, i + 5) if j < 20]
+    links = [Link(i, j, se2.between(truth[i], truth[j]), np.eye(3)) for i, j in pairs]
+    start = truth + 0.05 * rng.normal(size=truth.shape)
+    start[0] = truth[0]
+    assert optimise(start, links) == pytest.approx(truth, abs=1e-6)
+
+
+def error_of(drive, truth):
+    """Largest error of the position in m."""
+    error = se2.compose(truth[0], build_trajectory(drive).poses)[:, :2] - truth[:, :2]
+    return np.hypot(*error.T).max()
+
+
+def test_simulated_drive():
+    world = load_world("office")
+    truth = Scene.of(world, 300, 5).path(20)
+    assert error_of(driven(world, truth), truth) < 0.1
+
+
+def test_swept_scans():
+    scene = Scene.of(load_world("office"), 300, 5)
+    path, scanner = scene.path(20, at_full_speed=True), scene.scanner
+    scans = observations(scene, path, "corrected", "laser only")
+    ranges, stamps = np.array([scan.ranges for scan in scans]), np.arange(len(scans)) / scanner.rate
+    mount, increment = np.array(scanner.mount), scans[0].time_increment
+    laser = Laser(scanner.angles(), mount, scanner.range_max, increment)
+    drive = RawDrive(stamps, ranges, laser)
+    corrected, uncorrected = (
+        error_of(each, path[:-1]) for each in (drive, replace(drive, laser=replace(laser, time_increment=0.0)))
+    )
+    assert 3 * corrected < uncorrected
+
+
+def test_pausing_odometry():
+    world = load_world("office")
+    truth = Scene.of(world, 300, 5).path(20)
+    number = np.arange(len(truth))
+    odom = truth[np.where(number % 40 < 4, number // 40 * 40, number)]
+    built = build_trajectory(replace(driven(world, truth), odom=odom))
+    error = se2.compose(truth[0], built.poses)[:, :2] - truth[:, :2]
+    assert np.hypot(*error.T).max() < 0.1
+
+
+def test_look_alike_rooms_stay_apart():
+    corners = np.array([[2.95, 2.5], [2.95, 5.0], [2.95 + TWIN_OFFSET, 5.0], [2.95 + TWIN_OFFSET, 2.5]])
+    legs = [np.linspace(a, b, int(np.hypot(*(b - a)) / 0.05)) for a, b in pairwise(corners)]
+    places = np.concatenate(legs)
+    truth = np.column_stack([places, np.full(len(places), -np.pi / 2)])
+    built = build_trajectory(driven(TWINS, truth))
+    assert np.hypot(*(built.poses[-1] - built.poses[0])[:2]) == pytest.approx(TWIN_OFFSET, abs=0.3)

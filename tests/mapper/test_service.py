@@ -1,0 +1,81 @@
+"""The mapper as a process, over real zenoh."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from common.bus.inbox import Inbox
+from common.geometry import se2
+from common.geometry.world import load_world
+from common.messages.definitions import Belief, Map, Odom, Pose, Scan, Twist
+from common.messages.requests import SaveMapReply, SaveMapRequest
+from common.messages.topics import BELIEF, MAP, ODOM, SAVE_MAP, SCAN
+from common.robot.scan_geometry import Sweep
+from lab.accuracy.scenes import Scene
+from tests.conftest import WAIT_TIMEOUT_S, wait_for_message
+from tests.mapper.drives import driven
+
+OFFICE = load_world("office")
+
+
+def scan_message(drive, k, ranges=None):
+    first, increment, _ = Sweep.of_angles(drive.laser.angles)
+    return Scan(
+        stamp_ns=round(drive.stamps[k] * 1e9),
+        angle_min=first,
+        angle_increment=increment,
+        range_min=0.05,
+        range_max=drive.laser.range_max,
+        ranges=drive.ranges[k] if ranges is None else ranges,
+        mount=Pose.of(drive.laser.mount),
+    )
+
+
+@pytest.mark.parametrize("odometry", [True, False])
+def test_drive_and_save(process, bus, tmp_path, odometry):
+    truth = Scene.of(OFFICE, 300, 5).path(8)
+    drive, inbox, maps = driven(OFFICE, truth), Inbox(), Inbox()
+    bus.subscribe(BELIEF, inbox)
+    bus.subscribe(MAP, maps)
+    process("mapper", "--maps", str(tmp_path / "maps"))
+    assert bus.wait_matching(SCAN, WAIT_TIMEOUT_S)
+    assert bus.wait_matching(ODOM, WAIT_TIMEOUT_S)
+
+    def belief_of(scan, pose):
+        if odometry:
+            odom = Odom(stamp_ns=scan.stamp_ns, pose=Pose.of(pose), twist=Twist(), covariance=np.eye(3))
+            bus.put(ODOM, odom.encode())
+        bus.put(SCAN, scan.encode())
+        return wait_for_message(inbox, Belief, lambda b: b.stamp_ns == scan.stamp_ns)
+
+    beliefs = [belief_of(scan_message(drive, k), pose) for k, pose in enumerate(truth)]
+    assert {belief.state for belief in beliefs} == {"tracking"}
+    poses = np.array([belief.pose.array() for belief in beliefs])
+    error = se2.compose(truth[0], poses)[:, :2] - truth[:, :2]
+    assert np.hypot(*error.T).max() < 0.05
+    grown = wait_for_message(maps, Map, lambda message: len(message.poses) > 3)
+    assert np.abs(grown.poses[0]).max() < 0.01
+
+    file = bus.ask(SAVE_MAP, SaveMapRequest(name="here"), SaveMapReply).file
+    world = load_world(file)
+    assert (world.clearance(poses[:, :2]) > 0).mean() > 0.9
+    assert np.loadtxt(tmp_path / "maps" / "here.tum").shape == (len(truth), 8)
+    for name, reason in (("here", "exists already"), ("../here", "letters"), ("office", "shipped")):
+        reply = bus.ask(SAVE_MAP, SaveMapRequest(name=name), SaveMapReply)
+        assert not reply.ok
+        assert reason in reply.reason
+
+    last = len(truth) - 1
+    nonsense = np.random.default_rng(0).uniform(1, 8, drive.ranges.shape[1])
+    lost = scan_message(drive, last, nonsense).model_copy(update={"stamp_ns": round(drive.stamps[last] * 1e9) + 10**8})
+    belief = belief_of(lost, truth[last])
+    assert belief.state == "lost"
+    assert belief.covariance is None
+
+
+def test_save_before_the_first_scan(process, bus):
+    process("mapper")
+    assert bus.wait_matching(SCAN, WAIT_TIMEOUT_S)
+    reply = bus.ask(SAVE_MAP, SaveMapRequest(name="here"), SaveMapReply)
+    assert "no scan has come" in reply.reason

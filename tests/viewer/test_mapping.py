@@ -1,0 +1,43 @@
+"""The page while an unknown building is mapped: the growing map, and saving it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from common.geometry.world import load_world
+from tests.viewer.client import page_of
+
+
+def start_mapping(processes):
+    """Starts all services of `presage up --world office --mapping`. Returns the viewer and its environment."""
+    _, port = processes.start_router()
+    environment = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{port}", "PRESAGE_ROBOT": "robot"}
+    processes.start("simulator", "--world", "office", "--hide-world", env=environment)
+    processes.start("mapper", env=environment)
+    processes.start("controller", "--preset", "manual", env=environment)
+    return processes.start("viewer", "--port", "0", env=environment), environment
+
+
+def test_drive_and_save(browser, processes):
+    from tests.viewer.browser import visit  # without playwright these tests are skipped
+
+    viewer, _ = start_mapping(processes)
+    seen = visit(browser, page_of(viewer))
+    seen.wait("store.map && store.frame?.belief?.estimator === 'mapper'", 60)
+    seen.wait("store.frame.truth === null && store.frame.error === null")
+    assert seen.see("store.world.name") == "map"
+    count = seen.see("store.map.path.length")
+    seen.page.locator("#map").focus()
+    seen.page.keyboard.down("ArrowUp")
+    seen.wait("store.map.path.length > arg", 60, count)
+    seen.page.keyboard.up("ArrowUp")
+
+    save = seen.page.locator("#save-map")
+    save.locator("input").fill("here")
+    save.locator("button").click()
+    assert "presage train --world" in seen.toast("map saved")
+    assert load_world(str(Path(processes.folder) / "here.yaml")).grid is not None
+    save.locator("button").click()
+    seen.toast("exists already", ok=False)
+    seen.page.context.close()
+    assert seen.complaints == []
