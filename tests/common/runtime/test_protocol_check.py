@@ -99,7 +99,7 @@ def test_late_reply_of_a_busy_service(process, bus):
 
 def test_earlier_service_continues(process, bus, link):
     small = process(SMALL)
-    assert wait_until(lambda: "small" in bus.alive(), WAIT_TIMEOUT_S), small.output
+    started_long_ago(small, bus)
     calls = Inbox()
     with open_bus(link) as newcomer:
         newcomer.serve(CONFIG, calls, "careless")
