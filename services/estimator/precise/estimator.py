@@ -13,12 +13,13 @@ from services.estimator.precise.hypotheses import (
     Mode,
     clip_to_map,
     constraining_beams,
-    observed_directions,
     probability_of_being_near,
     project_evidence,
     protection_level,
     same_place,
+    unobserved_direction,
     update_mode,
+    weakest_direction,
     weigh,
 )
 from services.estimator.precise.likelihood import Likelihood
@@ -254,13 +255,15 @@ class PreciseEstimator:
         as when a replay starts again, the duration of the motion is unknown, and no motion is such evidence.
         """
         mode, period = self.modes[k], self._period(observation.stamp)
-        # While a direction is unobserved, a ripple a little larger than the others must not pass for a feature.
-        caution = 3 if mode.unobserved_scans else 1
-        projection, unobserved = observed_directions(evidence.curvature[k], self.model.ripple * caution)
-        min_beams = caution * self.settings.min_constraining_ratio * len(view.angles)
+        unobserved = unobserved_direction(evidence.curvature[k], self.model.ripple)
+        min_beams = self.settings.min_constraining_ratio * len(view.angles)
+        if mode.unobserved_scans:
+            # The pose may be metres off, so a ripple or a beam that happens to fit must not pass for a feature.
+            min_beams *= 3
+            unobserved = weakest_direction(evidence.curvature[k])[0]
         if unobserved is not None and constraining_beams(view, pose, unobserved) > min_beams:
-            projection, unobserved = np.eye(3), None
-        project_evidence(evidence, k, projection)
+            unobserved = None
+        project_evidence(evidence, k, unobserved)
         is_unobserved = unobserved is not None and len(candidates) > 1
         if unobserved is not None and is_unobserved and self._odometry_since_last_scan(observation) is None:
             *candidates, widest = (

@@ -58,23 +58,29 @@ class Mode:
         return np.asarray(inflation * (self.noise_covariance + self.model_covariance))
 
 
-def observed_directions(curvature: Array, ripple: float) -> tuple[Array, Array | None]:
-    """Returns a projection (3, 3) onto what a scan observes, and the direction (2,) it does not observe, if any.
+def weakest_direction(curvature: Array) -> tuple[Array, float]:
+    """The direction (2,) about which a scan says least, and the ratio of its information to that across it."""
+    values, vectors = np.linalg.eigh(position_information(curvature))
+    return vectors[:, 0], float(values[0] / values[1]) if values[1] > 0 else 0.0
+
+
+def unobserved_direction(curvature: Array, ripple: float) -> Array | None:
+    """The direction (2,) that a scan does not observe, if any.
 
     In a corridor without features a learned field still has ripples: walls tilted by about ``ripple`` rad, which add
     along the corridor about ripple² of the curvature across it. Information that does not clearly exceed this counts
     as none.
     """
-    values, vectors = np.linalg.eigh(position_information(curvature))
-    if values[0] >= (MIN_INFORMATION_RATIO + RIPPLE_FACTOR * ripple**2) * values[1] and values[1] > 0:
-        return np.eye(3), None
-    projection, unobserved = np.eye(3), vectors[:, 0]
+    direction, ratio = weakest_direction(curvature)
+    return direction if ratio < MIN_INFORMATION_RATIO + RIPPLE_FACTOR * ripple**2 else None
+
+
+def project_evidence(evidence: Evidence, k: int, unobserved: Array | None) -> None:
+    """Removes the k-th evidence along a direction (2,) that the scan does not observe, in place."""
+    if unobserved is None:
+        return
+    projection = np.eye(3)
     projection[:2, :2] -= np.outer(unobserved, unobserved)
-    return projection, unobserved
-
-
-def project_evidence(evidence: Evidence, k: int, projection: Array) -> None:
-    """Applies a projection from `observed_directions` to the k-th evidence, in place."""
     evidence.xi[k] = projection @ evidence.xi[k]
     for matrix in (evidence.curvature, evidence.xi_noise_covariance, evidence.xi_model_covariance):
         matrix[k] = projection @ matrix[k] @ projection
@@ -88,8 +94,7 @@ def mode_from_search(
     Without a prior every pose in ``volume`` m² rad was equally likely, and complexity is the Kullback-Leibler
     divergence from that. ``unknown`` (3, 3), the covariance of an unknown pose, remains along unobserved directions.
     """
-    projection, _ = observed_directions(evidence.curvature[k], ripple)
-    project_evidence(evidence, k, projection)
+    project_evidence(evidence, k, unobserved_direction(evidence.curvature[k], ripple))
     information = prior.information[k] if prior else np.linalg.inv(unknown)
     inverse = np.linalg.inv(evidence.curvature[k] + information)
     slope = evidence.xi[k] + (prior.information[k] @ difference(prior.mean[k : k + 1], pose[None])[0] if prior else 0)

@@ -244,6 +244,25 @@ def test_belief_stays_in_the_map(hall_estimator, kinds, seed, period):
                 assert moved <= 20 * 0.5 + 3 * made.settings.motion.speed * period
 
 
+def test_lost_along_a_corridor():
+    """A few beams that happen to fit are no feature: what was lost along a plain corridor stays lost."""
+    world = World(name="plain", boundary=[(0, 0), (35, 0), (35, 2), (0, 2)])
+    made, scene = estimator(world, 622)
+    scene = Scene(world, scene.scanner.model_copy(update={"range_max": 8.0}), scene.rng)
+    count = 90
+    path = np.column_stack([32 - 0.0635 * np.arange(count), np.full(count, 1.0), np.linspace(2.4, 6.0, count)])
+    made.restart(path[0], np.diag([0.05**2] * 3))
+    states = []
+    for k, (pose, clean) in enumerate(zip(path, scene.clean(path), strict=True)):
+        posterior = made.update(scene.observe(clean, k / 15))
+        states.append(posterior.state)
+        error = np.hypot(*off(posterior, pose)[:2])
+        assert error < 0.2 or posterior.state != "tracking"
+        assert error < 3.5 * np.sqrt(np.linalg.eigvalsh(posterior.covariance[:2, :2])[-1])
+    assert states[0] == "tracking"
+    assert states[-1] != "tracking"
+
+
 COUNT_COMPILED = """
 import sys
 
