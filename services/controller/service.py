@@ -8,17 +8,30 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from common.geometry.world import load_world
-from common.messages.definitions import Belief, CmdVel, Drive, Goal, Plan, Pose, Preference, Scan, Stamped, Status
+from common.messages.definitions import Belief, CmdVel, Drive, Goal, Map, Plan, Pose, Preference, Scan, Stamped, Status
 from common.messages.requests import PredictReply, PredictRequest, Reply
-from common.messages.topics import BELIEF, CMD_VEL, DRIVE, GOAL, PLAN, PREDICT, PREFERENCE, SCAN, STATUS, Query, Topic
+from common.messages.topics import (
+    BELIEF,
+    CMD_VEL,
+    DRIVE,
+    GOAL,
+    MAP,
+    PLAN,
+    PREDICT,
+    PREFERENCE,
+    SCAN,
+    STATUS,
+    Query,
+    Topic,
+)
 from common.runtime.service import Service
 from services.controller.belief_wait import Answered, AwaitsPredictions, AwaitsScan, BeliefWait, NoBelief
 from services.controller.navigator import Navigator
-from services.controller.policies.manual import ManualPolicy
 from services.controller.policies.paper_action import ActionParameters
 from services.controller.settings import ControllerSettings
 
 if TYPE_CHECKING:
+    from services.controller.growing_map import MapUpdates
     from services.controller.policies.geodesic_field import CostField
     from services.controller.policies.planner import GeodesicPolicy
 
@@ -55,7 +68,7 @@ class ControllerService(Service):
     name: ClassVar[str] = "controller"
     single: ClassVar[bool] = True
     restores_latched: ClassVar[tuple[Topic, ...]] = (GOAL, STATUS)
-    inputs: ClassVar[tuple[Topic, ...]] = (SCAN, BELIEF, GOAL, DRIVE)
+    inputs: ClassVar[tuple[Topic, ...]] = (SCAN, BELIEF, GOAL, DRIVE, MAP)
 
     settings: ControllerSettings
 
@@ -63,6 +76,7 @@ class ControllerService(Service):
         super().__init__(settings)
         self.navigator = Navigator()
         self.geodesic: GeodesicPolicy | None = None  # the policy if the preset is `geodesic`
+        self.map_updates: MapUpdates | None = None  # if it plans in the map that the mapper builds
         self.self_filter = settings.build_self_filter()
         self._wait: BeliefWait = NoBelief()
         self._belief_received_s = 0.0  # time.monotonic() of the latest belief
@@ -79,18 +93,20 @@ class ControllerService(Service):
         settings.check()
         robot = settings.build_robot()
         world = None
-        if settings.world and settings.preset != "manual":
+        if settings.world:
             self.log.info("loading the world", world=settings.world)
             world = load_world(settings.world)
-        if settings.preset == "geodesic" and world is not None:
+        if settings.preset == "geodesic":
             # scipy takes a third of a second to import, and preset paper does not need it.
+            from services.controller.growing_map import MapUpdates
             from services.controller.policies.planner import GeodesicPolicy
 
             keep_heading = settings.heading == "keep"
             self.geodesic = GeodesicPolicy(robot, world, keep_heading=keep_heading, epistemic=settings.epistemic)
+            if world is None:
+                self.map_updates = MapUpdates(robot.radius, self.loop.inbox.wake)
         parameters = ActionParameters(gamma=settings.gamma)
-        policy = ManualPolicy() if settings.preset == "manual" else self.geodesic
-        self.navigator = Navigator(robot, parameters, world, policy)
+        self.navigator = Navigator(robot, parameters, world, self.geodesic)
         # Declare the publishers now: the first message on a key that was just declared may be lost.
         for topic in (STATUS, CMD_VEL, PLAN, PREFERENCE):
             self.loop.bus.publisher(topic, self.name)
@@ -120,6 +136,13 @@ class ControllerService(Service):
             self.publish(STATUS, self.navigator.goal_state.status(stamp_ns, None))
         elif isinstance(message, Belief):
             self._on_belief(message)
+        elif isinstance(message, Map) and self.map_updates is not None:
+            self.map_updates.add(message)
+
+    def close(self) -> None:
+        """Wait for the thread that prepares maps."""
+        if self.map_updates is not None:
+            self.map_updates.close()
 
     def _on_scan(self, scan: Scan) -> None:
         self.navigator.on_scan(self.self_filter.mask_for_planning(scan))
@@ -192,6 +215,12 @@ class ControllerService(Service):
         self._publish_plan(command.stamp_ns)
 
     def due(self) -> float | None:
+        """Seconds until the deadline of the present wait, 0 if a map is ready; None if there is nothing to wait for."""
+        if self.map_updates is not None and self.map_updates.ready:
+            return 0.0
+        return self._deadline()
+
+    def _deadline(self) -> float | None:
         """Seconds until the deadline of the present wait; None before the first belief, and after a timeout."""
         if isinstance(self._wait, NoBelief):
             return None
@@ -201,7 +230,11 @@ class ControllerService(Service):
         return deadline_s - time.monotonic()
 
     def on_timer(self) -> None:
-        """Process the belief that has waited too long for its scan; otherwise stop the robot, as no belief comes."""
+        """Use a map that is ready; at a deadline, process the belief that waits for its scan, or stop the robot."""
+        if self.geodesic is not None and self.map_updates is not None and self.map_updates.ready:
+            planned = self.map_updates.take()
+            self.geodesic.use_map(planned.graph, jumped=planned.jumped)
+            return
         if isinstance(self._wait, AwaitsScan):
             self._process(self._wait.belief)
             return

@@ -14,7 +14,7 @@ def start_mapping(processes):
     environment = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{port}", "PRESAGE_ROBOT": "robot"}
     processes.start("simulator", "--world", "office", "--hide-world", env=environment)
     processes.start("mapper", env=environment)
-    processes.start("controller", "--preset", "manual", env=environment)
+    processes.start("controller", "--world=", env=environment)
     return processes.start("viewer", "--port", "0", env=environment), environment
 
 
