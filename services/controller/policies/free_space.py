@@ -83,15 +83,14 @@ class FreeSpace:
 
     grid: Grid
     clearance: Array  # (rows, columns) m from a cell's centre to the nearest wall; negative inside walls
-    unknown: npt.NDArray[np.bool_] | None = None  # (rows, columns) cells that nothing is known about; None if there are
-    # none
+    unknown: npt.NDArray[np.bool_]  # (rows, columns) whether nothing is known about a cell
 
     @classmethod
     def of(cls, world: World, resolution: float = RESOLUTION_M) -> FreeSpace:
         """Free space of a world; clearances are exact at the cell centres."""
         grid = Grid.over(world, resolution)
         centres = grid.centres().reshape(*grid.shape, 2)
-        return cls(grid, world.clearances(centres[0, :, 0], centres[:, 0, 1]))
+        return cls(grid, world.clearances(centres[0, :, 0], centres[:, 0, 1]), np.zeros(grid.shape, bool))
 
     @classmethod
     def of_map(cls, cells: OccupancyGrid) -> FreeSpace:
@@ -123,4 +122,7 @@ class FreeSpace:
         return np.asarray(slope / np.maximum(np.hypot(slope[..., 0], slope[..., 1]), 1e-9)[..., None])
 
 
-NO_MAP = FreeSpace(Grid((0.0, 0.0), RESOLUTION_M, (1, 1)), np.full((1, 1), -1.0))  # nowhere is free
+# Nowhere is free.
+NO_MAP = FreeSpace(
+    Grid((0.0, 0.0), RESOLUTION_M, (1, 1)), np.full((1, 1), -1.0), np.zeros((1, 1), bool)
+)

@@ -55,10 +55,7 @@ class FreeSpaceGraph:
         self._opposite[np.lexsort((self._to, self._from))] = np.lexsort((self._from, self._to))
         self._near_obstacles = np.zeros(self.grid.cells, bool)  # cells whose cost temporary obstacles may change
         self.slowness = np.zeros(self.grid.shape)  # cost of a metre in each cell
-        # Part of it that does not depend on clearance, above 1.
-        self._metre_cost = np.zeros(self.grid.cells)
-        if free.unknown is not None:
-            self._metre_cost += UNKNOWN_COST * free.unknown.ravel()
+        self._metre_cost = UNKNOWN_COST * free.unknown.ravel()  # part of it that does not depend on clearance, above 1
         self._update_weights(~self._near_obstacles)
         _, self.component = connected_components(self._graph, directed=False)  # (cells,), without temporary obstacles
         self._centres = self.grid.centres()
