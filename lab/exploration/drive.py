@@ -30,6 +30,7 @@ from services.simulator.simulation import Setup, Simulation
 
 Choice = Callable[[Survey], View | None]
 MAP_PERIOD_NS = 1_000_000_000  # between two versions of the map, as in the mapper's service
+MIN_PASSAGE_M = 0.7  # a narrower door may be refused (docs/navigation.md, limits)
 LAST_SCANS = 15  # while the robot comes to a stand
 
 
@@ -53,7 +54,8 @@ def explore(
     world: World, robot: Robot, choice: Choice, start: Array, seed: int, limit_s: float, *, beams: int = 622
 ) -> Exploration:
     """Explore a world from ``start`` (3,) until the explorer has finished or failed, or for ``limit_s`` s."""
-    navigator, policy, run = Navigator(robot, preset=(policy := GeodesicPolicy(robot, None))), policy, Exploration()
+    policy, run = GeodesicPolicy(robot, None), Exploration()
+    navigator = Navigator(robot, preset=policy)
     scanner = SCANNERS["tim571"].with_beams(beams)
     mapper: Mapper | None = None
     planned: PlannedMap | None = None
@@ -104,30 +106,35 @@ def _pose(pose: Array) -> tuple[float, float, float]:
     return x, y, yaw
 
 
-def reachable_area(world: World, robot: Robot, start: Array) -> shapely.Geometry:
-    """The area that the body of a robot can cover, from ``start`` (3,)."""
-    room = shapely.buffer(world.free_space, -robot.radius)
+def reachable_area(world: World, radius: float, start: Array) -> shapely.Geometry:
+    """The area that a disc of ``radius`` m can cover, coming from ``start`` (3,)."""
+    room = shapely.buffer(world.free_space, -radius)
     parts = [part for part in shapely.get_parts(room) if shapely.distance(part, shapely.Point(start[:2])) < 0.01]
-    return shapely.buffer(shapely.union_all(parts), robot.radius)
+    return shapely.buffer(shapely.union_all(parts), radius)
+
+
+def mapped_share(run: Exploration, area: shapely.Geometry) -> float:
+    """Share of an area that is free in the map, by points 5 cm apart."""
+    x0, y0, x1, y1 = shapely.bounds(area)
+    x, y = np.meshgrid(np.arange(x0 + 0.025, x1, 0.05), np.arange(y0 + 0.025, y1, 0.05))
+    points = np.stack([x.ravel(), y.ravel()], axis=-1)
+    points = points[shapely.contains_xy(area, *points.T)]
+    if run.map is None:
+        return 0.0
+    # The map's origin is where the robot began.
+    return float(np.mean(run.map.grid.values_at(se2.transform(se2.inverse(run.truths[0]), points)) == FREE))
 
 
 def measure(run: Exploration, world: World, robot: Robot) -> dict[str, Any]:
     """The numbers of one exploration."""
     truths, beliefs = np.array(run.truths), np.array(run.beliefs)
-    area = reachable_area(world, robot, truths[0])
-    x0, y0, x1, y1 = shapely.bounds(area)
-    x, y = np.meshgrid(np.arange(x0 + 0.025, x1, 0.05), np.arange(y0 + 0.025, y1, 0.05))
-    points = np.stack([x.ravel(), y.ravel()], axis=-1)
-    points = points[shapely.contains_xy(area, *points.T)]
-    mapped = np.zeros(len(points), bool)
-    if run.map is not None:
-        # The map's origin is where the robot began.
-        mapped = run.map.grid.values_at(se2.transform(se2.inverse(truths[0]), points)) == FREE
+    area, tight = (reachable_area(world, radius, truths[0]) for radius in (MIN_PASSAGE_M / 2, robot.radius))
     errors, _ = trajectory_errors(beliefs, truths)
     return {
         "phase": run.phase,
         "reason": run.reason,
-        "mapped_share": float(mapped.mean()),
+        "mapped_share": mapped_share(run, area),
+        "mapped_share_tight": mapped_share(run, tight),
         "reachable_m2": float(shapely.area(area)),
         "path_m": float(np.hypot(*np.diff(truths[:, :2], axis=0).T).sum()),
         "return_error_m": float(np.hypot(*(truths[-1] - truths[0])[:2])),

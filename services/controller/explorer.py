@@ -83,8 +83,11 @@ class Explorer:
         """What the choice of the next view depends on."""
         from services.controller.policies.exploration import Survey  # compiles
 
-        target = self.goal.pose.array()[:2] if self.goal is not None and self.phase == "exploring" else None
-        return Survey(self.map.graph, self.map.message.poses, self._arrivals, view, self._pose, self.home[:2], target, self._unreachable)
+        target = None
+        if self.goal is not None and self.phase == "exploring":
+            target = self.goal.pose.array()[:2]
+        poses, home = self.map.message.poses, self.home[:2]
+        return Survey(self.map.graph, poses, self._arrivals, view, self._pose, home, target, self._unreachable)
 
     def needs_goal(self, state: GoalState, stamp_ns: int) -> bool:
         """Whether the present goal has just ended, so that a view must be chosen; notes how it ended."""

@@ -130,7 +130,9 @@ def frontier_of(survey: Survey) -> Frontier:
 def known_space(graph: FreeSpaceGraph) -> FreeSpaceGraph:
     """The graph of the places that are known to be free, with some room to spare: walls seen later may be nearer."""
     free = graph.free
-    return FreeSpaceGraph(replace(free, clearance=np.where(free.unknown, -1.0, free.clearance)), graph.radius + SPARE_ROOM_M)
+    return FreeSpaceGraph(
+        replace(free, clearance=np.where(free.unknown, -1.0, free.clearance)), graph.radius + SPARE_ROOM_M
+    )
 
 
 def candidate_views(survey: Survey, edge: Frontier, known: FreeSpaceGraph) -> tuple[Array, Mask, int | None]:

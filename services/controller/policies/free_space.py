@@ -123,6 +123,4 @@ class FreeSpace:
 
 
 # Nowhere is free.
-NO_MAP = FreeSpace(
-    Grid((0.0, 0.0), RESOLUTION_M, (1, 1)), np.full((1, 1), -1.0), np.zeros((1, 1), bool)
-)
+NO_MAP = FreeSpace(Grid((0.0, 0.0), RESOLUTION_M, (1, 1)), np.full((1, 1), -1.0), np.zeros((1, 1), bool))
