@@ -148,14 +148,9 @@ class Explorer:
 
     def explain(self, status: Status) -> Status:
         """The controller's status, with the progress of the exploration."""
-        area, path = self.map.free_area_m2, self.path_m
-        status = status.model_copy(
-            update={"exploration": Exploration(phase=self.phase, seq=self.seq, area=area, path=path)}
-        )
-        if not self.drives or (status.state in {"lost", "manual", "blocked"} and not status.refused):
+        progress = Exploration(phase=self.phase, seq=self.seq, area=self.map.free_area_m2, path=self.path_m)
+        status = status.model_copy(update={"exploration": progress})
+        if not self.drives or status.state in {"lost", "manual"} or (status.state == "blocked" and not status.refused):
             return status
-        what = "returning to the start" if self.phase == "returning" else "going where a scan tells most"
-        reason = f"{what}; {area:.0f} m² mapped" + (
-            f"; {status.reason}" if status.state == "navigating" and status.reason else ""
-        )
+        reason = "returning to the start" if self.phase == "returning" else "going where a scan tells most"
         return status.model_copy(update={"state": "exploring", "reason": reason, "refused": False})

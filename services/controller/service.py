@@ -55,7 +55,7 @@ def preference_message(field: CostField, goal: Goal, stamp_ns: int) -> Preferenc
         resolution=grid.resolution,
         width=columns,
         height=rows,
-        distance=field.cost.ravel().astype(np.float32),
+        distance=np.where(field.graph.free.unknown, np.inf, field.cost).ravel().astype(np.float32),
     )
 
 
@@ -115,7 +115,7 @@ class ControllerService(Service):
     def on_restored(self, last: dict[Topic, Stamped]) -> None:
         """Resume the goal of the previous controller instance, if it was still under way."""
         goal, status = last.get(GOAL), last.get(STATUS)
-        if not isinstance(goal, Goal) or not isinstance(status, Status) or goal.cancel:
+        if not isinstance(goal, Goal) or not isinstance(status, Status) or goal.cancel or goal.explore:
             return
         if self.navigator.goal_state.goal is not None:
             return  # a new goal has arrived already
