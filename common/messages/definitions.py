@@ -172,7 +172,8 @@ class Goal(Stamped):
     tolerance: PositiveDistance = GOAL_TOLERANCE_M  # m, the goal is reached within this distance
     yaw_tolerance: PositiveAngle | None = None  # rad, tolerance of the final heading; nil accepts any heading
     approach: Angle | None = None  # rad in map, direction of motion over the last 0.6 m; nil accepts any direction
-    cancel: bool = False  # drop the goal and stop
+    cancel: bool = False  # drop the goal, end an exploration, and stop
+    explore: bool = False  # explore what is unknown in the mapper's map, and return; the pose is not used
 
 
 class Drive(Stamped):
@@ -197,17 +198,28 @@ class PolicyEnergy(Message):
     probability: Annotated[float, Field(ge=0, le=1)]  # of the policy among those compared, by softmax(-5000 G)
 
 
+class Exploration(Message):
+    """Progress of the exploration of an unknown building."""
+
+    phase: Literal["exploring", "returning", "finished", "failed"]  # finished: nothing is left to see, and the robot is
+    # back where it began; failed: it cannot get back
+    seq: Count  # of the goal that requested it
+    area: NotNegative  # m², free space in the map
+    path: NotNegative  # m, driven since it began
+
+
 class Status(Stamped):
     """What the controller does, and why."""
 
     state: Literal["idle", "navigating", "reached", "blocked", "lost", "manual", "exploring"]
-    # manual: driven by hand; exploring: moving to find out where the robot is
+    # manual: driven by hand; exploring: moving to find out where the robot is, or what is unknown in the map
     reason: Text = ""
     refused: bool = False  # blocked permanently, as the goal cannot be reached; if false, the way may become free
     goal: Pose | None = None  # base_link in map
     goal_seq: Count = 0  # seq of the goal
     distance: Distance | None = None  # m, from the believed pose to the goal
     energy: PolicyEnergy | None = None  # of the chosen policy; nil without a policy, and with preset paper
+    exploration: Exploration | None = None  # nil if none was requested, or the last one was cancelled
 
 
 class Plan(Stamped):

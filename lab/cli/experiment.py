@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from common.errors import UserError
-from lab.cli.navigation import dock, navigate
+from lab.cli.navigation import dock, explore, navigate
 from lab.cli.options import Alpha, Estimators, ExperimentSeed, Out, Trials, show, worker_count
 from presage.terminal.options import console
 from presage.terminal.output import make_folder
@@ -22,7 +22,7 @@ app = typer.Typer(no_args_is_help=True)
 def common_options(context: typer.Context, seed: ExperimentSeed = 1, out: Out = Path("experiments")) -> None:
     """The experiments of Burghardt & Lanillos 2021 with presets paper and precise and the particle filter.
 
-    Also navigation around walls and people, docking, and localisation on real logs.
+    Also navigation around walls and people, docking, exploration, and localisation on real logs.
     """
     context.obj = seed, out
 
@@ -251,3 +251,4 @@ def tables(
 
 app.command("navigation")(navigate)
 app.command("docking")(dock)
+app.command("exploration")(explore)

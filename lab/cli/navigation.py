@@ -1,4 +1,4 @@
-"""`presage experiment navigation` and `docking`."""
+"""`presage experiment navigation`, `docking` and `exploration`."""
 
 from __future__ import annotations
 
@@ -65,3 +65,22 @@ def dock(context: typer.Context, trials: Trials = 100) -> None:
     seed, out = context.obj
     job = docking.DockingJob(0, seed)
     show(docking, lambda: docking.run(job, trials, out, worker_count(1), console), out)
+
+
+def explore(
+    context: typer.Context,
+    starts: Annotated[int, typer.Option(min=1, help="Starts in each world.")] = 2,
+    worlds: Annotated[str, typer.Option(help="Comma-separated names or files.")] = "maze,office",
+    buildings: Annotated[int, typer.Option(min=0, help="Number of generated buildings, with one start each.")] = 5,
+) -> None:
+    """Exploration of unknown buildings, compared with a nearest-frontier explorer from the same starts.
+
+    Examples: `presage experiment exploration --starts 1 --buildings 0`;
+    `presage experiment --seed 7 --out mine exploration`.
+    """
+    from lab.exploration import experiment
+
+    seed, out = context.obj
+    names = [name.strip() for name in worlds.split(",") if name.strip()]
+    job = experiment.ExplorationJob(seed)
+    show(experiment, lambda: experiment.run(job, starts, names, buildings, out, worker_count(), console), out)

@@ -1,4 +1,4 @@
-"""`presage goal`, `teleport` and `relocalise`."""
+"""`presage goal`, `explore`, `teleport` and `relocalise`."""
 
 from __future__ import annotations
 
@@ -80,6 +80,19 @@ def goal(
         cancel=cancel,
     )
     raise typer.Exit(send_goal(chosen_link(context), request, console, wait=wait))
+
+
+@app.command(rich_help_panel="Drive", short_help="Explore an unknown building, and return to the start.")
+def explore(context: typer.Context) -> None:
+    """Explore the building that the mapper maps, until all that can be reached is mapped and the robot is back.
+
+    Shows the mapped area and the length of the path. Ctrl-C stops the robot. Goals sent meanwhile take precedence.
+
+    Example: `presage up --world office --mapping`, then in another terminal `presage explore`.
+    """
+    from presage.live.exploring import explore as run
+
+    raise typer.Exit(run(chosen_link(context), console))
 
 
 @app.command(

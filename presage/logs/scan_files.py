@@ -188,7 +188,7 @@ def _read_recording(path: Path) -> Scans:
         elif isinstance(message, CmdVel):
             command = message.twist.array()
         elif isinstance(message, Goal):
-            goal = unknown if message.cancel else message.pose.array()
+            goal = unknown if message.cancel or message.explore else message.pose.array()
     if recording.warning:  # damage is only found while reading
         print(f"warning: {recording.warning}", file=sys.stderr)
     if not scans:

@@ -187,7 +187,7 @@ class SessionConverter:
 
     def _new_goal(self, goal: Goal, _: int, logged: int) -> Iterator[tuple[str, Any]]:
         time = shapes.time_of(logged)  # a goal's own stamp may be of another clock
-        if goal.cancel:
+        if goal.cancel or goal.explore:
             self._goal = None
             yield "/goal/shape", SceneUpdate(deletions=[SceneEntityDeletion(timestamp=time, id="goal")])
             yield from self._log("goal", f"cancelled {logged}", "the goal was cancelled", logged)

@@ -99,7 +99,8 @@ class RecordedSession:
 
     def goal(self) -> Goal | None:
         """The last goal, unless it was cancelled."""
-        return self.goals[-1] if self.goals and not self.goals[-1].cancel else None
+        last = self.goals[-1] if self.goals else None
+        return None if last is None or last.cancel or last.explore else last
 
     def localised(self) -> int | None:
         """Index of the first belief in state tracking, or None."""

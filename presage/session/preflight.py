@@ -52,13 +52,14 @@ def plan_session(
     shared = [*common, *arguments(world=world)]
     simulator_args = [*shared, *arguments(drive=drive), *simulator]
     estimator_args = [*shared, *estimator]
-    controller_args = [*shared, *arguments(drive=drive)]
+    # While mapping, the controller plans in the map that grows.
+    controller_args = [*common, *(["--world="] if mapping else arguments(world=world)), *arguments(drive=drive)]
     simulator_settings = load_settings(SimulatorSettings, simulator_args)
     estimator_settings = load_settings(EstimatorSettings, estimator_args)
-    if estimator_settings.estimator == "paper":  # it localises at one heading only, which its controller keeps
+    # Estimator paper localises at one heading only, which its controller keeps.
+    if estimator_settings.estimator == "paper" and not mapping:
         controller_args += arguments(preset="paper")
     if mapping:
-        controller_args += arguments(preset="manual")
         simulator_args += arguments(hide_world=True)
     if simulator_settings.pace == "lockstep":
         controller_args += arguments(belief_timeout=LOCKSTEP_BELIEF_TIMEOUT_S)

@@ -13,6 +13,7 @@ from common.robot.base import Robot
 from common.robot.motion_distortion import correct_scan
 from common.runtime import safety
 from services.controller.docking import STANDING_TIME_S, Docking
+from services.controller.explorer import Explorer
 from services.controller.goal_state import GoalState
 from services.controller.manual_drive import ManualDrive
 from services.controller.policies.decision import Decision, Policy
@@ -24,6 +25,8 @@ from services.controller.velocity_command import VelocityCommand
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.geometry.world import World
+    from services.controller.growing_map import PlannedMap
+    from services.controller.policies.exploration import Survey, View
 
 
 @dataclass
@@ -42,6 +45,10 @@ class Navigator:
         self._command = VelocityCommand(self.robot)
         self._manual = ManualDrive()
         self._docking: Docking | None = None  # if the goal has an approach direction
+        self._map: PlannedMap | None = None  # the mapper's, if there is one
+        self._pose: Array | None = None  # (3,) base_link in map, of the latest belief that tracks
+        self.explorer: Explorer | None = None  # the last exploration, unless it was cancelled
+        self._view_due = False  # the exploration is to choose a view
         self._scan: Scan | None = None
         self._scan_points = np.zeros((0, 2))  # m in base_link
 
@@ -56,7 +63,50 @@ class Navigator:
         self._manual.update(drive, max(self.scan_stamp or 0, self._command.stamp_ns or 0))
 
     def on_goal(self, goal: Goal) -> None:
-        """Replace the goal, cancel it, or refuse it if it is known that it cannot be reached."""
+        """Replace the goal, cancel it, or refuse it if it is known that it cannot be reached. Or begin to explore."""
+        if goal.cancel or goal.explore or self.explorer is None or not self.explorer.active:
+            self.explorer = None
+        else:
+            self.explorer.pause()
+        if goal.explore and not goal.cancel:
+            self._explore(goal)
+        else:
+            self._set_goal(goal)
+
+    def _explore(self, request: Goal) -> None:
+        self.policy.set_goal(None)
+        if self._map is None or self._pose is None:
+            self.goal_state.start(
+                request, "cannot explore without a mapper's map: does a mapper run, and do scans arrive?"
+            )
+            return
+        self.goal_state.cancel()
+        self.explorer, self._view_due = Explorer(request.seq, self._pose, self._map), True
+
+    def on_map(self, planned: PlannedMap) -> None:
+        """Explore in a new version of the mapper's map; the policy gets it from the caller."""
+        self._map = planned
+        if self.explorer is not None:
+            self.explorer.map = planned
+            self._view_due = self.explorer.drives
+
+    def take_survey(self) -> Survey | None:
+        """If the exploration is to choose a view now: what the choice depends on. The answer goes to `use_view`."""
+        due, self._view_due = self._view_due, False
+        if not due or self.explorer is None or self._map is None or self._scan is None or not self.explorer.drives:
+            return None
+        from services.controller.policies.exploration import ScannerView  # compiles
+
+        return self.explorer.survey(ScannerView.of(self._scan, self._map.message.grid.resolution))
+
+    def use_view(self, view: View | None, survey: Survey) -> None:
+        """Drive to the view that was chosen, or back to the start if there is none."""
+        if self.explorer is not None and self.explorer.drives:
+            goal = self.explorer.next_goal(view, survey.view.sector.half)
+            if goal is not None:
+                self._set_goal(goal)
+
+    def _set_goal(self, goal: Goal) -> None:
         self._docking = None if goal.approach is None or goal.cancel else Docking(goal, self.robot)
         if goal.cancel:
             self.goal_state.cancel()
@@ -83,6 +133,10 @@ class Navigator:
         pose, manual_twist = belief.pose.array(), self._manual.twist(belief.stamp_ns)
         self._resume_after_pause(belief.stamp_ns)
         self.decision = Decision()
+        if belief.state == "tracking":
+            self._pose = pose
+        if self.explorer is not None:
+            self.explorer.move(pose)
         if self._scan is not None and self._scan.stamp_ns == belief.stamp_ns:
             self.policy.observe(self._scan, belief)
         if manual_twist is not None:
@@ -91,14 +145,16 @@ class Navigator:
         distance = None if goal is None else float(np.hypot(*(goal.pose.array() - pose)[:2]))
         if manual_twist is not None:
             command, _ = self._command.limit(belief.stamp_ns, manual_twist, self._scan_points)
-            return command, self._manual_status(belief.stamp_ns, distance)
+            return command, self._explained(self._manual_status(belief.stamp_ns, distance))
         desired = np.zeros(3)
         if goal is not None and distance is not None and self.goal_state.active:
             desired = self._goal_velocity(belief, pose, goal, distance)
         command, limited_by_scan = self._command.limit(belief.stamp_ns, desired, self._scan_points)
         moving = is_moving(self._command.velocity)
         self.goal_state.update_progress(belief.stamp_ns, self.decision, moving=moving, limited_by_scan=limited_by_scan)
-        status = self.goal_state.status(belief.stamp_ns, distance)
+        if self.explorer is not None and self.explorer.needs_goal(self.goal_state, belief.stamp_ns):
+            self._view_due = True
+        status = self._explained(self.goal_state.status(belief.stamp_ns, distance))
         if (terms := self.decision.terms) is not None:
             status = status.model_copy(update={"energy": PolicyEnergy(**terms)})
         return command, status
@@ -146,6 +202,9 @@ class Navigator:
         reason = "driven by hand; the goal waits" if self.goal_state.active else "driven by hand"
         status = self.goal_state.status(stamp_ns, distance)
         return status.model_copy(update={"state": "manual", "reason": reason})
+
+    def _explained(self, status: Status) -> Status:
+        return status if self.explorer is None else self.explorer.explain(status)
 
     def _goal_velocity(self, belief: Belief, pose: Array, goal: Goal, distance: float) -> Array:
         """Velocity (3,) in base_link that the policy chooses, before any limit; updates the state of the goal."""

@@ -8,17 +8,32 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from common.geometry.world import load_world
-from common.messages.definitions import Belief, CmdVel, Drive, Goal, Plan, Pose, Preference, Scan, Stamped, Status
+from common.messages.definitions import Belief, CmdVel, Drive, Goal, Map, Plan, Pose, Preference, Scan, Stamped, Status
 from common.messages.requests import PredictReply, PredictRequest, Reply
-from common.messages.topics import BELIEF, CMD_VEL, DRIVE, GOAL, PLAN, PREDICT, PREFERENCE, SCAN, STATUS, Query, Topic
+from common.messages.topics import (
+    BELIEF,
+    CMD_VEL,
+    DRIVE,
+    GOAL,
+    MAP,
+    PLAN,
+    PREDICT,
+    PREFERENCE,
+    SCAN,
+    STATUS,
+    Query,
+    Topic,
+)
 from common.runtime.service import Service
+from services.controller.background_job import BackgroundJob
 from services.controller.belief_wait import Answered, AwaitsPredictions, AwaitsScan, BeliefWait, NoBelief
 from services.controller.navigator import Navigator
-from services.controller.policies.manual import ManualPolicy
 from services.controller.policies.paper_action import ActionParameters
 from services.controller.settings import ControllerSettings
 
 if TYPE_CHECKING:
+    from services.controller.growing_map import PlannedMap
+    from services.controller.policies.exploration import Survey, View
     from services.controller.policies.geodesic_field import CostField
     from services.controller.policies.planner import GeodesicPolicy
 
@@ -40,7 +55,7 @@ def preference_message(field: CostField, goal: Goal, stamp_ns: int) -> Preferenc
         resolution=grid.resolution,
         width=columns,
         height=rows,
-        distance=field.cost.ravel().astype(np.float32),
+        distance=np.where(field.graph.free.unknown, np.inf, field.cost).ravel().astype(np.float32),
     )
 
 
@@ -55,7 +70,7 @@ class ControllerService(Service):
     name: ClassVar[str] = "controller"
     single: ClassVar[bool] = True
     restores_latched: ClassVar[tuple[Topic, ...]] = (GOAL, STATUS)
-    inputs: ClassVar[tuple[Topic, ...]] = (SCAN, BELIEF, GOAL, DRIVE)
+    inputs: ClassVar[tuple[Topic, ...]] = (SCAN, BELIEF, GOAL, DRIVE, MAP)
 
     settings: ControllerSettings
 
@@ -63,6 +78,9 @@ class ControllerService(Service):
         super().__init__(settings)
         self.navigator = Navigator()
         self.geodesic: GeodesicPolicy | None = None  # the policy if the preset is `geodesic`
+        self._map: PlannedMap | None = None  # the mapper's, if the policy plans in it
+        self._map_job: BackgroundJob[PlannedMap] = BackgroundJob(self._wake)
+        self._view_job: BackgroundJob[tuple[View | None, Survey]] = BackgroundJob(self._wake)
         self.self_filter = settings.build_self_filter()
         self._wait: BeliefWait = NoBelief()
         self._belief_received_s = 0.0  # time.monotonic() of the latest belief
@@ -79,18 +97,17 @@ class ControllerService(Service):
         settings.check()
         robot = settings.build_robot()
         world = None
-        if settings.world and settings.preset != "manual":
+        if settings.world:
             self.log.info("loading the world", world=settings.world)
             world = load_world(settings.world)
-        if settings.preset == "geodesic" and world is not None:
+        if settings.preset == "geodesic":
             # scipy takes a third of a second to import, and preset paper does not need it.
             from services.controller.policies.planner import GeodesicPolicy
 
             keep_heading = settings.heading == "keep"
             self.geodesic = GeodesicPolicy(robot, world, keep_heading=keep_heading, epistemic=settings.epistemic)
         parameters = ActionParameters(gamma=settings.gamma)
-        policy = ManualPolicy() if settings.preset == "manual" else self.geodesic
-        self.navigator = Navigator(robot, parameters, world, policy)
+        self.navigator = Navigator(robot, parameters, world, self.geodesic)
         # Declare the publishers now: the first message on a key that was just declared may be lost.
         for topic in (STATUS, CMD_VEL, PLAN, PREFERENCE):
             self.loop.bus.publisher(topic, self.name)
@@ -98,7 +115,7 @@ class ControllerService(Service):
     def on_restored(self, last: dict[Topic, Stamped]) -> None:
         """Resume the goal of the previous controller instance, if it was still under way."""
         goal, status = last.get(GOAL), last.get(STATUS)
-        if not isinstance(goal, Goal) or not isinstance(status, Status) or goal.cancel:
+        if not isinstance(goal, Goal) or not isinstance(status, Status) or goal.cancel or goal.explore:
             return
         if self.navigator.goal_state.goal is not None:
             return  # a new goal has arrived already
@@ -115,11 +132,24 @@ class ControllerService(Service):
             self.navigator.on_drive(message)
         elif isinstance(message, Goal):
             self.navigator.on_goal(message)
-            self.log.info("goal", x=message.pose.x, y=message.pose.y, cancel=message.cancel)
+            self.log.info("goal", x=message.pose.x, y=message.pose.y, cancel=message.cancel, explore=message.explore)
             stamp_ns = self._last_answer[0] if self._last_answer else 0
             self.publish(STATUS, self.navigator.goal_state.status(stamp_ns, None))
         elif isinstance(message, Belief):
             self._on_belief(message)
+        elif isinstance(message, Map) and self.geodesic is not None and not self.settings.world:
+            from services.controller.growing_map import PlannedMap
+
+            radius = self.geodesic.robot.radius
+            self._map_job.submit(lambda: PlannedMap.of(message, radius))
+
+    def close(self) -> None:
+        """Wait for the threads."""
+        self._map_job.close()
+        self._view_job.close()
+
+    def _wake(self) -> None:
+        self.loop.inbox.wake()
 
     def _on_scan(self, scan: Scan) -> None:
         self.navigator.on_scan(self.self_filter.mask_for_planning(scan))
@@ -178,6 +208,7 @@ class ControllerService(Service):
         self._wait = Answered()
         began = time.thread_time_ns()
         answer = self.navigator.step(belief)
+        self._choose_view()
         took_us = (time.thread_time_ns() - began + cpu_ns) // 1000
         self.counters["steps"] += 1
         self.counters["step_us"] += took_us
@@ -192,6 +223,10 @@ class ControllerService(Service):
         self._publish_plan(command.stamp_ns)
 
     def due(self) -> float | None:
+        """Seconds until the deadline of the present wait, 0 if a job is done; None if there is nothing to wait for."""
+        return 0.0 if self._map_job.ready or self._view_job.ready else self._deadline()
+
+    def _deadline(self) -> float | None:
         """Seconds until the deadline of the present wait; None before the first belief, and after a timeout."""
         if isinstance(self._wait, NoBelief):
             return None
@@ -201,7 +236,13 @@ class ControllerService(Service):
         return deadline_s - time.monotonic()
 
     def on_timer(self) -> None:
-        """Process the belief that has waited too long for its scan; otherwise stop the robot, as no belief comes."""
+        """Use the result of a job; at a deadline, process the belief that waits for its scan, or stop the robot."""
+        if self._map_job.ready:
+            self._use_map(self._map_job.take())
+            return
+        if self._view_job.ready:
+            self.navigator.use_view(*self._view_job.take())
+            return
         if isinstance(self._wait, AwaitsScan):
             self._process(self._wait.belief)
             return
@@ -211,6 +252,20 @@ class ControllerService(Service):
         self.log.warning("stopping the robot", reason=reason)
         self.counters["belief_timeouts"] += 1
         self._send(*self.navigator.stop_without_belief(stamp_ns, reason))
+
+    def _use_map(self, planned: PlannedMap) -> None:
+        assert self.geodesic is not None  # noqa: S101 - it plans in the map
+        self.geodesic.use_map(planned.graph, jumped=self._map is not None and planned.jumped_from(self._map))
+        self._map = planned
+        self.navigator.on_map(planned)
+        self._choose_view()
+
+    def _choose_view(self) -> None:
+        """If the exploration is to choose a view, do so in a thread."""
+        if (survey := self.navigator.take_survey()) is not None:
+            from services.controller.policies.exploration import choose_view
+
+            self._view_job.submit(lambda: (choose_view(survey), survey))
 
     def _send(self, command: CmdVel, status: Status) -> None:
         self.publish(STATUS, status)

@@ -19,6 +19,7 @@ class ControllerSettings(SelfFilterSettings):
       python -m services.controller --drive differential --radius 0.105 --max-speed 0.22    a TurtleBot 3
       python -m services.controller --preset paper       straight to the goal, as in the paper
       python -m services.controller --preset paper --world ''    without a map
+      python -m services.controller --world ''           in the map that the mapper builds
       presage goal 15 1.5                                sends a goal to the controller
 
     """
@@ -27,14 +28,14 @@ class ControllerSettings(SelfFilterSettings):
 
     world: Annotated[
         str,
-        Field(description="the map: a shipped world, a world file or a ROS map.yaml; may be empty with preset paper"),
+        Field(
+            description="the map: a shipped world, a world file or a ROS map.yaml; if empty, the growing map of the "
+            "mapper (preset geodesic) or none (preset paper)"
+        ),
     ] = "corridor"
     preset: Annotated[
-        Literal["geodesic", "paper", "manual"],
-        Field(
-            description="geodesic: around walls and obstacles in the scan; paper: straight to the goal (equation 4); "
-            "manual: only by hand, without a map"
-        ),
+        Literal["geodesic", "paper"],
+        Field(description="geodesic: around walls and obstacles in the scan; paper: straight to the goal (equation 4)"),
     ] = "geodesic"
     heading: Annotated[
         Literal["travel", "keep"],
@@ -50,8 +51,6 @@ class ControllerSettings(SelfFilterSettings):
         """Raise UserError if settings contradict each other."""
         self.build_robot()
         self.build_self_filter()
-        if self.preset == "geodesic" and not self.world:
-            raise UserError("preset geodesic needs a map: give --world, or use --preset paper")
         if self.preset == "paper" and self.drive != "holonomic":
             raise UserError(
                 "preset paper moves without turning, which only a holonomic robot can: give --drive holonomic, or use "

@@ -107,7 +107,7 @@ class EstimatorService(Service):
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
         """Processes a scan; stores goal, odometry and command for the scans after it."""
         if isinstance(message, Goal):
-            self.goal = None if message.cancel else message
+            self.goal = None if message.cancel or message.explore else message
         elif isinstance(message, CmdVel):
             self.command = message
         elif isinstance(message, Odom):

@@ -84,6 +84,7 @@ class Control:
         self._handlers: dict[type[requests.Action], Callable[[str, Any], ActionResult]] = {
             requests.GoTo: self._goal,
             requests.Cancel: self._cancel,
+            requests.Explore: self._explore,
             requests.Teleport: self._teleport,
             requests.Localise: self._localise,
             requests.EditObstacle: self._obstacle,
@@ -145,11 +146,25 @@ class Control:
             raise UserError(status.reason)
         return ActionResult(ok=True, reason=f"going to ({action.x:.2f}, {action.y:.2f})")
 
+    def _explore(self, robot: str, _action: requests.Explore) -> ActionResult:
+        self._check_subscriber(robot, GOAL, "controller")
+        stamp_ns, seq = self._lookup.stamp_ns(robot), time.time_ns()
+        goal = Goal(stamp_ns=stamp_ns, seq=seq, pose=Pose(x=0.0, y=0.0), explore=True)
+        self._bus.put(GOAL, goal.encode(), key=GOAL.key(robot))
+        status = self._wait_for_status(
+            robot, lambda status: seq in {status.goal_seq, status.exploration.seq if status.exploration else None}
+        )
+        if status is None:
+            raise UserError(f"the controller did not begin to explore within {ANSWER_TIMEOUT_S:g} s")
+        if status.exploration is None:
+            raise UserError(status.reason)
+        return ActionResult(ok=True, reason="exploring until nothing is left to see; goals take precedence")
+
     def _cancel(self, robot: str, _action: requests.Cancel) -> ActionResult:
         self._check_subscriber(robot, GOAL, "controller")
         goal = Goal(stamp_ns=self._lookup.stamp_ns(robot), seq=time.time_ns(), pose=Pose(x=0.0, y=0.0), cancel=True)
         self._bus.put(GOAL, goal.encode(), key=GOAL.key(robot))
-        if self._wait_for_status(robot, lambda status: status.goal is None) is None:
+        if self._wait_for_status(robot, lambda status: status.goal is None and status.exploration is None) is None:
             raise UserError(f"the controller did not cancel the goal within {ANSWER_TIMEOUT_S:g} s")
         return ActionResult(ok=True, reason="goal cancelled")
 

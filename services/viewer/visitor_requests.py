@@ -55,6 +55,12 @@ class Cancel(Action):
     do: Literal["cancel"]
 
 
+class Explore(Action):
+    """Explore the unknown space around the map, and return."""
+
+    do: Literal["explore"]
+
+
 class Teleport(Action):
     """Teleport the robot."""
 
@@ -156,6 +162,7 @@ ACTIONS = (
     Watch,
     GoTo,
     Cancel,
+    Explore,
     Teleport,
     Localise,
     EditObstacle,

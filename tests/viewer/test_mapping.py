@@ -14,11 +14,11 @@ def start_mapping(processes):
     environment = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{port}", "PRESAGE_ROBOT": "robot"}
     processes.start("simulator", "--world", "office", "--hide-world", env=environment)
     processes.start("mapper", env=environment)
-    processes.start("controller", "--preset", "manual", env=environment)
+    processes.start("controller", "--world=", env=environment)
     return processes.start("viewer", "--port", "0", env=environment), environment
 
 
-def test_drive_and_save(browser, processes):
+def test_drive_explore_and_save(browser, processes):
     from tests.viewer.browser import visit  # without playwright these tests are skipped
 
     viewer, _ = start_mapping(processes)
@@ -31,6 +31,15 @@ def test_drive_and_save(browser, processes):
     seen.page.keyboard.down("ArrowUp")
     seen.wait("store.map.path.length > arg", 60, count)
     seen.page.keyboard.up("ArrowUp")
+
+    seen.page.locator("#explore").click()
+    seen.toast("exploring")
+    count = seen.see("store.map.path.length")
+    seen.wait("store.frame.status.exploration?.phase === 'exploring' && store.map.path.length > arg", 60, count)
+    seen.wait("document.querySelector('#explore-label').textContent === 'Stop'")
+    seen.page.locator("#explore").click()
+    seen.toast("goal cancelled")
+    seen.wait("store.frame.status.exploration === null && store.frame.status.state === 'idle'", 30)
 
     save = seen.page.locator("#save-map")
     save.locator("input").fill("here")

@@ -109,11 +109,16 @@ class ActiveLocaliser:
         """Keep ``min_point_distance`` m from the robot's centre to scan points; ``may_turn``: the heading is free."""
         self.may_turn = may_turn
         self.robot = robot.model_copy(update={"max_speed": min(robot.max_speed, MAX_SPEED)})
-        self.graph, self.min_point_distance = graph, min_point_distance
+        self.min_point_distance = min_point_distance
+        self.use_graph(graph)
+        self.reset()
+
+    def use_graph(self, graph: FreeSpaceGraph) -> None:
+        """Plan in another map."""
+        self.graph = graph
         area = float((graph.free.clearance > 0).sum()) * graph.grid.resolution**2
         # Of a pose of which nothing is known, at the resolution of the pose.
         self._unknown_entropy = float(np.log(max(1.0, 2 * np.pi * area / np.sqrt(np.linalg.det(efe.RESOLUTION)))))
-        self.reset()
 
     def reset(self) -> None:
         """Forget everything. Call it when the pose is known, or the goal has changed."""

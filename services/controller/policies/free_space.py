@@ -8,12 +8,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from common.geometry.occupancy_grid import OCCUPIED, UNKNOWN
+
 if TYPE_CHECKING:
+    from common.geometry.occupancy_grid import OccupancyGrid
     from common.geometry.se2 import Array
     from common.geometry.world import World
 
 RESOLUTION_M = 0.1
 MAX_CELLS = 2_000_000  # a world that would need more cells gets larger ones
+MAX_CLEARANCE_M = 3.0  # in a growing map; computing larger ones would take long
 
 
 @dataclass(frozen=True)
@@ -79,13 +83,33 @@ class FreeSpace:
 
     grid: Grid
     clearance: Array  # (rows, columns) m from a cell's centre to the nearest wall; negative inside walls
+    unknown: npt.NDArray[np.bool_]  # (rows, columns) whether nothing is known about a cell
 
     @classmethod
     def of(cls, world: World, resolution: float = RESOLUTION_M) -> FreeSpace:
         """Free space of a world; clearances are exact at the cell centres."""
         grid = Grid.over(world, resolution)
         centres = grid.centres().reshape(*grid.shape, 2)
-        return cls(grid, world.clearances(centres[0, :, 0], centres[:, 0, 1]))
+        return cls(grid, world.clearances(centres[0, :, 0], centres[:, 0, 1]), np.zeros(grid.shape, bool))
+
+    @classmethod
+    def of_map(cls, cells: OccupancyGrid) -> FreeSpace:
+        """Free space of a map that is still growing. Only occupied cells are walls; its yaw must be 0.
+
+        A cell of the result is a square of cells of the map, and unknown if none of these is known.
+        """
+        factor = max(1, round(RESOLUTION_M / cells.resolution))
+        values = np.pad(
+            cells.values,
+            [(0, -cells.height % factor), (0, -cells.width % factor)],
+            constant_values=UNKNOWN,
+        )
+        shape = (values.shape[0] // factor, values.shape[1] // factor)
+        grid = Grid(cells.origin[:2], factor * cells.resolution, shape)
+        known = (values != UNKNOWN).reshape(shape[0], factor, shape[1], factor).any(axis=(1, 3))
+        centres = grid.centres().reshape(*shape, 2)
+        clearance = cells.shapes.lattice_distances(OCCUPIED, centres[0, :, 0], centres[:, 0, 1], MAX_CLEARANCE_M)
+        return cls(grid, clearance, ~known)
 
     def clearance_at(self, points: Array) -> Array:
         """Interpolated distance (...,) m from points (..., 2) m in map to the nearest wall."""
@@ -96,3 +120,7 @@ class FreeSpace:
         step = self.grid.resolution / 2 * np.eye(2)
         slope = np.stack([self.clearance_at(points + e) - self.clearance_at(points - e) for e in step], axis=-1)
         return np.asarray(slope / np.maximum(np.hypot(slope[..., 0], slope[..., 1]), 1e-9)[..., None])
+
+
+# Nowhere is free.
+NO_MAP = FreeSpace(Grid((0.0, 0.0), RESOLUTION_M, (1, 1)), np.full((1, 1), -1.0), np.zeros((1, 1), bool))

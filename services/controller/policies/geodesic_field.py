@@ -29,6 +29,7 @@ WALL_GAP_M = 0.03  # minimum distance between footprint and wall, a little more 
 WALL_COST_RANGE_M = 0.35  # range of clearances beyond the minimum within which a metre costs more
 STOP_RANGE_M = 0.05  # and once more within this range, where noise in the scan makes the obstacle stop brake the robot
 MAX_WALL_COST = 1.0  # additional cost of a metre at the minimum clearance, for each of the two ranges
+UNKNOWN_COST = 30.0  # additional cost of a metre where nothing is known: a way through it is the last resort
 ATTRACTOR_RANGE_M = 3.0  # length of the path within which the attractor is chosen
 MAX_ATTRACTOR_CANDIDATES = 12
 MAX_LINE_COST_RATIO = 1.02  # cost of the straight line to the attractor, relative to the path on the grid
@@ -54,7 +55,7 @@ class FreeSpaceGraph:
         self._opposite[np.lexsort((self._to, self._from))] = np.lexsort((self._from, self._to))
         self._near_obstacles = np.zeros(self.grid.cells, bool)  # cells whose cost temporary obstacles may change
         self.slowness = np.zeros(self.grid.shape)  # cost of a metre in each cell
-        self._metre_cost = np.zeros(self.grid.cells)  # part of it that does not depend on clearance, above 1
+        self._metre_cost = UNKNOWN_COST * free.unknown.ravel()  # part of it that does not depend on clearance, above 1
         self._update_weights(~self._near_obstacles)
         _, self.component = connected_components(self._graph, directed=False)  # (cells,), without temporary obstacles
         self._centres = self.grid.centres()

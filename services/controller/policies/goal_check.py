@@ -13,11 +13,14 @@ def wall_refusal(world: World, goal: Array, radius: float) -> str | None:
     """The reason why a robot of ``radius`` m cannot stand at a goal (2,) m, or None if it can."""
     if world.has_room(goal, radius):
         return None
-    clearance = float(world.clearance(goal)[0])
-    problem = "is inside something, or off the map" if clearance < 0 else f"is {clearance:.2f} m from a wall"
-    return refusal_text(world, goal, problem)
+    return refusal_text(world.name, goal, near_wall(float(world.clearance(goal)[0])))
 
 
-def refusal_text(world: World, goal: Array, problem: str) -> str:
-    """The reason in `Status` for refusing a goal (2,) m."""
-    return f"goal refused: ({goal[0]:.2f}, {goal[1]:.2f}) in {world.name} {problem}"
+def near_wall(clearance: float) -> str:
+    """What is wrong with a goal ``clearance`` m from the nearest wall."""
+    return "is inside something, or off the map" if clearance < 0 else f"is {clearance:.2f} m from a wall"
+
+
+def refusal_text(world: str, goal: Array, problem: str) -> str:
+    """The reason in `Status` for refusing a goal (2,) m in the world of that name."""
+    return f"goal refused: ({goal[0]:.2f}, {goal[1]:.2f}) in {world} {problem}"

@@ -31,14 +31,28 @@ class TemporaryObstacles:
     """Grid cells in which beams ended although the map has no wall there."""
 
     def __init__(self, free: FreeSpace) -> None:
-        self._free = free
-        x0, y0 = free.grid.origin
-        self._origin = np.array([x0, y0])
-        self._columns = int(np.ceil(free.grid.shape[1] * free.grid.resolution / CELL_M)) + 1
+        self._use(free)
         # One entry per occupied cell.
         self._cells = np.zeros(0, np.int64)  # flat indices, sorted
         self._first_seen = np.zeros(0, np.int64)  # ns
         self._last_seen = np.zeros(0, np.int64)  # ns
+
+    def _use(self, free: FreeSpace) -> None:
+        self._free, self._origin = free, np.array(free.grid.origin)
+        self._columns = int(np.ceil(free.grid.shape[1] * free.grid.resolution / CELL_M)) + 1
+
+    def change_map(self, free: FreeSpace) -> None:
+        """Use another map of the same place. Obstacles that are walls in it are no longer obstacles."""
+        points, first, last = self.points(), self._first_seen, self._last_seen
+        self._use(free)
+        keep = self._unmapped(points)
+        # Where cells of the old grid share one of the new, the first one's times are kept.
+        self._cells, kept = np.unique(self._cell_of(points[keep]), return_index=True)
+        self._first_seen, self._last_seen = first[keep][kept], last[keep][kept]
+
+    def _unmapped(self, points: Array) -> npt.NDArray[np.bool_]:
+        """Whether points (K, 2) m lie on the map and far from its walls; (K,) bool."""
+        return self._free.grid.inside(points) & (self._free.clearance_at(points) > MIN_WALL_DISTANCE_M)
 
     def update(self, scan: Scan, pose: Array) -> None:
         """Add and remove cells according to a scan taken at a reliable pose (3,) of base_link in map."""
@@ -48,7 +62,7 @@ class TemporaryObstacles:
         hit = is_surface(ranges) & (ranges < MAX_RANGE_M)
         heading = laser[2] + angles[hit]
         ends = laser[:2] + ranges[hit, None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
-        unmapped = ends[self._free.grid.inside(ends) & (self._free.clearance_at(ends) > MIN_WALL_DISTANCE_M)]
+        unmapped = ends[self._unmapped(ends)]
         self._remove_cleared(scan, laser, scan.stamp_ns)
         self._add(np.unique(self._cell_of(unmapped)), scan.stamp_ns)
 

@@ -16,9 +16,9 @@ from common.runtime import safety
 from services.controller.policies import expected_free_energy as efe
 from services.controller.policies.active_localisation import ActiveLocaliser, CandidateMotions
 from services.controller.policies.decision import Decision, State
-from services.controller.policies.free_space import FreeSpace
+from services.controller.policies.free_space import NO_MAP, FreeSpace
 from services.controller.policies.geodesic_field import WALL_COST_RANGE_M, CostField, FreeSpaceGraph
-from services.controller.policies.goal_check import refusal_text, wall_refusal
+from services.controller.policies.goal_check import near_wall, refusal_text, wall_refusal
 from services.controller.policies.motion_model import STEP_S, delay_until_effect, is_moving, turn_to_attractor
 from services.controller.policies.obstacles import TemporaryObstacles
 from services.controller.policies.policy_selection import PoseBelief, Surroundings, least_distance, select_policy
@@ -45,15 +45,18 @@ OBSTACLE_RANGE_M = 3.0  # obstacles farther from the robot do not matter to its 
 class GeodesicPolicy:
     """Preset `geodesic`: drives around the walls of a map and around obstacles in the scan."""
 
-    def __init__(self, robot: Robot, world: World, *, keep_heading: bool = False, epistemic: bool = True) -> None:
-        """Build the graph of the world.
+    def __init__(
+        self, robot: Robot, world: World | None, *, keep_heading: bool = False, epistemic: bool = True
+    ) -> None:
+        """Build the graph of the world, or without a world wait for a map (`use_map`).
 
         ``keep_heading``: a holonomic base does not turn into its direction of motion. ``epistemic``: policies are also
         judged by the information that they gain; otherwise the robot drives on as if the best hypothesis were true.
         """
-        self.epistemic = epistemic
+        # Where the map is unknown, so is what a scan tells there.
+        self.epistemic = epistemic and world is not None
         self.robot, self.world, self.keep_heading = robot, world, keep_heading
-        self.free = FreeSpace.of(world)
+        self.free = NO_MAP if world is None else FreeSpace.of(world)
         self.graph = FreeSpaceGraph(self.free, robot.radius)
         self.obstacles = TemporaryObstacles(self.free)
         self.localiser = ActiveLocaliser(robot, self.graph, robot.radius + OBSTACLE_GAP_M, may_turn=not keep_heading)
@@ -76,17 +79,43 @@ class GeodesicPolicy:
 
     def refusal(self, goal: Array) -> str | None:
         """The reason why a goal (2,) m cannot be reached by the map, with the nearest place that can, or None."""
-        refusal = wall_refusal(self.world, goal, self.robot.radius)
+        if self.free is NO_MAP:
+            return "goal refused: there is no map yet; does the mapper run, and do scans arrive?"
+        refusal = self._wall_refusal(goal)
         if refusal is None:
             cell = self.graph.nearest_free(goal, self.robot.radius, map_only=True)
             if cell is not None and self._component in (None, self.graph.component[cell]):
                 return None
-            refusal = refusal_text(self.world, goal, "cannot be reached from here")
+            refusal = refusal_text(self._map_name, goal, "cannot be reached from here")
         nearest = self.graph.nearest_free(goal, component=self._component, map_only=True)
         if nearest is None:
             return refusal
         x, y = self.free.grid.centres([nearest])[0]
         return f"{refusal}; the nearest place that can be reached is ({x:.2f}, {y:.2f})"
+
+    @property
+    def _map_name(self) -> str:
+        return "the map so far" if self.world is None else self.world.name
+
+    def _wall_refusal(self, goal: Array) -> str | None:
+        """The reason why the robot cannot stand at a goal (2,) m, or None if it can."""
+        if self.world is not None:
+            return wall_refusal(self.world, goal, self.robot.radius)
+        clearance = float(self.free.clearance_at(goal)) if self.free.grid.inside(goal) else -1.0
+        if clearance >= self.robot.radius:
+            return None
+        return refusal_text(self._map_name, goal, near_wall(clearance))
+
+    def use_map(self, graph: FreeSpaceGraph, *, jumped: bool) -> None:
+        """Plan in a new version of the mapper's map; with ``jumped`` it does not fit what was seen so far."""
+        self.free, self.graph = graph.free, graph
+        if jumped:
+            self.obstacles = TemporaryObstacles(self.free)
+        else:
+            self.obstacles.change_map(self.free)
+        self.localiser.use_graph(graph)
+        self.field = self._component = self._vetted_component = None
+        self._planned = (-REPLAN_PERIOD_NS, np.zeros(0, int))
 
     def set_goal(self, goal: Array | None) -> None:
         """Set the goal (2,) m in map, or none."""
@@ -281,7 +310,7 @@ class GeodesicPolicy:
             reason = f"{distance:.2f} m from the goal, {self._hindrance(pose, surroundings, standing=True)}"
             return Decision(reason=reason, state="blocked", path=path) if arrived else None
         problem = f"is too near to a wall: stopped {distance:.2f} m from it"
-        reason = refusal_text(self.world, self._goal, problem)
+        reason = refusal_text(self._map_name, self._goal, problem)
         return Decision(reason=reason, state="blocked", path=path, refused=True) if arrived or stuck else None
 
     def _back_off(self, pose: Array, velocity: Array, surroundings: Surroundings, path: Array) -> Decision:

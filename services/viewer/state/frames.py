@@ -121,12 +121,14 @@ def status_of(status: Status | None, goals: Mapping[int, Goal]) -> Json | None:
     if goal is not None and message is not None and message.pose == status.goal:
         goal |= {"tolerance": message.tolerance, "yaw_tolerance": message.yaw_tolerance}
     energy = None if status.energy is None else status.energy.model_dump()
+    exploration = None if status.exploration is None else status.exploration.model_dump(exclude={"seq"})
     return {
         "state": status.state,
         "reason": status.reason[:500],
         "distance": status.distance,
         "goal": goal,
         "energy": energy,
+        "exploration": exploration,
     }
 
 

@@ -65,5 +65,5 @@ def test_a_world_without_a_model(tmp_path):
         plan(str(path))
     plan(str(path), estimator=["--model", "exact"])
     planned = plan(str(path), mapping=True)
-    assert "--preset=manual" in planned.controller
+    assert "--world=" in planned.controller
     assert "--hide-world" in planned.simulator

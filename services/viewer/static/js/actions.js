@@ -33,6 +33,10 @@ export class Actions {
     return this.ask("cancel", {}, "Goal cancelled");
   }
 
+  explore() {
+    return this.ask("explore", {}, "Exploring");
+  }
+
   teleport(pose) {
     return this.ask("teleport", neat(pose), `Carried to ${at(pose)}; the estimator is not informed`);
   }

@@ -105,10 +105,7 @@ function takeMap(map) {
   const first = !store.map;
   Object.assign(store, { map, world: map.world });
   if (first || view.camera.fitted) view.fit();
-  if (first) {
-    modes.set("look"); // no goal can be set before there is a map
-    redraw();
-  }
+  if (first) redraw();
   view.invalidate();
 }
 

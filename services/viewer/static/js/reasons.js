@@ -22,7 +22,10 @@ export class Reasons {
   get now() {
     const { frame, missing, connected, stoppedAt } = this.store, status = frame?.status;
     if (!connected || missing.some((one) => one.name === "controller")) return null;
-    if (status && status.state in TOLD) return [status.state, `${TOLD[status.state]}:`, status.reason || "no reason given"];
+    if (status && status.state in TOLD) {
+      const done = status.exploration ? `; ${status.exploration.area.toFixed(0)} m² mapped, ${status.exploration.path.toFixed(0)} m driven` : "";
+      return [status.state, `${TOLD[status.state]}:`, (status.reason || "no reason given") + done];
+    }
     if (frame?.truth?.contact) return ["lost", "Contact:", "the robot touches something"];
     if (frame?.truth?.stopped && performance.now() - stoppedAt > HELD_BACK) {
       return ["blocked", "Obstacle stop:", "an obstacle is too close ahead; the robot's safety stop holds the wheels"];

@@ -18,6 +18,7 @@ export class Toolbar {
     $("reset").addEventListener("click", () => actions.reset());
     $("speed").addEventListener("change", () => actions.speed(Number($("speed").value)));
     $("localise").addEventListener("click", () => actions.localise());
+    $("explore").addEventListener("click", () => (this.exploring ? actions.cancel() : actions.explore()));
     $("record").addEventListener("click", () => actions.record(actions.recording ? "stop" : "start"));
     $("sub").addEventListener("submit", (event) => {
       event.preventDefault();
@@ -38,6 +39,11 @@ export class Toolbar {
     return this.store.paused || (last !== undefined && performance.now() - last > 1500);
   }
 
+  /** Whether the robot explores, or goes on with it after a goal. */
+  get exploring() {
+    return ["exploring", "returning"].includes(this.store.frame?.status?.exploration?.phase);
+  }
+
   togglePause() {
     this.actions.pause(!this.standing);
   }
@@ -50,8 +56,10 @@ export class Toolbar {
     for (const id of ["pause", "step", "reset", "speed", "localise", "record"]) $(id).disabled = !can;
     for (const button of document.querySelectorAll("[data-mode]")) button.disabled = !can && button.dataset.mode !== "look";
     $("open").disabled = !store.connected || !store.control;
-    $("save-map").hidden = !store.map;
-    $("save-button").disabled = !can;
+    $("explore-group").hidden = $("save-map").hidden = !store.map;
+    $("explore").disabled = $("save-button").disabled = !can;
+    $("explore").setAttribute("aria-pressed", String(this.exploring));
+    setText($("explore-label"), this.exploring ? "Stop" : "Explore");
     $("step").disabled = !can || !this.standing;
     setIcon($("pause"), this.standing ? "i-play" : "i-pause");
     setText($("pause-label"), this.standing ? "Resume" : "Pause");

@@ -1,0 +1,1 @@
+"""Exploration of unknown buildings, compared with a frontier explorer."""

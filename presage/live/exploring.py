@@ -1,0 +1,68 @@
+"""`presage explore`: begins an exploration, shows its progress, and stops the robot on Ctrl-C."""
+
+from __future__ import annotations
+
+import time
+
+from rich.console import Console
+
+from common.bus.bus import Link
+from common.errors import UserError
+from common.messages.definitions import Exploration, Goal, Pose, Status
+from common.messages.topics import GOAL, STATUS
+from presage.live.bus_watch import Watch, session
+from presage.session.stack import ignoring_interrupts
+
+ANSWER_TIMEOUT_S = 3.0
+STATUS_TIMEOUT_S = 30.0  # long enough to restart the mapper meanwhile
+
+
+def explore(link: Link, console: Console) -> int:
+    """Explores until everything that can be reached is mapped; returns 0 then, and 1 if the robot cannot get back."""
+    with session(link) as bus:
+        watch = Watch(bus, STATUS)
+        if not bus.wait_matching(GOAL, ANSWER_TIMEOUT_S):
+            raise UserError("no controller receives goals: is it running?")
+        request = Goal(stamp_ns=0, seq=time.time_ns(), pose=Pose(x=0.0, y=0.0), explore=True)
+        try:
+            bus.put(GOAL, request.encode())
+            return _follow(watch, request.seq, console)
+        except KeyboardInterrupt:
+            with ignoring_interrupts():
+                _stop(watch, request)
+                console.print("stopped; the map is kept")
+            raise
+
+
+def _follow(watch: Watch, seq: int, console: Console) -> int:
+    status = watch.until(Status, lambda s: _progress(s, seq) is not None or s.goal_seq == seq, ANSWER_TIMEOUT_S)
+    if status is None:
+        raise UserError("the controller did not begin to explore within 3 s: `presage doctor` finds the cause")
+    began_ns = status.stamp_ns
+    with console.status("exploring") as line:
+        while status is not None:
+            progress = _progress(status, seq)
+            if progress is None:
+                raise UserError(status.reason if status.refused else "the exploration was cancelled")
+            so_far = f"{progress.area:.0f} m² mapped, {progress.path:.1f} m driven"
+            line.update(f"{progress.phase}: {so_far}; {status.state} {status.reason}")
+            if progress.phase == "finished":
+                seconds = (status.stamp_ns - began_ns) * 1e-9
+                console.print(f"finished: {so_far} in {seconds:.0f} s; the robot is back where it began")
+                return 0
+            if progress.phase == "failed":
+                console.print(f"the robot cannot return to where it began: {status.reason}; {so_far}")
+                return 1
+            status = watch.until(Status, lambda _: True, STATUS_TIMEOUT_S)
+    raise UserError(f"the controller has published no status for {STATUS_TIMEOUT_S:g} s")
+
+
+def _progress(status: Status, seq: int) -> Exploration | None:
+    """The progress of the exploration with this number; None if the status is about another, or none."""
+    return status.exploration if status.exploration is not None and status.exploration.seq == seq else None
+
+
+def _stop(watch: Watch, request: Goal) -> None:
+    """Ends the exploration, and waits until the controller confirms it."""
+    watch.bus.put(GOAL, request.model_copy(update={"cancel": True}).encode())
+    watch.until(Status, lambda status: status.exploration is None and status.state == "idle", ANSWER_TIMEOUT_S)

@@ -1,0 +1,156 @@
+"""Exploration of an unknown building: which goal comes next, until nothing is left to see and the robot is back.
+
+| from | event | to |
+|---|---|---|
+| - | a goal with `explore` | EXPLORING |
+| EXPLORING, RETURNING | a view is worth the way | EXPLORING |
+| EXPLORING, RETURNING | no view is | RETURNING |
+| RETURNING | the robot has arrived | FINISHED |
+| RETURNING | the way back is refused, or the robot does not get on | FAILED |
+
+A goal of a user pauses it until `PAUSE_NS` after that goal was reached, refused or cancelled.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from common.geometry import se2
+from common.messages.definitions import Exploration, Goal, Pose, Status
+from services.controller.goal_state import Phase
+
+if TYPE_CHECKING:
+    from common.geometry.se2 import Array
+    from services.controller.goal_state import GoalState
+    from services.controller.growing_map import PlannedMap
+    from services.controller.policies.exploration import ScannerView, Survey, View
+
+PAUSE_NS = 2_000_000_000  # for which the robot stands at a goal of a user
+STALLED_NS = 8_000_000_000  # without a motion of STALLED_M after which a place counts as unreachable
+STALLED_M = 0.2
+VIEW_TOLERANCE_M = 0.1
+HOME_TOLERANCE_M = 0.005
+SAME_PLACE_M = 0.1  # a view this close to the present goal is the same
+
+
+class Explorer:
+    """One exploration: chooses the robot's goals."""
+
+    def __init__(self, seq: int, pose: Array, planned: PlannedMap) -> None:
+        """Begin at a pose (3,) in a map; ``seq`` is the number of the request."""
+        self.seq, self.map = seq, planned
+        self.phase: Literal["exploring", "returning", "finished", "failed"] = "exploring"
+        self.goal: Goal | None = None  # its own goal
+        self.paused = False  # the goal of a user takes precedence
+        self.path_m = 0.0
+        self._pose = pose
+        # Relative to the last key scan, so that it moves with the map when a loop closes.
+        self._home_key = len(planned.message.poses) - 1
+        self._home = se2.between(planned.message.poses[self._home_key], pose)
+        self._arrivals = np.zeros((0, 3))
+        self._unreachable = np.zeros((0, 2))
+        self._over_since_ns: int | None = None  # stamp since which the goal of a user is over
+        self._progress = pose, 0  # where and when (ns) the robot last got on; 0 while it need not
+
+    @property
+    def active(self) -> bool:
+        """Whether there is something left to do."""
+        return self.phase in {"exploring", "returning"}
+
+    @property
+    def drives(self) -> bool:
+        """Whether the robot's goals are those of the exploration."""
+        return self.active and not self.paused
+
+    @property
+    def home(self) -> Array:
+        """Where exploration began, (3,) in the present map."""
+        poses = self.map.message.poses
+        return se2.compose(poses[min(self._home_key, len(poses) - 1)], self._home)
+
+    def pause(self) -> None:
+        """A user has set a goal, or cancelled it."""
+        self.goal, self.paused, self._over_since_ns = None, True, None
+
+    def move(self, pose: Array) -> None:
+        """The robot is at a pose (3,)."""
+        self.path_m += float(np.hypot(*(pose - self._pose)[:2]))
+        self._pose = pose
+
+    def survey(self, view: ScannerView) -> Survey:
+        """What the choice of the next view depends on."""
+        from services.controller.policies.exploration import Survey  # compiles
+
+        target = None
+        if self.goal is not None and self.phase == "exploring":
+            target = self.goal.pose.array()[:2]
+        poses, home = self.map.message.poses, self.home[:2]
+        return Survey(self.map.graph, poses, self._arrivals, view, self._pose, home, target, self._unreachable)
+
+    def needs_goal(self, state: GoalState, stamp_ns: int) -> bool:
+        """Whether the present goal has just ended, so that a view must be chosen; notes how it ended."""
+        if not self.active or not (self.paused or self.goal is not None):
+            return False
+        if self.paused:
+            return self._resumes(state, stamp_ns)
+        if state.active and not self._stalled(stamp_ns):
+            return False
+        assert self.goal is not None  # noqa: S101 - as it is not paused
+        self._end_goal(self.goal, reached=state.phase is Phase.REACHED)
+        self.goal = None
+        return self.active
+
+    def _resumes(self, state: GoalState, stamp_ns: int) -> bool:
+        """Whether the goal of a user has been over for long enough."""
+        if state.active:
+            self._over_since_ns = None
+        elif self._over_since_ns is None or stamp_ns < self._over_since_ns:
+            self._over_since_ns = stamp_ns
+        elif stamp_ns - self._over_since_ns >= PAUSE_NS:
+            self.paused = False
+        return not self.paused
+
+    def _stalled(self, stamp_ns: int) -> bool:
+        """Whether the robot has not got on for `STALLED_NS`."""
+        place, since_ns = self._progress
+        if np.hypot(*(self._pose - place)[:2]) > STALLED_M or not 0 < since_ns <= stamp_ns:
+            self._progress = self._pose, stamp_ns
+            return False
+        return stamp_ns - since_ns > STALLED_NS
+
+    def _end_goal(self, goal: Goal, *, reached: bool) -> None:
+        if self.phase == "returning":
+            self.phase = "finished" if reached else "failed"
+        elif reached:
+            self._arrivals = np.concatenate([self._arrivals, self._pose[None]])
+        else:
+            self._unreachable = np.concatenate([self._unreachable, goal.pose.array()[None, :2]])
+
+    def next_goal(self, view: View | None, half_view: float) -> Goal | None:
+        """The goal of a view that was chosen, or the way back if there is none; None if the goal stays the same.
+
+        ``half_view`` rad is what the scanner sees to either side.
+        """
+        phase: Literal["exploring", "returning"] = "returning" if view is None else "exploring"
+        pose = self.home if view is None else view.pose
+        same = self.goal is not None and np.hypot(*(self.goal.pose.array() - pose)[:2]) <= SAME_PLACE_M
+        if same and phase == self.phase:
+            return None
+        self.phase, self._progress = phase, (self._pose, 0)
+        goal = Goal(stamp_ns=0, seq=self.seq, pose=Pose.of(pose), tolerance=HOME_TOLERANCE_M)
+        if view is not None:
+            yaw_tolerance = None if half_view >= np.pi else half_view / 2
+            goal = goal.model_copy(update={"tolerance": VIEW_TOLERANCE_M, "yaw_tolerance": yaw_tolerance})
+        self.goal = goal
+        return goal
+
+    def explain(self, status: Status) -> Status:
+        """The controller's status, with the progress of the exploration."""
+        progress = Exploration(phase=self.phase, seq=self.seq, area=self.map.free_area_m2, path=self.path_m)
+        status = status.model_copy(update={"exploration": progress})
+        if not self.drives or status.state in {"lost", "manual"} or (status.state == "blocked" and not status.refused):
+            return status
+        reason = "returning to the start" if self.phase == "returning" else "going where a scan tells most"
+        return status.model_copy(update={"state": "exploring", "reason": reason, "refused": False})

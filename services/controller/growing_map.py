@@ -1,0 +1,39 @@
+"""A version of the map that the mapper builds, prepared for planning."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from common.geometry.occupancy_grid import FREE
+from services.controller.policies.free_space import FreeSpace
+from services.controller.policies.geodesic_field import FreeSpaceGraph
+
+if TYPE_CHECKING:
+    from common.messages.definitions import Map
+
+JUMP_M = 0.05  # a key scan that moved farther moved with a loop closure, and obstacles seen before are elsewhere
+
+
+@dataclass(frozen=True)
+class PlannedMap:
+    """A map, and the graph of the ways through it."""
+
+    message: Map
+    graph: FreeSpaceGraph
+    free_area_m2: float
+
+    @classmethod
+    def of(cls, message: Map, radius: float) -> PlannedMap:
+        """Prepare a map for a robot of ``radius`` m."""
+        free_area_m2 = float(np.count_nonzero(message.grid.values == FREE)) * message.grid.resolution**2
+        return cls(message, FreeSpaceGraph(FreeSpace.of_map(message.grid), radius), free_area_m2)
+
+    def jumped_from(self, before: PlannedMap) -> bool:
+        """Whether a place of the version ``before`` has moved in this one."""
+        old, new = before.message.poses, self.message.poses
+        if len(new) < len(old):
+            return True  # mapping started again
+        return bool(np.hypot(*(new[: len(old)] - old)[:, :2].T).max(initial=0.0) > JUMP_M)

@@ -1,0 +1,144 @@
+"""The course of an exploration: goals one after another, those of a user first, and the way back."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from common.geometry.occupancy_grid import FREE, OccupancyGrid
+from common.messages.definitions import Map
+from common.robot.base import Robot
+from services.controller.growing_map import PlannedMap
+from services.controller.navigator import Navigator
+from services.controller.policies.exploration import View
+from services.controller.policies.planner import GeodesicPolicy
+from tests.controller.driving import PERIOD_NS, belief, goal, room, scan
+
+HALL, START = room(10, 5), (2.0, 2.5, 0.0)
+FULL_S, HALF_VIEW = 15, 2.36  # scans per second; rad
+GRID = OccupancyGrid.of(np.full((100, 200), FREE, np.uint8), 0.05, (0.0, 0.0, 0.0))
+
+
+def map_with(*poses) -> PlannedMap:
+    return PlannedMap.of(Map(stamp_ns=0, grid=GRID, poses=np.array(poses, float)), 0.27)
+
+
+class Drive:
+    """A perfect robot, whose views are chosen by the test."""
+
+    def __init__(self) -> None:
+        self.policy = GeodesicPolicy(Robot(), None)
+        self.navigator = Navigator(Robot(), preset=self.policy)
+        self.pose, self.scans = np.array(START), 0
+        self.use_map(map_with(START))
+        self.step()
+
+    def use_map(self, planned: PlannedMap) -> None:
+        self.policy.use_map(planned.graph, jumped=False)
+        self.navigator.on_map(planned)
+
+    def step(self, *, moves: bool = True):
+        from common.geometry import se2
+
+        stamp = self.scans * PERIOD_NS
+        self.scans += 1
+        self.navigator.on_scan(scan(stamp, self.pose, HALL))
+        command, status = self.navigator.step(belief(stamp, self.pose))
+        if moves:
+            self.pose = se2.compose(self.pose, command.twist.array() * PERIOD_NS * 1e-9)
+        return status
+
+    def until(self, condition, limit=600, *, moves: bool = True):
+        for _ in range(limit):
+            if condition(status := self.step(moves=moves)):
+                return status
+        raise AssertionError(status)
+
+    def explore(self, *places) -> None:
+        """Begin to explore, or go on with views at these places in m."""
+        for place in places:
+            view = None if place is None else View(np.array([*place, 0.0]), 9.0, np.array([place]))
+            survey = self.navigator.take_survey()
+            assert survey is not None
+            self.navigator.use_view(view, survey)
+
+
+def begin() -> Drive:
+    drive = Drive()
+    drive.navigator.on_goal(goal(0, 0, explore=True, seq=5))
+    return drive
+
+
+def test_no_exploration_without_a_map():
+    navigator = Navigator(Robot(), preset=GeodesicPolicy(Robot(), None))
+    navigator.on_goal(goal(0, 0, explore=True, seq=5))
+    status = navigator.goal_state.status(0, None)
+    assert status.refused
+    assert "does a mapper run" in status.reason
+
+
+def test_views_then_the_way_back():
+    drive = begin()
+    drive.explore((5.0, 2.5))
+    status = drive.step()
+    assert (status.state, status.goal.x, status.exploration.phase, status.exploration.seq) == (
+        "exploring",
+        5,
+        "exploring",
+        5,
+    )
+    assert np.isclose(status.exploration.area, 50.0)
+    drive.until(lambda _: drive.navigator._view_due)
+    assert np.hypot(*(drive.pose[:2] - [5.0, 2.5])) < 0.1
+    drive.explore(None)
+    assert drive.step().exploration.phase == "returning"
+    status = drive.until(lambda status: status.exploration.phase == "finished")
+    assert np.hypot(*(drive.pose - START)[:2]) < 0.01
+    assert 5.9 < status.exploration.path < 7.5
+    assert status.state == "reached"
+    assert drive.navigator.take_survey() is None
+
+
+def test_a_goal_of_a_user_takes_precedence():
+    drive = begin()
+    drive.explore((8.0, 2.5))
+    drive.until(lambda _: drive.pose[0] > 3.0)
+    drive.navigator.on_goal(goal(3.0, 1.5, seq=6))
+    drive.use_map(map_with(START, (3.0, 2.5, 0.0)))
+    assert drive.navigator.take_survey() is None  # no view is chosen meanwhile
+    status = drive.until(lambda status: status.state == "reached")
+    assert (status.goal_seq, status.exploration.phase) == (6, "exploring")
+    count = drive.scans
+    drive.until(lambda _: drive.navigator._view_due)
+    assert drive.scans - count >= 2 * FULL_S - 1  # whoever waits for the goal sees that it was reached
+    drive.explore((8.0, 2.5))
+    assert drive.step().state == "exploring"
+
+
+def test_cancelling_ends_it():
+    drive = begin()
+    drive.explore((8.0, 2.5))
+    drive.until(lambda _: drive.pose[0] > 3.0)
+    drive.navigator.on_goal(goal(0, 0, cancel=True))
+    status = drive.until(lambda _: not drive.navigator._command.velocity.any())
+    assert (status.state, status.exploration) == ("idle", None)
+
+
+def test_a_place_without_progress_is_given_up():
+    drive = begin()
+    drive.explore((8.0, 2.5))
+    drive.until(lambda _: drive.navigator._view_due, moves=False)
+    survey = drive.navigator.take_survey()
+    assert survey.unreachable.tolist() == [[8.0, 2.5]]
+    assert not len(survey.arrivals)
+
+
+def test_a_new_map_may_show_a_better_view_and_moves_the_start():
+    drive = begin()
+    drive.explore((8.0, 2.5))
+    drive.step()
+    drive.use_map(map_with((2.1, 2.5, 0.0), (3.0, 2.5, 0.0)))
+    survey = drive.navigator.take_survey()
+    assert survey.target.tolist() == [8.0, 2.5]
+    assert survey.home.tolist() == [2.1, 2.5]
+    drive.navigator.use_view(View(np.array([4.0, 4.0, 0.0]), 9.0, np.zeros((1, 2))), survey)
+    assert drive.step().goal.y == 4.0
