@@ -113,6 +113,23 @@ def bench_mapping(
     raise typer.Exit(run(log, relations, worlds, seed, seconds, json_file, console))
 
 
+@app.command("mapping-faults")
+def bench_mapping_faults(
+    worlds: Annotated[int, typer.Option(min=1, max=1000, help="Number of generated buildings for each case.")] = 3,
+    seed: Seed = 1,
+    seconds: Annotated[float, typer.Option(min=10, help="Length of a drive.")] = 120.0,
+    json_file: Json = None,
+) -> None:
+    """Errors of mapping if the robot is carried off, among a crowd, and in look-alike rooms.
+
+    Examples: `presage bench mapping-faults --worlds 1 --seconds 60`;
+    `presage bench mapping-faults --json mapping-faults.json`.
+    """
+    from lab.benchmarks.mapping_faults import bench_mapping_faults as run
+
+    raise typer.Exit(run(worlds, seed, seconds, json_file, console))
+
+
 @app.command("refinement")
 def bench_refinement(
     worlds: Annotated[int, typer.Option(min=0, max=1000, help="Number of generated buildings beside office.")] = 2,

@@ -132,11 +132,18 @@ def _build_poses(
         f"before; {'with' if odom is not None else 'without'} odometry",
         soft_wrap=True,
     )
+    unplaced = float(np.isnan(built.poses).any(axis=1).mean())
+    if unplaced:
+        console.print(
+            f"{unplaced:.1%} of the scans are left out: they contradict what was seen just before, and were not found "
+            "elsewhere in the map; the robot was carried off, or its view was blocked",
+            soft_wrap=True,
+        )
     if rough is None:
         return built.poses
     posed = drive_of(replace(scans, truth=built.poses), options.log)
     with working(f"finding the drive in {rough.name}", progress):
-        placement = place(rough, posed.part(np.array(built.keys)))
+        placement = place(rough, posed.part(np.flatnonzero(np.isin(posed.stamps, stamps[built.keys]))))
     console.print(
         f"{placement.found:.0%} of the key scans found in {rough.name}, with a median deviation of "
         f"{placement.deviation * 1e3:.0f} mm",
