@@ -72,7 +72,10 @@ def run_up(options: UpOptions, console: Console) -> None:
             show_page_link(stack, console, open_it=options.open_page)
         with announced(stack.endpoint, robots, stack.security):
             if options.mapping:
-                console.print("[bold green]mapping[/]: drive with the arrow keys on the page, then save the map there.")
+                console.print(
+                    "[bold green]mapping[/]: drive with the arrow keys on the page, then save the map there or with "
+                    "`presage save-map NAME`."
+                )
             else:
                 _show_hints(stack, plan.estimator_settings.world, robots, console)
             _watch(stack, console)
