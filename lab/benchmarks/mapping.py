@@ -63,7 +63,7 @@ def relation_errors(poses: Array, stamps: Array, relations: Array) -> Errors:
     """
     known = np.isfinite(poses).all(axis=1)
     unwrapped, stamps = poses[known], stamps[known]
-    unwrapped[:, 2] = np.unwrap(poses[:, 2])
+    unwrapped[:, 2] = np.unwrap(poses[known, 2])
     first, second = (
         np.stack([np.interp(times, stamps, axis) for axis in unwrapped.T], axis=-1) for times in relations[:, :2].T
     )

@@ -149,6 +149,28 @@ def bench_refinement(
     raise typer.Exit(run(worlds, seed, seconds, out or Path("refinement"), json_file, worker_count(), console))
 
 
+@app.command("visits")
+def bench_visits(
+    worlds: Annotated[int, typer.Option(min=0, max=1000, help="Number of generated buildings beside office.")] = 2,
+    visits: Annotated[int, typer.Option(min=2, max=100, help="Number of visits.")] = 10,
+    seed: Seed = 1,
+    scans: Annotated[int, typer.Option(min=1, help="Number of single scans localised at each visit.")] = 60,
+    out: GeneratedFolder = None,
+    json_file: Json = None,
+) -> None:
+    """Errors of localisation in a building that changes, with a map updated by a drive at every visit.
+
+    Before each visit, all furniture of half of the rooms is moved, and doors of these rooms are opened and closed.
+    Single scans are localised in the first map, in the map before and after the update by the visit's drive, and in a
+    model learned at true poses in the present world.
+
+    Examples: `presage bench visits --worlds 0 --visits 3`; `presage bench visits --json visits.json`.
+    """
+    from lab.benchmarks.visits import bench_visits as run
+
+    raise typer.Exit(run(worlds, visits, seed, scans, out or Path("visits"), json_file, worker_count(), console))
+
+
 @app.command("metrics")
 def bench_metrics(seconds: Seconds = 20.0, rounds: Rounds = 3, json_file: Json = None) -> None:
     """Processor time that Prometheus metrics cost each service: rounds with one scrape per second, and without.

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from common.geometry import se2
 from common.geometry.se2 import Array
@@ -50,18 +51,28 @@ def build_trajectory(drive: RawDrive, report: Callable[[str, float], None] = lam
 def spread(tracked: Track, poses: Array) -> Array:
     """Poses (N, 3) of all scans, from the corrected ``poses`` (K, 3) of the key scans.
 
-    Between two key scans, the correction changes from that of the first to that of the second. The poses of scans that
-    belong to no piece, or to one whose key scans have no pose, are NaN.
+    The poses of scans that belong to no piece, or to one whose key scans have no pose, are NaN.
     """
     keys, pieces = np.array(tracked.keys), tracked.key_scans.pieces
-    number = np.arange(len(tracked.poses))
+    before = np.searchsorted(keys, np.arange(len(tracked.poses)), side="right") - 1
+    in_piece = tracked.pieces == pieces[np.maximum(before, 0)]
+    return np.where(in_piece[:, None], bend(tracked.poses, keys, poses, pieces), np.nan)
+
+
+def bend(poses: Array, keys: npt.NDArray[np.int_], corrected: Array, pieces: npt.NDArray[np.int_]) -> Array:
+    """Poses (N, 3) of all scans, after those of the key scans, numbers ``keys`` (K,), were ``corrected`` (K, 3).
+
+    Between two key scans of one of the ``pieces`` (K,), the correction changes from that of the first to that of the
+    second.
+    """
+    number = np.arange(len(poses))
     before = np.clip(np.searchsorted(keys, number, side="right") - 1, 0, len(keys) - 1)
     after = np.minimum(before + 1, len(keys) - 1)
     after = np.where(pieces[after] == pieces[before], after, before)
-    sides = [se2.compose(poses[k], se2.between(tracked.poses[keys[k]], tracked.poses)) for k in (before, after)]
+    sides = [se2.compose(corrected[k], se2.between(poses[keys[k]], poses)) for k in (before, after)]
     share = (number - keys[before]) / np.maximum(keys[after] - keys[before], 1)
     off = sides[1] - sides[0]
     off[:, 2] = se2.wrap(off[:, 2])
     result = sides[0] + share[:, None] * off
     result[:, 2] = se2.wrap(result[:, 2])
-    return np.where((tracked.pieces == pieces[before])[:, None], result, np.nan)
+    return np.asarray(result)
