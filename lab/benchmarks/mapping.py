@@ -61,8 +61,9 @@ def relation_errors(poses: Array, stamps: Array, relations: Array) -> Errors:
 
     ``relations`` (K, 5) are two times in s and the true relative pose x, y (m), yaw (rad).
     """
-    unwrapped = poses.copy()
-    unwrapped[:, 2] = np.unwrap(poses[:, 2])
+    known = np.isfinite(poses).all(axis=1)
+    unwrapped, stamps = poses[known], stamps[known]
+    unwrapped[:, 2] = np.unwrap(poses[known, 2])
     first, second = (
         np.stack([np.interp(times, stamps, axis) for axis in unwrapped.T], axis=-1) for times in relations[:, :2].T
     )
@@ -71,12 +72,19 @@ def relation_errors(poses: Array, stamps: Array, relations: Array) -> Errors:
 
 
 def trajectory_errors(poses: Array, truths: Array) -> Errors:
-    """Errors of a trajectory (N, 3) after it is moved and turned as a whole so that its positions fit best."""
+    """Errors of the known poses of a trajectory (N, 3), moved and turned as a whole so that its positions fit best."""
+    known = np.isfinite(poses).all(axis=1)
+    poses, truths = poses[known], truths[known]
+    off = fitted(poses, truths) - truths
+    return np.hypot(*off[:, :2].T), np.abs(se2.wrap(off[:, 2]))
+
+
+def fitted(poses: Array, truths: Array) -> Array:
+    """A trajectory (N, 3), moved and turned as a whole so that its positions are nearest to those of ``truths``."""
     mean, true_mean = poses[:, :2].mean(axis=0), truths[:, :2].mean(axis=0)
     a, b = poses[:, :2] - mean, truths[:, :2] - true_mean
     turn = float(np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum()))
-    position = se2.rotate(turn, a) - b
-    return np.hypot(*position.T), np.abs(se2.wrap(poses[:, 2] + turn - truths[:, 2]))
+    return np.column_stack([se2.rotate(turn, a) + true_mean, se2.wrap(poses[:, 2] + turn)])
 
 
 def _read_relations(file: Path) -> Array:
@@ -116,6 +124,7 @@ def _rows(name: str, drive: RawDrive, errors: Callable[[Array], Errors], console
             built = build_trajectory(drive if odometry else replace(drive, odom=None))
         taken = time.perf_counter() - begin
         position, heading = errors(built.poses)
+        placed = np.isfinite(built.poses).all(axis=1).mean()
         degrees = np.rad2deg(heading)
         values = (position.mean(), position.std(), position.max(), degrees.mean(), degrees.std())
         rows.append(
@@ -126,6 +135,7 @@ def _rows(name: str, drive: RawDrive, errors: Callable[[Array], Errors], console
                 "position_rms_m": float(np.sqrt((position**2).mean())),
                 "closures": len(built.closures),
                 "lost": built.lost,
+                "placed": float(placed),
                 "duration_s": float(drive.stamps[-1] - drive.stamps[0]),
                 "seconds": taken,
             }

@@ -113,6 +113,23 @@ def bench_mapping(
     raise typer.Exit(run(log, relations, worlds, seed, seconds, json_file, console))
 
 
+@app.command("mapping-faults")
+def bench_mapping_faults(
+    worlds: Annotated[int, typer.Option(min=1, max=1000, help="Number of generated buildings for each case.")] = 3,
+    seed: Seed = 1,
+    seconds: Annotated[float, typer.Option(min=10, help="Length of a drive.")] = 120.0,
+    json_file: Json = None,
+) -> None:
+    """Errors of mapping if the robot is carried off, among a crowd, and in look-alike rooms.
+
+    Examples: `presage bench mapping-faults --worlds 1 --seconds 60`;
+    `presage bench mapping-faults --json mapping-faults.json`.
+    """
+    from lab.benchmarks.mapping_faults import bench_mapping_faults as run
+
+    raise typer.Exit(run(worlds, seed, seconds, json_file, console))
+
+
 @app.command("refinement")
 def bench_refinement(
     worlds: Annotated[int, typer.Option(min=0, max=1000, help="Number of generated buildings beside office.")] = 2,
@@ -130,6 +147,28 @@ def bench_refinement(
     from lab.benchmarks.refinement import bench_refinement as run
 
     raise typer.Exit(run(worlds, seed, seconds, out or Path("refinement"), json_file, worker_count(), console))
+
+
+@app.command("visits")
+def bench_visits(
+    worlds: Annotated[int, typer.Option(min=0, max=1000, help="Number of generated buildings beside office.")] = 2,
+    visits: Annotated[int, typer.Option(min=2, max=100, help="Number of visits.")] = 10,
+    seed: Seed = 1,
+    scans: Annotated[int, typer.Option(min=1, help="Number of single scans localised at each visit.")] = 60,
+    out: GeneratedFolder = None,
+    json_file: Json = None,
+) -> None:
+    """Errors of localisation in a building that changes, with a map updated by a drive at every visit.
+
+    Before each visit, all furniture of half of the rooms is moved, and doors of these rooms are opened and closed.
+    Single scans are localised in the first map, in the map before and after the update by the visit's drive, and in a
+    model learned at true poses in the present world.
+
+    Examples: `presage bench visits --worlds 0 --visits 3`; `presage bench visits --json visits.json`.
+    """
+    from lab.benchmarks.visits import bench_visits as run
+
+    raise typer.Exit(run(worlds, visits, seed, scans, out or Path("visits"), json_file, worker_count(), console))
 
 
 @app.command("metrics")

@@ -139,6 +139,22 @@ def relocalise(
     run(chosen_link(context), pose, console, heading_known=yaw is not None)
 
 
+@app.command("save-map", rich_help_panel="Drive", short_help="Save the map that is being built.")
+def save_map(
+    context: typer.Context,
+    name: Annotated[str, typer.Argument(help="Name of the map: letters, digits, - and _.")],
+) -> None:
+    """Save the map of `presage up --mapping` as a ROS map, NAME.yaml and .pgm, with the trajectory NAME.tum.
+
+    The mapper writes into its own folder (its setting `maps`), by default the one where the session was started.
+
+    Example: `presage save-map my-floor`.
+    """
+    from presage.live.commands import save_map as run
+
+    run(chosen_link(context), name, console)
+
+
 def _pose(x: float, y: float, yaw: float = 0.0) -> Pose:
     """A pose from m and deg; raises UserError if a value is not finite or too far from the origin."""
     from common.messages.definitions import Pose

@@ -10,7 +10,6 @@ from rich.console import Console
 from rich.progress import Progress
 
 from common.errors import UserError
-from common.geometry import se2
 from common.geometry.occupancy_grid import FREE, OCCUPIED
 from common.geometry.rasterize import rasterise
 from common.geometry.ros_map_writer import write_grid
@@ -27,7 +26,7 @@ from presage.terminal.progress import working
 from services.estimator.precise.learning import drive_learning, weights
 from services.mapper.slam.drive import Laser, RawDrive
 from services.mapper.slam.grid import grid_of_scans
-from services.mapper.slam.trajectory import build_trajectory
+from services.mapper.slam.trajectory import bend, build_trajectory
 
 MIN_SCANS = 2
 SIMULATED_SCANS = 2000  # in the rough map, for the model where the drive saw nothing
@@ -44,7 +43,7 @@ class MapOptions:
     reading: Reading | None = None
     poses: str = "slam"  # slam: from scans and odometry; reference: the log's own
     odometry: bool = True  # whether slam uses the log's odometry
-    refine: str = ""  # map or world whose frame and unseen parts are kept; slam only
+    refine: str = ""  # map or world whose frame and unseen parts are kept, of its model as well; slam only
     models: Path | None = None  # folder for the weights of the model; defaults to no model
 
 
@@ -52,6 +51,7 @@ def map_command(options: MapOptions, console: Console, progress: Console) -> Pat
     """Writes the map and its image, and returns its path; raises UserError if that fails."""
     _check(options)
     rough = load_world(options.refine) if options.refine else None
+    former = None if rough is None else _model_of(rough, options)
     make_folder(options.out.parent, "--out")
     scans = read_scans(options.log, reading=options.reading)
     scans.print_notes(progress)
@@ -65,7 +65,7 @@ def map_command(options: MapOptions, console: Console, progress: Console) -> Pat
             f"{options.log}: {len(scans)} scans; a model needs at least {least}: add --no-learn for the map alone"
         )
     if options.poses == "slam":
-        scans = replace(scans, truth=_build_poses(scans, stamps, rough, options, console, progress))
+        scans = replace(scans, truth=_build_poses(scans, stamps, rough, former, options, console, progress))
     drive = drive_of(scans, options.log)
     if options.half:
         drive = split(drive)[0 if options.half == "first" else 1]
@@ -82,7 +82,7 @@ def map_command(options: MapOptions, console: Console, progress: Console) -> Pat
     )
     if options.models is not None:
         samples = SIMULATED_SCANS if options.refine else 0
-        training = TrainDriveOptions(options.log, str(path), options.models, samples)
+        training = TrainDriveOptions(options.log, str(path), options.models, samples, former=former)
         train_on_drive(training, drive, console)
     return path
 
@@ -111,8 +111,22 @@ def _check(options: MapOptions) -> None:
         raise UserError(f"{existing} exists already: choose another name with --out, or remove it")
 
 
+def _model_of(rough: World, options: MapOptions) -> Path | None:
+    """The file of the model that belongs to the map to refine, if it has one."""
+    try:
+        return None if options.models is None else weights.find(options.models, rough, options.refine)
+    except UserError:
+        return None
+
+
 def _build_poses(
-    scans: Scans, stamps: Array, rough: World | None, options: MapOptions, console: Console, progress: Console
+    scans: Scans,
+    stamps: Array,
+    rough: World | None,
+    former: Path | None,
+    options: MapOptions,
+    console: Console,
+    progress: Console,
 ) -> Array:
     """Poses (N, 3) computed from the scans, in the frame of the map ``rough`` if given, otherwise of the first scan."""
     if len(scans) < MIN_SCANS:
@@ -132,14 +146,22 @@ def _build_poses(
         f"before; {'with' if odom is not None else 'without'} odometry",
         soft_wrap=True,
     )
+    unplaced = float(np.isnan(built.poses).any(axis=1).mean())
+    if unplaced:
+        console.print(
+            f"{unplaced:.1%} of the scans are left out: they contradict what was seen just before, and were not found "
+            "elsewhere in the map; the robot was carried off, or its view was blocked",
+            soft_wrap=True,
+        )
     if rough is None:
         return built.poses
     posed = drive_of(replace(scans, truth=built.poses), options.log)
+    keys = np.array([key for key in built.keys if stamps[key] in posed.stamps])
     with working(f"finding the drive in {rough.name}", progress):
-        placement = place(rough, posed.part(np.array(built.keys)))
+        placement = place(rough, posed.part(np.flatnonzero(np.isin(posed.stamps, stamps[keys]))), former)
     console.print(
         f"{placement.found:.0%} of the key scans found in {rough.name}, with a median deviation of "
         f"{placement.deviation * 1e3:.0f} mm",
         soft_wrap=True,
     )
-    return se2.compose(placement.origin, built.poses)
+    return bend(built.poses, keys, placement.poses, np.zeros(len(keys), int))

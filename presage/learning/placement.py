@@ -7,6 +7,7 @@ walls that it saw, the median is wrong by a few millimetres.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -20,27 +21,31 @@ from services.estimator.precise.field import FieldModel
 from services.estimator.precise.learning.calibration import Drive
 from services.estimator.precise.learning.field_learning import Recipe, learn_field
 from services.estimator.shared.interface import Observation
+from services.mapper.slam.pose_graph import Link, optimise
 
 SIMULATED_SCANS = 2000  # in the map
 SAME_M = 0.3  # poses found in the map that differ by less agree
 MIN_FOUND = 0.5  # share of the key scans that must agree
+# Standard deviations, m, m, rad: of the drive between two key scans, and of the poses found, because of model errors.
+DRIFT, MODEL = np.array([0.003, 0.003, 0.001]), np.array([0.002, 0.002, 0.001])
 
 
 @dataclass(frozen=True)
 class Placement:
     """Where a drive is in a map."""
 
-    origin: Array  # (3,) frame of the drive in map
+    poses: Array  # (N, 3) of the key scans in map
     found: float  # share of the key scans that the estimator found there
     deviation: float  # m, median distance between the poses found and those of the placed drive
 
 
-def place(world: World, keys: Drive) -> Placement:
+def place(world: World, keys: Drive, model: Path | None = None) -> Placement:
     """Where key scans, with poses in the frame of their drive, are in the map ``world``.
 
-    Raises UserError if too few are found in the map at places that agree.
+    The drive is moved as a whole. If the map has a ``model``, it is exact to some millimetres, and the drive is bent to
+    it as well. Raises UserError if too few key scans are found in the map at places that agree.
     """
-    found = _localise(world, keys)
+    found, covariances = _localise(world, keys, model)
     middle = np.array([*keys.poses[:, :2].mean(axis=0), 0.0])  # turned about it, a drive hardly moves
     local = se2.between(middle, keys.poses)
     origins = se2.compose(found, se2.inverse(local))  # the middle in map, according to each key scan
@@ -52,22 +57,37 @@ def place(world: World, keys: Drive) -> Placement:
             f"only {share:.0%} of the drive were found in the map {world.name}: is it a map of the same place?"
         )
     off = se2.between(origins[best], origins[agreeing[best]])
-    centre = se2.compose(origins[best], np.median(off, axis=0))
-    deviation = float(np.median(_distance(se2.compose(centre, local), found)))
-    return Placement(se2.compose(centre, se2.inverse(middle)), share, deviation)
+    placed = se2.compose(se2.compose(origins[best], np.median(off, axis=0)), local)
+    if model is not None:
+        placed = _bent(placed, found, covariances)
+    return Placement(placed, share, float(np.median(_distance(placed, found))))
 
 
-def _localise(world: World, keys: Drive) -> Array:
-    """Poses (N, 3) of key scans in the map; some are wrong, at first and where much has changed."""
-    # In a learned field, oblique walls are no staircases, which would bias the headings.
-    beams = simulated_beams(world, keys, SIMULATED_SCANS, seed=0)
-    options = EstimatorOptions(world, generative_model=FieldModel(learn_field(beams, Recipe(0.05))))
+def _bent(placed: Array, found: Array, covariances: Array) -> Array:
+    """Poses (N, 3) of key scans by their relative poses and by those ``found`` in the map, some of which are wrong."""
+    drift = np.diag(1 / DRIFT**2)
+    steps = se2.between(placed[:-1], placed[1:])
+    links = [Link(k + 1, k + 2, step, drift) for k, step in enumerate(steps)]
+    for k, (pose, covariance) in enumerate(zip(found, covariances, strict=True)):
+        links.append(Link(0, k + 1, pose, np.linalg.inv(covariance + np.diag(MODEL**2)), robust=True))
+    return optimise(np.concatenate([np.zeros((1, 3)), placed]), links)[1:]
+
+
+def _localise(world: World, keys: Drive, model: Path | None) -> tuple[Array, Array]:
+    """Poses (N, 3) of key scans in the map with covariances; some are wrong, at first and where much has changed."""
+    if model is not None:
+        options = EstimatorOptions(world, model=str(model))
+    else:  # In a learned field, oblique walls are no staircases, which would bias the headings.
+        beams = simulated_beams(world, keys, SIMULATED_SCANS, seed=0)
+        options = EstimatorOptions(world, generative_model=FieldModel(learn_field(beams, Recipe(0.05))))
     estimator = prepare(options)(Geometry(keys.angles, keys.mount, keys.range_max))
     observations = [
         Observation(ranges, keys.angles, keys.range_max, float(stamp), pose)
         for ranges, stamp, pose in zip(keys.ranges, keys.stamps, keys.poses, strict=True)
     ]
-    return np.array([estimator.update(observation).pose for observation in observations])
+    found = [estimator.update(observation) for observation in observations]
+    covariances = [np.eye(3) if each.covariance is None else each.covariance for each in found]
+    return np.array([each.pose for each in found]), np.array(covariances)
 
 
 def _distance(poses: Array, others: Array) -> Array:

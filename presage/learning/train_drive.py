@@ -47,6 +47,7 @@ class TrainDriveOptions:
     recipe: Recipe = Recipe(resolution=0.05)  # noqa: RUF009 - frozen
     share: float = 1.0  # of the drive to use, from its beginning
     reading: Reading | None = None  # properties of the log that the file does not state
+    former: Path | None = None  # weights of a former model, which simulates the scans in place of the map
 
 
 def train_from_drive(options: TrainDriveOptions, console: Console) -> Path:
@@ -69,7 +70,6 @@ def train_on_drive(options: TrainDriveOptions, drive: Drive, console: Console) -
     world = load_world(options.world) if options.world else rectangle(drive, options.log)
     path = weights.path_of(options.out, world.name)
     weights.refuse_to_overwrite(path, world)
-    uses_map = bool(options.world and options.samples)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     start = time.monotonic()
     with Progress(*columns, console=console) as bar:
@@ -78,8 +78,12 @@ def train_on_drive(options: TrainDriveOptions, drive: Drive, console: Console) -
         def report(title: str, done: float) -> None:
             bar.update(task, description=f"training: {title}", completed=done)
 
-        simulated = simulated_beams(world, drive, options.samples, options.recipe.seed) if uses_map else None
-        learned = learn_drive(drive, options.recipe, simulated, report)
+        simulated = None
+        if options.former is not None:
+            simulated = replayed_beams(options.former, drive, options.samples, options.recipe.seed)
+        elif options.world and options.samples:
+            simulated = simulated_beams(world, drive, options.samples, options.recipe.seed)
+        learned = learn_drive(drive, options.recipe, simulated, report, replayed=options.former is not None)
     card = card_of(options, world, drive, learned, time.monotonic() - start)
     weights.save(path, learned.model, learned.places, card)
     draw_learned(weights.load(path)[0], card, path.with_suffix(".png"))
@@ -157,6 +161,16 @@ def simulated_beams(world: World, drive: Drive, samples: int, seed: int) -> Beam
     return Beams.of(poses, drive.mount, drive.angles, np.where(ranges > drive.range_max, np.inf, ranges))
 
 
+def replayed_beams(former: Path, drive: Drive, samples: int, seed: int) -> Beams:
+    """Scans of the drive's scanner as a former model predicts them, at random places that it knows."""
+    rng = np.random.default_rng(seed)
+    model, seeds, _ = weights.load(former)
+    lasers = np.column_stack([rng.choice(seeds.places, samples), rng.uniform(-np.pi, np.pi, samples)])
+    expected = model.expect(lasers, drive.angles)
+    known = np.isfinite(expected.scale) & (expected.ranges < drive.range_max)
+    return Beams.of(lasers, np.zeros(3), drive.angles, np.where(known, expected.ranges, -np.inf))
+
+
 def scanner_of(drive: Drive, sigma: float, name: str) -> Scanner:
     """The scanner of a drive, for the model card; ``sigma`` is its range noise in m."""
     angles = drive.angles
@@ -183,7 +197,8 @@ def card_of(
     calibration, errors = learned.calibration, learned.errors
     source = f"{len(drive.ranges)} posed scans of {options.log.name}"
     if options.world and options.samples:
-        source = f"{source}; elsewhere {options.samples} simulated scans in map {world.name}"
+        where = f"map {world.name}" if options.former is None else f"the former model {options.former.stem}"
+        source = f"{source}; elsewhere {options.samples} simulated scans in {where}"
     return weights.FieldCard(
         world=world,
         scanner=scanner_of(drive, calibration.likelihood.sigma, options.log.stem),

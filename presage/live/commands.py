@@ -1,4 +1,4 @@
-"""goal, teleport, topics, hz and echo."""
+"""goal, teleport, relocalise, save-map, topics, hz and echo."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from common.bus.bus import Link
 from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
 from common.messages.definitions import Goal, Pose, Status
-from common.messages.requests import LocaliseRequest, PoseRequest, Reply
-from common.messages.topics import GOAL, LOCALISE, QUERIES, STATUS, TELEPORT, TOPICS, Topic
+from common.messages.requests import LocaliseRequest, PoseRequest, Reply, SaveMapReply, SaveMapRequest
+from common.messages.topics import GOAL, LOCALISE, QUERIES, SAVE_MAP, STATUS, TELEPORT, TOPICS, Topic
 from common.messages.wire import DecodeError, Message
 from presage.live.bus_watch import Watch, session
 
@@ -26,6 +26,7 @@ BLOCKED_TIMEOUT_S = 30.0
 # Without statuses from the controller: time until a note is printed, and until the command gives up.
 STATUS_WARNING_S, STATUS_TIMEOUT_S = 3.0, 30.0
 MIN_PROGRESS_M = 0.3  # a smaller decrease of the distance to the goal does not end a blockage
+SAVE_TIMEOUT_S = 30.0  # a large map takes a while
 MAX_TEXT = 200  # characters; longer texts are shortened
 
 
@@ -219,3 +220,15 @@ def relocalise(link: Link, pose: Pose | None, console: Console, *, heading_known
     if not reply.ok:
         raise UserError(f"refused: {reply.reason}")
     console.print("localising again " + (f"from ({pose.x:g}, {pose.y:g})" if pose else "from the initial pose"))
+
+
+def save_map(link: Link, name: str, console: Console) -> None:
+    """Has the mapper write its map into files; raises UserError with the reason if it cannot."""
+    with session(link) as bus:
+        if SAVE_MAP.server not in bus.alive():
+            raise UserError("no mapper is running: start one with `presage up --mapping`, and drive")
+        reply = bus.ask(SAVE_MAP, SaveMapRequest(name=name), SaveMapReply, SAVE_TIMEOUT_S)
+    if not reply.ok:
+        raise UserError(f"not saved: {reply.reason}")
+    console.print(f"saved: {reply.file}. Before `presage up --world`, learn its model:", soft_wrap=True)
+    console.print(f"presage train --world {reply.file}", soft_wrap=True)

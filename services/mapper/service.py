@@ -187,4 +187,5 @@ def belief_message(scan: Scan, place: Place) -> Belief:
 def map_message(stamp_ns: int, grown: GrownMap) -> Map:
     """The map as a message."""
     ends = grown.poses[grown.closures.ravel(), :2].astype(np.float32)
-    return Map(stamp_ns=stamp_ns, grid=grown.grid, poses=grown.poses, closures=ends)
+    known = np.isfinite(grown.poses).all(axis=1)
+    return Map(stamp_ns=stamp_ns, grid=grown.grid, poses=grown.poses[known], closures=ends)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from common.bus.inbox import Inbox
 from common.geometry import se2
@@ -13,6 +14,7 @@ from common.messages.requests import SaveMapReply, SaveMapRequest
 from common.messages.topics import BELIEF, MAP, ODOM, SAVE_MAP, SCAN
 from common.robot.scan_geometry import Sweep
 from lab.accuracy.scenes import Scene
+from presage.live.commands import save_map
 from tests.conftest import WAIT_TIMEOUT_S, wait_for_message
 from tests.mapper.drives import driven
 
@@ -33,7 +35,7 @@ def scan_message(drive, k, ranges=None):
 
 
 @pytest.mark.parametrize("odometry", [True, False])
-def test_drive_and_save(process, bus, tmp_path, odometry):
+def test_drive_and_save(process, bus, link, tmp_path, odometry):
     truth = Scene.of(OFFICE, 300, 5).path(8)
     drive, inbox, maps = driven(OFFICE, truth), Inbox(), Inbox()
     bus.subscribe(BELIEF, inbox)
@@ -57,8 +59,8 @@ def test_drive_and_save(process, bus, tmp_path, odometry):
     grown = wait_for_message(maps, Map, lambda message: len(message.poses) > 3)
     assert np.abs(grown.poses[0]).max() < 0.01
 
-    file = bus.ask(SAVE_MAP, SaveMapRequest(name="here"), SaveMapReply).file
-    world = load_world(file)
+    save_map(link, "here", Console(quiet=True))
+    world = load_world(str(tmp_path / "maps" / "here.yaml"))
     assert (world.clearance(poses[:, :2]) > 0).mean() > 0.9
     assert np.loadtxt(tmp_path / "maps" / "here.tum").shape == (len(truth), 8)
     for name, reason in (("here", "exists already"), ("../here", "letters"), ("office", "shipped")):

@@ -109,6 +109,7 @@ def test_tools_beside_a_session(presage, process, bus, link, monkeypatch):
         ("relocalise 3.5 1.5", 0, ""),
         ("goal 4 1.5 90 --wait", 0, "reached"),
         ("goal --cancel", 0, ""),
+        ("save-map here", 2, "no mapper is running"),
         ("topics", 0, "presage/ROBOT/scan"),
     ):
         found, output = presage(*command.split())

@@ -5,24 +5,27 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import numpy.typing as npt
 
 from common.geometry import se2
 from services.mapper.slam.drive import Laser
 from services.mapper.slam.front_end import KeyScans
+from services.mapper.slam.joining import Joining, is_contradicted, largest
 from services.mapper.slam.loop_closure import MAX_SQUARED_DEVIATION, Closure, find_closures
-from services.mapper.slam.pose_graph import Link, LinkTable, Uncertainty, optimise
-from services.mapper.slam.segments import KEYS, segments_of
+from services.mapper.slam.pose_graph import Link, LinkTable, Uncertainty, components, optimise
+from services.mapper.slam.segments import Segment, segments_of
 
 
 class BackEnd:
-    """Corrects the drift of key scans."""
+    """Corrects the drift of key scans, and joins the pieces of a drive."""
 
     def __init__(self, laser: Laser) -> None:
         self.laser = laser
-        self.poses = np.zeros((0, 3))  # of the key scans, corrected
+        self.poses = np.zeros((0, 3))  # of the key scans, corrected; comparable only if links connect them
         self.closures: list[Closure] = []
         self._uncertainty: Uncertainty | None = None  # of the segments; None after a change
         self._known: set[tuple[int, int]] = set()  # pairs of segments that were tried
+        self._joining = Joining()
 
     def extend(self, scans: KeyScans) -> None:
         """Adds key scans that follow those that are known, at the places where the front end sees them."""
@@ -44,14 +47,42 @@ class BackEnd:
 
         If the drive is still ``growing``, its last segment is left out until it is complete.
         """
-        ranges = np.array(scans.ranges)
-        segments = segments_of(self.poses, scans.elements, ranges, self.laser.angles, self.laser.mount)
-        if growing:
-            segments = segments[: len(self.poses) // KEYS]
+        segments = self._segments(scans, growing=growing)
         if self._uncertainty is None:
-            references = np.array([segment.reference for segment in segments])
+            references = np.array([segment.reference for segment in segments], int)
             self._uncertainty = Uncertainty(self.poses, self._links(scans), references)
         found = find_closures(segments, self.poses, self._uncertainty, self._known, window, report)
+        self._add(found, scans)
+
+    def join_pieces(self, scans: KeyScans, *, growing: bool = False) -> bool:
+        """Searches the map for pieces without a link to it; returns whether one was found."""
+        if not scans.pieces.any():
+            return False
+        segments = self._segments(scans, growing=growing)
+        self._separate(segments)
+        component = self._components(scans)
+        if not component.any():
+            return False
+        found = self._joining.find(segments, self.poses, component)
+        if not found:
+            return False
+        link = found[0].link
+        first, second = (component == component[k] for k in (link.first, link.second))
+        if np.argmax(first) < np.argmax(second):  # the earlier one stays
+            origin = se2.compose(se2.compose(self.poses[link.first], link.pose), se2.inverse(self.poses[link.second]))
+            self.poses[second] = se2.compose(origin, self.poses[second])
+        else:
+            back = se2.compose(self.poses[link.second], se2.inverse(link.pose))
+            self.poses[first] = se2.compose(se2.compose(back, se2.inverse(self.poses[link.first])), self.poses[first])
+        self._add(found, scans)
+        return True
+
+    def in_map(self, scans: KeyScans) -> npt.NDArray[np.bool_]:
+        """Mask (K,) of the key scans that belong to the map: the largest part of the drive that links connect."""
+        component = self._components(scans)
+        return np.asarray(component == largest(component))
+
+    def _add(self, found: list[Closure], scans: KeyScans) -> None:
         if found:
             self._uncertainty = None
         self.closures += found
@@ -59,8 +90,27 @@ class BackEnd:
         self._drop_implausible()
         self.poses = optimise(self.poses, self._links(scans))
 
+    def _separate(self, segments: list[Segment]) -> None:
+        """Separates the last piece from the others if its last segment contradicts them."""
+        last = segments[-1]
+        pieces = [{segments[k].piece for k in (each.first, each.second)} for each in self.closures]
+        between = [last.piece in each and len(each) > 1 for each in pieces]
+        others = [k for k, each in enumerate(segments) if each.piece != last.piece]
+        if any(between) and is_contradicted(
+            len(segments) - 1, self.poses[last.reference], others, segments, self.poses
+        ):
+            self.closures = [each for each, joins in zip(self.closures, between, strict=True) if not joins]
+            self._uncertainty = None
+
+    def _segments(self, scans: KeyScans, *, growing: bool) -> list[Segment]:
+        laser, ranges = self.laser, np.array(scans.ranges)
+        return segments_of(self.poses, scans.pieces, scans.elements, ranges, laser.angles, laser.mount, growing=growing)
+
     def _links(self, scans: KeyScans) -> list[Link]:
         return [*scans.links, *(each.link for each in self.closures)]
+
+    def _components(self, scans: KeyScans) -> npt.NDArray[np.int_]:
+        return components(len(self.poses), self._links(scans))
 
     def _drop_implausible(self) -> None:
         """Drops the closures that contradict the graph."""

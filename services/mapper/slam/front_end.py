@@ -1,4 +1,8 @@
-"""The front end: the motion between scans, from each scan's registration to the last key scans."""
+"""The front end: the motion between scans, from each scan's registration to the last key scans.
+
+A scan that contradicts the last key scans is not used: something hides the surroundings, or the robot was carried off.
+If the next scans do so as well, another piece of the drive begins, of which no place in the former pieces is known.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from common.geometry import se2
 from common.geometry.se2 import Array
@@ -14,14 +19,20 @@ from common.robot.scan_geometry import Sweep
 from services.mapper.slam.drive import Laser, RawDrive
 from services.mapper.slam.elements import Elements, elements_of_scan, joined
 from services.mapper.slam.pose_graph import Link
-from services.mapper.slam.registration import PRIOR_SCALE, Prior, Registration, Surface, register
+from services.mapper.slam.registration import MIN_PARTNERS, PRIOR_SCALE, Prior, Registration, Surface, register
 from services.mapper.slam.search import search
+from services.mapper.slam.segments import Segment, Views, agreement
 
 KEY_DISTANCE_M, KEY_TURN_RAD = 0.4, 0.5  # from the last key scan, before another one is taken
 KEY_SHARE = 0.1  # of the median range, if that is a larger distance
 SEARCH_WINDOW, SEARCH_RANGE_M = np.array([0.3, 0.3, 0.4]), 10.0  # around the prior; of the elements that take part
 LOCAL_SCANS = 12  # key scans in the local map
 MIN_SHARE = 0.2  # of a scan's elements that must match the local map
+# Share of agreeing elements, among those that agree with or contradict the local map, at a pose that may be right;
+# and the number that is taken to agree anyway, so that a few elements alone are no evidence.
+MIN_AGREEMENT, AGREEING = 0.78, 10
+LOST_SCANS = 10  # successive ones that do not match, before another piece begins
+NO_PIECE = -1
 # A scan of which less matches sees something new; it becomes a key scan earlier, after this share of the way.
 FAMILIAR_SHARE, EARLY = 0.7, 0.25
 # Standard deviations of the motion. With odometry: of its error, as a share of the motion. Without: of the change of
@@ -32,6 +43,7 @@ LEARNED_SCANS, MAX_SURPRISE = 100, 10.0
 STANDING = np.array([0.002, 0.002, 0.002])  # m, m, rad
 ACCELERATION = np.array([1.0, 1.0, 3.0])
 MAX_VELOCITY = np.array([1.0, 1.0, 1.5])
+MAX_MOTION = 3 * MAX_VELOCITY  # in one second; a robot that seems to move faster was carried off
 # Errors of a registration that do not average out, for each key scan: moving things, the surfaces' roughness.
 REGISTRATION = np.array([0.005, 0.005, 0.002])
 
@@ -43,7 +55,8 @@ class KeyScans:
     poses: Array  # (K, 3)
     elements: list[Elements]
     ranges: list[Array]  # (B,) m
-    links: list[Link]  # between successive ones, by their numbers
+    links: list[Link]  # between successive ones of one piece, by their numbers
+    pieces: npt.NDArray[np.int_]  # (K,) piece of the drive to which each belongs
 
 
 @dataclass(frozen=True)
@@ -51,6 +64,7 @@ class Track:
     """A whole drive as the front end sees it."""
 
     poses: Array  # (N, 3) of all scans
+    pieces: npt.NDArray[np.int_]  # (N,) of the drive, or `NO_PIECE`
     keys: list[int]  # scans that are key scans
     key_scans: KeyScans
     lost: int  # scans that did not match
@@ -63,6 +77,7 @@ class Place:
     pose: Array  # (3,)
     covariance: Array  # (3, 3) relative to the last key scans
     matched: bool  # otherwise only the motion model tells the pose
+    piece: int = 0  # of the drive, or `NO_PIECE` if the surroundings contradict the pose
 
 
 class FrontEnd:
@@ -72,13 +87,17 @@ class FrontEnd:
         self.laser = laser
         self.stamps: list[float] = []  # s, of all scans
         self.poses: list[Array] = []  # (3,) of all scans
+        self.pieces: list[int] = []  # of all scans
         self.keys: list[int] = []  # scans that are key scans
         self.lost = 0  # scans that did not match
         self._sweep = Sweep.of_angles(laser.angles)
         self._elements: list[Elements] = []  # of the key scans
         self._ranges: list[Array] = []  # of the key scans
         self._links: list[Link] = []
-        self._surface = Surface(Elements(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)))
+        self._key_pieces: list[int] = []  # of the key scans
+        self._surface: Surface  # of the local map
+        self._local: Segment  # the local map with what its scans saw through
+        self._lost_scans = 0  # since one matched, if one of them contradicted the local map
         self._odom: Array | None = None  # of the last scan
         self._velocity: Array | None = None  # (3,) base_link
         self._scale = np.ones(3)  # of the deviations of the motion, learned
@@ -94,28 +113,36 @@ class FrontEnd:
         used_odometry, self._odom = self._odom is not None and odom is not None, odom
         self.stamps.append(stamp)
         if first:
-            self.poses.append(np.zeros(3))
-            self._add_key(elements, ranges, angles)
-            return Place(np.zeros(3), np.diag(REGISTRATION**2), matched=True)
+            return self._begin_piece(np.zeros(3), elements, ranges, angles)
         last = self.poses[-1]
         _, by_step = se2.compose_jacobians(last, motion)
         covariance = (by_step * (self._scale * deviation) ** 2) @ by_step.T
         prior = Prior(se2.compose(last, motion), np.asarray(np.linalg.inv(covariance), float))
         coasting = last if self._velocity is None else se2.compose(last, self._velocity * period)
         found = _best_registration(self._surface, elements, prior, coasting)
+        if found is not None and found.share < MIN_SHARE:
+            found = None
         self._since_key = self._since_key + PRIOR_SCALE**2 * covariance
-        if found is None or found.share < MIN_SHARE:
+        familiar = found is not None and found.share > FAMILIAR_SHARE
+        pose = prior.mean if found is None else found.pose
+        jumps = bool((np.abs(se2.between(last, pose)) > MAX_MOTION * period).any())
+        if jumps or (not familiar and (self._lost_scans or self._is_contradicted(pose, elements, ranges, angles))):
+            found, self._lost_scans = None, max(1, self._lost_scans)
+        if found is None:
             self.lost += 1
             self._velocity = None if used_odometry else self._velocity
-            place, information = Place(prior.mean, self._since_key, matched=False), np.zeros((3, 3))
+            if self._lost_scans:
+                return self._add_lost(prior.mean, elements, ranges, angles)
+            place, information = Place(prior.mean, self._since_key, False, self._key_pieces[-1]), np.zeros((3, 3))
         else:
+            self._lost_scans = 0
             self._velocity = se2.between(last, found.pose) / period
-            if found.share > FAMILIAR_SHARE:
+            if familiar:
                 self._scale = _learned(self._scale, self._scale * deviation, prior.mean, found)
-            place = Place(found.pose, found.covariance + np.diag(REGISTRATION**2), matched=True)
+            place = Place(found.pose, found.covariance + np.diag(REGISTRATION**2), True, self._key_pieces[-1])
             information = found.information
-        self.poses.append(place.pose)
-        if self._is_key(place.pose, elements, familiar=found is None or found.share >= FAMILIAR_SHARE):
+        self._append(place)
+        if self._is_key(place.pose, elements, familiar=found is None or familiar):
             key = self.poses[self.keys[-1]]
             self._links.append(_link(len(self.keys) - 1, key, place.pose, information, self._since_key))
             self._add_key(elements, ranges, angles)
@@ -124,11 +151,12 @@ class FrontEnd:
     def key_scans(self) -> KeyScans:
         """The key scans so far."""
         poses = np.array([self.poses[key] for key in self.keys])
-        return KeyScans(poses, self._elements.copy(), self._ranges.copy(), self._links.copy())
+        pieces = np.array(self._key_pieces)
+        return KeyScans(poses, self._elements.copy(), self._ranges.copy(), self._links.copy(), pieces)
 
     def track(self) -> Track:
         """The drive so far."""
-        return Track(np.array(self.poses), self.keys.copy(), self.key_scans(), self.lost)
+        return Track(np.array(self.poses), np.array(self.pieces), self.keys.copy(), self.key_scans(), self.lost)
 
     def _motion(self, period: float, odom: Array | None) -> tuple[Array, Array]:
         """Motion (3,) in base_link in the ``period`` since the scan before, and its standard deviations (3,)."""
@@ -152,6 +180,34 @@ class FrontEnd:
         times = beam_times(len(laser.angles), laser.time_increment)
         return correct_beams(ranges, laser.angles, times[:, None] * (motion / period), laser.mount)
 
+    def _is_contradicted(self, pose: Array, elements: Elements, ranges: Array, angles: Array) -> bool:
+        """Whether a scan at a pose contradicts the local map more than moving things would make it."""
+        mount = self.laser.mount
+        scan = Segment(0, 0, elements, Views(mount[None], self._even(ranges, angles)[None], self.laser.angles))
+        _, both, against = agreement(self._local, self._surface, scan, pose)
+        return both + AGREEING < MIN_AGREEMENT * (both + AGREEING + against)
+
+    def _add_lost(self, pose: Array, elements: Elements, ranges: Array, angles: Array) -> Place:
+        """Adds a scan of unknown pose; after some of them, another piece begins."""
+        self._lost_scans += 1
+        if self._lost_scans > LOST_SCANS and len(elements) >= MIN_PARTNERS:
+            return self._begin_piece(pose, elements, ranges, angles)
+        place = Place(pose, self._since_key, matched=False, piece=NO_PIECE)
+        self._append(place)
+        return place
+
+    def _begin_piece(self, pose: Array, elements: Elements, ranges: Array, angles: Array) -> Place:
+        """Begins a piece with a scan, whose pose (3,) may be any."""
+        self._velocity, self._lost_scans = None, 0
+        place = Place(pose, np.diag(REGISTRATION**2), matched=True, piece=max(self._key_pieces, default=-1) + 1)
+        self._append(place)
+        self._add_key(elements, ranges, angles)
+        return place
+
+    def _append(self, place: Place) -> None:
+        self.poses.append(place.pose)
+        self.pieces.append(place.piece)
+
     def _is_key(self, pose: Array, elements: Elements, *, familiar: bool) -> bool:
         off = se2.between(self.poses[self.keys[-1]], pose)
         far = max(KEY_DISTANCE_M, KEY_SHARE * _median_range(elements))
@@ -162,12 +218,20 @@ class FrontEnd:
         """Makes the last scan a key scan."""
         self.keys.append(len(self.poses) - 1)
         self._elements.append(elements)
-        self._ranges.append(
-            evenly_spaced(ranges, angles, self._sweep, -np.inf) if self.laser.time_increment else ranges
-        )
-        recent = zip(self.keys[-LOCAL_SCANS:], self._elements[-LOCAL_SCANS:], strict=True)
-        self._surface = Surface(joined([each.moved(self.poses[key]) for key, each in recent]))
+        self._ranges.append(self._even(ranges, angles))
+        self._key_pieces.append(self.pieces[-1])
+        recent = [k for k in range(-min(LOCAL_SCANS, len(self.keys)), 0) if self._key_pieces[k] == self.pieces[-1]]
+        poses = np.array([self.poses[self.keys[k]] for k in recent])
+        local = joined([self._elements[k].moved(pose) for k, pose in zip(recent, poses, strict=True)])
+        self._surface = Surface(local)
+        seen = np.array([self._ranges[k] for k in recent])
+        views = Views(se2.compose(poses, self.laser.mount), seen, self.laser.angles)
+        self._local = Segment(0, 0, local, views)
         self._since_key = np.zeros((3, 3))
+
+    def _even(self, ranges: Array, angles: Array) -> Array:
+        """Ranges (B,) at the laser's own angles."""
+        return evenly_spaced(ranges, angles, self._sweep, -np.inf) if self.laser.time_increment else ranges
 
 
 def track(drive: RawDrive, report: Callable[[float], None] = lambda _done: None) -> Track:

@@ -14,9 +14,9 @@ import numpy as np
 from common.geometry import se2
 from common.geometry.se2 import Array
 from services.mapper.slam.pose_graph import Link, Uncertainty
-from services.mapper.slam.registration import MATCHED_M, Surface, register
+from services.mapper.slam.registration import Surface, register
 from services.mapper.slam.search import search
-from services.mapper.slam.segments import Segment, submap
+from services.mapper.slam.segments import Segment, agreement, submap
 
 MAX_DISTANCE_M = 6.0  # between the references of segments that are matched
 MIN_APART = 3  # segments between two that are matched
@@ -73,7 +73,9 @@ def _targets(
     for first in np.argsort(distance):
         if distance[first] > MAX_DISTANCE_M + window or len(chosen) == MAX_TARGETS:
             break
-        if (int(first), second) in known or any(abs(first - other) < MIN_APART for other in chosen):
+        if (int(first), second) in known or not uncertainty.linked(int(first), second):
+            continue
+        if any(abs(first - other) < MIN_APART for other in chosen):
             continue
         deviation = SIGMAS * float(np.sqrt(np.linalg.eigvalsh(uncertainty.of_pair(int(first), second)[:2, :2])[1]))
         if deviation < window and distance[first] < MAX_DISTANCE_M + deviation:
@@ -96,7 +98,8 @@ def _match(
         found = register(surface, moved.elements, start)
         if found is None:
             continue
-        matched, share = agreement(target, surface, moved, found.pose)
+        matched, both, against = agreement(target, surface, moved, found.pose)
+        share = both / max(1, both + against)
         link_covariance = np.linalg.inv(found.information + np.eye(3)) + np.diag(MATCH**2)
         off = found.pose - predicted
         off[2] = se2.wrap(off[2])
@@ -116,22 +119,6 @@ def _match(
     return Closure(first, second, link, wide)
 
 
-def agreement(target: Segment, surface: Surface, moved: Segment, pose: Array) -> tuple[int, float]:
-    """Number of elements of ``moved`` at ``pose`` (3,) that match, and the share of matches among both sides' elements.
-
-    The others are contradictions: elements of one side where the other saw through. Elements of which the other side
-    saw nothing do not count.
-    """
-    placed = moved.elements.moved(pose)
-    matched = surface.distances(placed) < MATCHED_M
-    back = target.elements.moved(se2.inverse(pose))
-    against = int(target.views.see_through(placed.part(~matched)).sum())
-    met = Surface(placed).distances(target.elements) < MATCHED_M
-    against += int(moved.views.see_through(back.part(~met)).sum())
-    both = int(matched.sum() + met.sum())
-    return int(matched.sum()), both / max(1, both + against)
-
-
 def _consistent(closures: list[Closure], poses: Array, uncertainty: Uncertainty) -> list[Closure]:
     """The closures that agree with one another: narrow ones, and wide ones that another one supports."""
     return [
@@ -144,6 +131,8 @@ def _consistent(closures: list[Closure], poses: Array, uncertainty: Uncertainty)
 
 def _support(a: Closure, b: Closure, poses: Array, uncertainty: Uncertainty) -> bool:
     """Whether two closures confirm one another: the circle through both of them closes, and could have failed to."""
+    if not (uncertainty.linked(a.first, b.first) and uncertainty.linked(a.second, b.second)):
+        return False
     there = uncertainty.of_pair(a.first, b.first)
     back = uncertainty.of_pair(a.second, b.second)
     covariance = there + back + np.linalg.inv(a.link.information) + np.linalg.inv(b.link.information)

@@ -25,7 +25,7 @@ class GrownMap:
     """The map after some key scans."""
 
     grid: OccupancyGrid
-    poses: Array  # (K, 3) of the key scans
+    poses: Array  # (K, 3) of all key scans; NaN for those of pieces whose place in the map is unknown
     closures: npt.NDArray[np.int_]  # (C, 2) numbers of the key scans that loop closures link
 
 
@@ -42,6 +42,7 @@ class Mapper:
         self._front_end = FrontEnd(laser)
         self._back_end = BackEnd(laser)
         self._origin = np.zeros(3)  # of the front end's frame, in map
+        self._pieces = {0}  # whose place in the map is known
 
     def add(self, stamp: float, ranges: Array, odom: Array | None = None) -> Place:
         """The place in map of a scan ``ranges`` (B,) m at ``stamp`` s, with or without odometry (3,)."""
@@ -49,7 +50,8 @@ class Mapper:
         turn = np.eye(3)
         turn[:2, :2] = se2.rotate(float(self._origin[2]), np.eye(2)).T
         pose = se2.compose(self._origin, place.pose)
-        return replace(place, pose=pose, covariance=turn @ place.covariance @ turn.T)
+        matched = place.matched and place.piece in self._pieces
+        return replace(place, pose=pose, covariance=turn @ place.covariance @ turn.T, matched=matched)
 
     @property
     def outdated(self) -> bool:
@@ -68,20 +70,28 @@ class Mapper:
         if len(back_end.poses) // KEYS > complete:
             for window in WINDOWS_M:
                 back_end.close_loops(scans, window, growing=True)
-        grid = grid_of_scans(back_end.poses, np.array(scans.ranges), self.laser, self.cell)
-        pairs = [(each.link.first, each.link.second) for each in back_end.closures]
-        return GrownMap(grid, back_end.poses, np.array(pairs, int).reshape(-1, 2))
+            back_end.join_pieces(scans, growing=True)
+        in_map = back_end.in_map(scans)
+        grid = grid_of_scans(back_end.poses[in_map], np.array(scans.ranges)[in_map], self.laser, self.cell)
+        pairs = np.array([(each.link.first, each.link.second) for each in back_end.closures], int).reshape(-1, 2)
+        poses = np.where(in_map[:, None], back_end.poses, np.nan)
+        return GrownMap(grid, poses, pairs[in_map[pairs].all(axis=1)])
 
     def use(self, grown: GrownMap) -> None:
         """Places the following scans in a map that `update` returned."""
         self.map = grown
-        last = self._front_end.poses[self._front_end.keys[len(grown.poses) - 1]]
-        self._origin = se2.compose(grown.poses[-1], se2.inverse(last))
+        placed = np.flatnonzero(np.isfinite(grown.poses[:, 0]))
+        last = self._front_end.poses[self._front_end.keys[placed[-1]]]
+        self._origin = se2.compose(grown.poses[placed[-1]], se2.inverse(last))
+        self._pieces = set(self._front_end.key_scans().pieces[placed].tolist())
 
     def trajectory(self) -> tuple[Array, Array]:
-        """Stamps (N,) in s and poses (N, 3) in map of all scans."""
+        """Stamps (N,) in s and poses (N, 3) in map of all scans whose place is known."""
         track = self._front_end.track()
-        poses = se2.compose(self._origin, track.key_scans.poses)
+        known = np.isin(track.key_scans.pieces, list(self._pieces))
+        poses = np.where(known[:, None], se2.compose(self._origin, track.key_scans.poses), np.nan)
         if self.map is not None:
             poses[: len(self.map.poses)] = self.map.poses
-        return np.array(self._front_end.stamps), spread(track, poses)
+        poses = spread(track, poses)
+        placed = np.isfinite(poses[:, 0])
+        return np.array(self._front_end.stamps)[placed], poses[placed]

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu
 
 from common.geometry import se2
@@ -18,7 +19,7 @@ from common.geometry.se2 import Array
 
 MAX_STEPS = 20
 CONVERGED = 1e-5  # m and rad
-ANCHOR = 1e8  # information that holds the first pose
+ANCHOR = 1e8  # information that holds the first pose of each component
 ROBUST_SCALE = 3.0  # standard deviations, of the Cauchy weights of robust links
 
 
@@ -56,14 +57,7 @@ class LinkTable:
 
     def jacobians(self, poses: Array) -> tuple[Array, Array]:
         """Derivatives (L, 3, 3) of `errors` with respect to the first and the second pose of each link."""
-        a, b = poses[self.first], poses[self.second]
-        cos, sin = np.cos(a[:, 2]), np.sin(a[:, 2])
-        x, y = (b - a)[:, :2].T
-        zero, one = np.zeros(len(a)), np.ones(len(a))
-        by_second = _rows((cos, sin, zero), (-sin, cos, zero), (zero, zero, one))
-        by_first = -by_second
-        by_first[:, 0, 2], by_first[:, 1, 2] = cos * y - sin * x, -cos * x - sin * y
-        return by_first, by_second
+        return _relative_jacobians(poses[self.first], poses[self.second])
 
     def normal_equations(self, poses: Array) -> tuple[sparse.csc_array, Array]:
         """Hessian (3 N, 3 N) and gradient (3 N,) of half the sum of the squared deviations, robustly weighted."""
@@ -84,11 +78,12 @@ class LinkTable:
 
 
 def optimise(poses: Array, links: Sequence[Link]) -> Array:
-    """The poses (N, 3) that minimise the squared deviations of the links; the first one stays."""
+    """The poses (N, 3) that minimise the squared deviations of the links; the first of each component stays."""
     table, poses = LinkTable(links), poses.copy()
+    component = components(len(poses), links)
     for _ in range(MAX_STEPS):
         hessian, gradient = table.normal_equations(poses)
-        step = anchored(hessian).solve(-gradient).reshape(-1, 3)
+        step = anchored(hessian, component).solve(-gradient).reshape(-1, 3)
         poses += step
         poses[:, 2] = se2.wrap(poses[:, 2])
         if np.abs(step).max() < CONVERGED:
@@ -97,31 +92,48 @@ def optimise(poses: Array, links: Sequence[Link]) -> Array:
 
 
 class Uncertainty:
-    """Covariances between some poses of a graph (linearised)."""
+    """Covariances between some poses of a graph (linearised).
+
+    The Hessian is factorised once; the inverse is computed column by column, where it is needed.
+    """
 
     def __init__(self, poses: Array, links: Sequence[Link], chosen: npt.NDArray[np.integer]) -> None:
-        factor = anchored(LinkTable(links).normal_equations(poses)[0])
-        columns = (3 * np.asarray(chosen)[:, None] + np.arange(3)).ravel()
-        unit = np.zeros((3 * len(poses), len(columns)))
-        unit[columns, np.arange(len(columns))] = 1.0
-        count = len(chosen)
-        self._poses = poses[chosen]
-        self._covariance = factor.solve(unit)[columns].reshape(count, 3, count, 3).transpose(0, 2, 1, 3)
+        component = components(len(poses), links)
+        self._factor = anchored(LinkTable(links).normal_equations(poses)[0], component)
+        self._poses, self._chosen, self._component = poses, np.asarray(chosen), component[chosen]
+        self._columns: dict[int, Array] = {}  # (C, 3, 3) covariances of all chosen poses with one
+
+    def linked(self, first: int, second: int) -> bool:
+        """Whether links connect two chosen poses; otherwise nothing is known of their relative pose."""
+        return bool(self._component[first] == self._component[second])
 
     def of_pair(self, first: int, second: int) -> Array:
         """Covariance (3, 3) of the pose of a chosen pose in the frame of another, by their numbers."""
-        table = LinkTable([Link(0, 1, np.zeros(3), np.eye(3))])
-        (by_first,), (by_second,) = table.jacobians(self._poses[[first, second]])
-        J = np.concatenate([by_first, by_second], axis=1)
-        joint = np.block([[self._covariance[i, j] for j in (first, second)] for i in (first, second)])
-        return np.asarray(J @ joint @ J.T)
+        by_first, by_second = _relative_jacobians(*self._poses[self._chosen[[first, second]]])
+        a, b = self._column(first), self._column(second)
+        cross = by_first @ b[first] @ by_second.T
+        return np.asarray(by_first @ a[first] @ by_first.T + cross + cross.T + by_second @ b[second] @ by_second.T)
+
+    def _column(self, number: int) -> Array:
+        if number not in self._columns:
+            unit = np.zeros((len(self._poses), 3, 3))
+            unit[self._chosen[number]] = np.eye(3)
+            self._columns[number] = self._factor.solve(unit.reshape(-1, 3)).reshape(-1, 3, 3)[self._chosen]
+        return self._columns[number]
 
 
-def anchored(hessian: sparse.csc_array) -> SuperLU:
-    """Factorisation of a Hessian (3 N, 3 N) with the first pose held."""
-    anchor = np.zeros(hessian.shape[0])
-    anchor[:3] = ANCHOR
-    return splu((hessian + sparse.diags_array(anchor)).tocsc())
+def components(count: int, links: Sequence[Link]) -> npt.NDArray[np.int_]:
+    """Labels (N,) of poses; those that links connect have the same one."""
+    pairs = np.array([(link.first, link.second) for link in links], int).reshape(-1, 2)
+    graph = sparse.coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(count, count))
+    return np.asarray(connected_components(graph, directed=False)[1], int)
+
+
+def anchored(hessian: sparse.csc_array, component: npt.NDArray[np.int_]) -> SuperLU:
+    """Factorisation of a Hessian (3 N, 3 N) with the first pose of each component (N,) held."""
+    anchor = np.zeros((len(component), 3))
+    anchor[np.unique(component, return_index=True)[1]] = ANCHOR
+    return splu((hessian + sparse.diags_array(anchor.ravel())).tocsc())
 
 
 def block_matrix(blocks: Array, rows: Array, columns: Array, count: int) -> sparse.csc_array:
@@ -131,5 +143,13 @@ def block_matrix(blocks: Array, rows: Array, columns: Array, count: int) -> spar
     return sparse.coo_array((blocks.ravel(), (i.ravel(), j.ravel())), shape=(3 * count, 3 * count)).tocsc()
 
 
-def _rows(*rows: tuple[Array, Array, Array]) -> Array:
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+def _relative_jacobians(first: Array, second: Array) -> tuple[Array, Array]:
+    """Derivatives (..., 3, 3) of poses ``second`` in the frames of ``first``, both (..., 3), with respect to each."""
+    cos, sin = np.cos(first[..., 2]), np.sin(first[..., 2])
+    x, y = np.moveaxis((second - first)[..., :2], -1, 0)
+    by_second = np.zeros((*first.shape, 3))
+    by_second[..., 0, 0] = by_second[..., 1, 1] = cos
+    by_second[..., 0, 1], by_second[..., 1, 0], by_second[..., 2, 2] = sin, -sin, 1.0
+    by_first = -by_second
+    by_first[..., 0, 2], by_first[..., 1, 2] = cos * y - sin * x, -cos * x - sin * y
+    return by_first, by_second

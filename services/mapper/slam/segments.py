@@ -13,6 +13,7 @@ from common.geometry.se2 import Array
 from common.robot.ranges import is_surface
 from common.robot.scan_geometry import Sweep
 from services.mapper.slam.elements import Elements, joined
+from services.mapper.slam.registration import MATCHED_M, Surface
 
 KEYS = 8  # key scans of a segment
 PASSED_M = 0.3  # behind an element, along its normal, from where a beam has passed through it
@@ -47,28 +48,45 @@ class Segment:
     """Successive key scans, in the frame of the one in their middle, the reference."""
 
     reference: int  # number of the key scan
+    piece: int  # of the drive
     elements: Elements
     views: Views
 
 
 def segments_of(
-    poses: Array, elements: Sequence[Elements], ranges: Array, angles: Array, mount: Array
+    poses: Array,
+    pieces: npt.NDArray[np.int_],
+    elements: Sequence[Elements],
+    ranges: Array,
+    angles: Array,
+    mount: Array,
+    *,
+    growing: bool = False,
 ) -> list[Segment]:
-    """Divides key scans at ``poses`` (N, 3), with ``ranges`` (N, B), into segments."""
-    found = []
-    for first in range(0, len(poses), KEYS):
-        keys = np.arange(first, min(first + KEYS, len(poses)))
+    """Divides key scans at ``poses`` (N, 3) of ``pieces`` (N,), with ``ranges`` (N, B), into segments.
+
+    If the drive is still ``growing``, its last segment is left out until it is complete.
+    """
+    found, ends = [], np.append(np.flatnonzero(np.diff(pieces)) + 1, len(pieces))
+    first = 0
+    while first < len(poses):
+        end = min(first + KEYS, int(ends[np.searchsorted(ends, first, side="right")]))
+        if growing and end == len(poses) and end < first + KEYS:
+            break
+        keys = np.arange(first, end)
         reference = int(keys[len(keys) // 2])
         local = se2.between(poses[reference], poses[keys])
         placed = joined([elements[key].moved(pose) for key, pose in zip(keys.tolist(), local, strict=True)])
-        found.append(Segment(reference, placed, Views(se2.compose(local, mount), ranges[keys], angles)))
+        views = Views(se2.compose(local, mount), ranges[keys], angles)
+        found.append(Segment(reference, int(pieces[first]), placed, views))
+        first = end
     return found
 
 
 def submap(segments: Sequence[Segment], middle: int, poses: Array) -> Segment:
     """A segment and its neighbours in time, in its frame; ``poses`` (N, 3) are of all key scans."""
-    around = segments[max(0, middle - 1) : middle + 2]
-    reference = segments[middle].reference
+    reference, piece = segments[middle].reference, segments[middle].piece
+    around = [each for each in segments[max(0, middle - 1) : middle + 2] if each.piece == piece]
     offsets = [se2.between(poses[reference], poses[each.reference]) for each in around]
     views = Views(
         np.concatenate([se2.compose(off, each.views.poses) for off, each in zip(offsets, around, strict=True)]),
@@ -76,4 +94,19 @@ def submap(segments: Sequence[Segment], middle: int, poses: Array) -> Segment:
         around[0].views.angles,
     )
     placed = [each.elements.moved(off) for off, each in zip(offsets, around, strict=True)]
-    return Segment(reference, joined(placed), views)
+    return Segment(reference, piece, joined(placed), views)
+
+
+def agreement(target: Segment, surface: Surface, moved: Segment, pose: Array) -> tuple[int, int, int]:
+    """Counts of elements of ``moved`` at ``pose`` (3,) that match, and of both sides' that match, and that contradict.
+
+    ``surface`` has the target's elements. A contradiction is an element of one side where the other saw through.
+    Elements of which the other side saw nothing do not count.
+    """
+    placed = moved.elements.moved(pose)
+    matched = surface.distances(placed) < MATCHED_M
+    back = target.elements.moved(se2.inverse(pose))
+    against = int(target.views.see_through(placed.part(~matched)).sum())
+    met = Surface(placed).distances(target.elements) < MATCHED_M
+    against += int(moved.views.see_through(back.part(~met)).sum())
+    return int(matched.sum()), int(matched.sum() + met.sum()), against

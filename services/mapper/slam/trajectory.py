@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from common.geometry import se2
 from common.geometry.se2 import Array
@@ -21,7 +22,7 @@ WINDOWS_M = (1.0, 1.0, 3.0, 3.0, 10.0, 10.0, 30.0, 30.0, 1.0, 1.0)  # of the rou
 class Trajectory:
     """Poses of all scans of a drive."""
 
-    poses: Array  # (N, 3) base_link in map
+    poses: Array  # (N, 3) base_link in map; NaN where it is unknown
     keys: list[int]  # key scans
     closures: list[Closure]
     lost: int  # scans that did not match the ones before
@@ -32,25 +33,43 @@ def build_trajectory(drive: RawDrive, report: Callable[[str, float], None] = lam
     tracked = track(drive, lambda done: report("tracking", done))
     back_end = BackEnd(drive.laser)
     back_end.extend(tracked.key_scans)
-    for number, window in enumerate(WINDOWS_M):
+    joined = True
+    while joined:
+        for number, window in enumerate(WINDOWS_M):
 
-        def report_round(done: float, before: int = number) -> None:
-            report("closing loops", (before + done) / len(WINDOWS_M))
+            def report_round(done: float, before: int = number) -> None:
+                report("closing loops", (before + done) / len(WINDOWS_M))
 
-        back_end.close_loops(tracked.key_scans, window, report_round)
-    return Trajectory(spread(tracked, back_end.poses), tracked.keys, back_end.closures, tracked.lost)
+            back_end.close_loops(tracked.key_scans, window, report_round)
+        joined = back_end.join_pieces(tracked.key_scans)
+    in_map = back_end.in_map(tracked.key_scans)
+    poses = np.where(in_map[:, None], back_end.poses, np.nan)
+    keys = [key for key, known in zip(tracked.keys, in_map, strict=True) if known]
+    return Trajectory(spread(tracked, poses), keys, back_end.closures, tracked.lost)
 
 
 def spread(tracked: Track, poses: Array) -> Array:
     """Poses (N, 3) of all scans, from the corrected ``poses`` (K, 3) of the key scans.
 
-    Between two key scans, the correction changes from that of the first to that of the second.
+    The poses of scans that belong to no piece, or to one whose key scans have no pose, are NaN.
     """
-    keys = np.array(tracked.keys)
-    number = np.arange(len(tracked.poses))
+    keys, pieces = np.array(tracked.keys), tracked.key_scans.pieces
+    before = np.searchsorted(keys, np.arange(len(tracked.poses)), side="right") - 1
+    in_piece = tracked.pieces == pieces[np.maximum(before, 0)]
+    return np.where(in_piece[:, None], bend(tracked.poses, keys, poses, pieces), np.nan)
+
+
+def bend(poses: Array, keys: npt.NDArray[np.int_], corrected: Array, pieces: npt.NDArray[np.int_]) -> Array:
+    """Poses (N, 3) of all scans, after those of the key scans, numbers ``keys`` (K,), were ``corrected`` (K, 3).
+
+    Between two key scans of one of the ``pieces`` (K,), the correction changes from that of the first to that of the
+    second.
+    """
+    number = np.arange(len(poses))
     before = np.clip(np.searchsorted(keys, number, side="right") - 1, 0, len(keys) - 1)
     after = np.minimum(before + 1, len(keys) - 1)
-    sides = [se2.compose(poses[k], se2.between(tracked.poses[keys[k]], tracked.poses)) for k in (before, after)]
+    after = np.where(pieces[after] == pieces[before], after, before)
+    sides = [se2.compose(corrected[k], se2.between(poses[keys[k]], poses)) for k in (before, after)]
     share = (number - keys[before]) / np.maximum(keys[after] - keys[before], 1)
     off = sides[1] - sides[0]
     off[:, 2] = se2.wrap(off[:, 2])

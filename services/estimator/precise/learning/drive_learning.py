@@ -17,6 +17,7 @@ from services.estimator.precise.learning.calibration import (
     learn_motion,
 )
 from services.estimator.precise.learning.field_learning import (
+    MAX_ERROR_M,
     Recipe,
     learn_field,
     learn_scales,
@@ -24,9 +25,10 @@ from services.estimator.precise.learning.field_learning import (
     seed_places,
     seen_cells,
 )
-from services.estimator.precise.learning.surfaces import Beams
+from services.estimator.precise.learning.surfaces import Beams, SurfaceCells, field_of_surfaces
 from services.estimator.precise.noise import estimate_noise
 
+SEED_CLEARANCE_M = 0.1  # from surfaces, of a place where a search begins
 HELD_OUT_EVERY = 5  # every fifth scan is held out, to measure the precision
 MIN_SCANS = 50
 Report = Callable[[str, float], None]
@@ -42,11 +44,14 @@ class Learned:
     errors: Array  # (K,) m, of the ranges of held-out scans, where a surface is expected and was measured
 
 
-def learn_drive(drive: Drive, recipe: Recipe, simulated: Beams | None, report: Report) -> Learned:
+def learn_drive(
+    drive: Drive, recipe: Recipe, simulated: Beams | None, report: Report, *, replayed: bool = False
+) -> Learned:
     """Learns the model of a drive, and calibrates it.
 
-    ``simulated`` are beams simulated in a map of the place, used where the drive saw nothing. ``report`` is called with
-    the present stage and the share done.
+    ``simulated`` are beams simulated in a map of the place, used where the drive saw nothing. If they are ``replayed``
+    from a former model, they are used unless the drive contradicts them. ``report`` is called with the present stage
+    and the share done.
 
     The field is learned twice: first without the held-out scans, which measure its precision, then from all scans.
     """
@@ -60,6 +65,7 @@ def learn_drive(drive: Drive, recipe: Recipe, simulated: Beams | None, report: R
         recipe,
         simulated,
         lambda done: report("first field, without the held-out scans", 0.4 * done),
+        replayed=replayed,
     )
     lasers = se2.compose(held_out.poses, held_out.mount)
     scales = learn_scales(trial.field, held_out.poses, held_out.mount, held_out.angles, held_out.ranges, sigma)
@@ -69,23 +75,55 @@ def learn_drive(drive: Drive, recipe: Recipe, simulated: Beams | None, report: R
     calibration = calibrate(trial, held_out, motion, sigma)
     expected = trial.expect(lasers, held_out.angles)
     both = np.isfinite(held_out.ranges) & np.isfinite(expected.ranges) & np.isfinite(expected.scale)
-    final = _learn_model(drive, recipe, simulated, lambda done: report("final field", 0.55 + 0.4 * done))
+    final = _learn_model(
+        drive, recipe, simulated, lambda done: report("final field", 0.55 + 0.4 * done), replayed=replayed
+    )
     final = replace(final, scales=scales, ripple=trial.ripple)
     visited = se2.compose(drive.poses, drive.mount)[:, :2]
+    if simulated is not None:  # rooms that the drive did not enter, perhaps because a door was closed
+        visited = np.concatenate([visited, _free_places(final, np.unique(simulated.starts, axis=0))])
     places = seed_places(final.field, visited, final.seen)
     report("learned", 1.0)
     return Learned(final, places, calibration, np.abs(held_out.ranges[both] - expected.ranges[both]))
 
 
-def _learn_model(drive: Drive, recipe: Recipe, simulated: Beams | None, report: Callable[[float], None]) -> FieldModel:
+def _learn_model(
+    drive: Drive, recipe: Recipe, simulated: Beams | None, report: Callable[[float], None], *, replayed: bool
+) -> FieldModel:
     measured = Beams.of(drive.poses, drive.mount, drive.angles, drive.ranges)
-    beams = measured if simulated is None else measured.joined(_outside_of(measured, simulated))
+    beams = measured
+    if simulated is not None and replayed:
+        beams = measured.joined(still_valid(measured, simulated, recipe.resolution))
+    elif simulated is not None:
+        beams = measured.joined(_outside_of(measured, simulated))
     field = learn_field(beams, recipe, lambda _, done: report(done))
     # Rounded to half precision, as the field will be stored and read.
     field = replace(field, phi=field.phi.astype(np.float16).astype(np.float32))
     return FieldModel(field, seen=seen_cells(beams))
 
 
+def _free_places(model: FieldModel, places: Array) -> Array:
+    """The places (N, 2) m in map that are in seen free space."""
+    field, seen = model.field, model.seen
+    column, row = np.round((places - field.origin) / field.resolution).astype(int).T
+    inside = (column >= 0) & (row >= 0) & (column < field.phi.shape[1]) & (row < field.phi.shape[0])
+    inside[inside] &= field.phi[row[inside], column[inside]] > SEED_CLEARANCE_M
+    return np.asarray(places[inside if seen is None else inside & seen.contains(places)])
+
+
 def _outside_of(measured: Beams, simulated: Beams) -> Beams:
     """The simulated beams that end where no measured beam has passed; a map's walls are as thick as its cells."""
     return simulated.part(~seen_cells(measured).contains(simulated.ends()))
+
+
+def still_valid(measured: Beams, replayed: Beams, h: float) -> Beams:
+    """The beams replayed from a former model that the measured ones do not contradict.
+
+    Left out are those that end at a surface that is gone, or would pass through one that is new.
+    """
+    cells = SurfaceCells.of(replayed, h)
+    gone = cells.at(cells.contradicted_by(measured), replayed.ends())
+    present = FieldModel(field_of_surfaces(measured, h), seen=seen_cells(measured))
+    expected = present.expect(np.column_stack([replayed.starts, replayed.directions]), np.zeros(1))
+    in_front = np.isfinite(expected.scale) & (expected.ranges < replayed.ranges[:, None] - MAX_ERROR_M)
+    return replayed.part(~(gone | in_front[:, 0]))

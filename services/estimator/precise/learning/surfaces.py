@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
@@ -53,34 +54,88 @@ class Beams:
         return Beams(*(np.concatenate(pair) for pair in zip(mine, theirs, strict=True)))
 
 
+@dataclass(frozen=True)
+class SurfaceCells:
+    """Cells of a grid in which beams end, with a surface element (mean, normal) each; arrays (ny, nx)."""
+
+    low: Array  # (2,) m in map, corner of cell (0, 0)
+    h: float  # m, edge length
+    own: Array  # beams that end in the cell
+    mx: Array  # m from `low`
+    my: Array
+    nx: Array  # towards free space
+    ny: Array
+
+    @classmethod
+    def of(cls, beams: Beams, h: float) -> SurfaceCells:
+        """The cells of ``h`` m in which beams end."""
+        ends, unit = beams.ends(), beams.unit()
+        low = np.minimum(ends.min(0), beams.starts.min(0)) - 4 * h
+        shape = np.ceil((np.maximum(ends.max(0), beams.starts.max(0)) + 4 * h - low) / h).astype(int)[::-1] + 1
+        cell = np.floor((ends - low) / h).astype(int)
+        index = cell[:, 1] * shape[1] + cell[:, 0]
+
+        def pooled(values: Array | None) -> Array:
+            return _pooled(np.bincount(index, values, int(shape.prod())).reshape(shape))
+
+        own = np.bincount(index, minlength=int(shape.prod())).reshape(shape).astype(float)
+        local = ends - low  # smaller numbers, so that sums of squares lose less precision
+        count = np.maximum(pooled(None), 1)
+        mx, my = pooled(local[:, 0]) / count, pooled(local[:, 1]) / count
+        xx, yy = pooled(local[:, 0] ** 2) / count - mx**2, pooled(local[:, 1] ** 2) / count - my**2
+        xy = pooled(local[:, 0] * local[:, 1]) / count - mx * my
+        dx, dy = pooled(unit[:, 0]), pooled(unit[:, 1])
+        angle = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the surface, the long axis of the points
+        nx, ny = -np.sin(angle), np.cos(angle)
+        flip = np.where(nx * dx + ny * dy > 0, -1.0, 1.0)  # against the beams, that is, towards free space
+        return cls(low, h, own, mx, my, nx * flip, ny * flip)
+
+    @property
+    def is_surface(self) -> npt.NDArray[np.bool_]:
+        """Mask (ny, nx) of cells in which enough beams end."""
+        return np.asarray(self.own >= MIN_POINTS_PER_CELL)
+
+    def crossings(self, beams: Beams) -> Array:
+        """Counts (ny, nx) of beams that passed through the element of each cell."""
+        crossed, elements = np.zeros(self.own.shape), (self.mx, self.my, self.nx, self.ny)
+        starts = beams.starts - self.low
+        count_crossings(starts, beams.unit(), beams.ranges, self.h, self.is_surface, *elements, PASSED_DEPTH_M, crossed)
+        return crossed
+
+    def contradicted_by(self, beams: Beams) -> npt.NDArray[np.bool_]:
+        """Mask (ny, nx) of cells through whose elements most of the beams pass that meet them."""
+        crossed = _pooled(self.crossings(beams))
+        cell, inside = self._cells_at(beams.ends())
+        ended = np.zeros(self.own.shape)
+        np.add.at(ended, tuple(cell[inside].T), 1.0)
+        ended = _pooled(ended)
+        return np.asarray((crossed >= MIN_POINTS_PER_CELL) & (ended < MIN_PRESENT_SHARE * (ended + crossed)))
+
+    def at(self, mask: npt.NDArray[np.bool_], points: Array) -> npt.NDArray[np.bool_]:
+        """The values (N,) of a mask (ny, nx) at points (N, 2) m in map; False beyond the grid."""
+        cell, inside = self._cells_at(points)
+        found = np.zeros(len(points), np.bool_)
+        found[inside] = mask[tuple(cell[inside].T)]
+        return found
+
+    def _cells_at(self, points: Array) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.bool_]]:
+        """Rows and columns (N, 2) of points (N, 2) m in map, and whether they are inside the grid."""
+        cell = np.floor((points - self.low) / self.h).astype(int)[:, ::-1]
+        return cell, np.asarray(((cell >= 0) & (cell < self.own.shape)).all(axis=1))
+
+
 def field_of_surfaces(beams: Beams, h: float) -> DistanceField:
     """The field from surface elements in cells of ``h`` m, without those that most beams passed through."""
-    ends, unit = beams.ends(), beams.unit()
-    low = np.minimum(ends.min(0), beams.starts.min(0)) - 4 * h
-    shape = np.ceil((np.maximum(ends.max(0), beams.starts.max(0)) + 4 * h - low) / h).astype(int)[::-1] + 1
-    cell = np.floor((ends - low) / h).astype(int)
-    index = cell[:, 1] * shape[1] + cell[:, 0]
+    cells = SurfaceCells.of(beams, h)
+    crossed = cells.crossings(beams)
+    surface = cells.is_surface & (cells.own >= MIN_PRESENT_SHARE * (cells.own + crossed))
+    phi = _distances(surface, cells.mx, cells.my, cells.nx, cells.ny, cells.own, h)
+    return DistanceField(phi, (float(cells.low[0]), float(cells.low[1])), h)
 
-    def pooled(values: Array | None) -> Array:
-        grid = np.bincount(index, values, int(shape.prod())).reshape(shape)
-        return np.asarray(ndimage.correlate(grid, np.ones((2 * POOL_CELLS + 1,) * 2), mode="constant"))
 
-    own = np.bincount(index, minlength=int(shape.prod())).reshape(shape)
-    local = ends - low  # smaller numbers, so that sums of squares lose less precision
-    count = np.maximum(pooled(None), 1)
-    mx, my = pooled(local[:, 0]) / count, pooled(local[:, 1]) / count
-    xx, yy = pooled(local[:, 0] ** 2) / count - mx**2, pooled(local[:, 1] ** 2) / count - my**2
-    xy = pooled(local[:, 0] * local[:, 1]) / count - mx * my
-    dx, dy = pooled(unit[:, 0]), pooled(unit[:, 1])
-    surface = own >= MIN_POINTS_PER_CELL
-    angle = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the surface, the long axis of the points
-    nx, ny = -np.sin(angle), np.cos(angle)
-    flip = np.where(nx * dx + ny * dy > 0, -1.0, 1.0)  # against the beams, that is, towards free space
-    nx, ny = nx * flip, ny * flip
-    crossed = np.zeros(own.shape)
-    count_crossings(beams.starts - low, unit, beams.ranges, h, surface, mx, my, nx, ny, PASSED_DEPTH_M, crossed)
-    surface &= own >= MIN_PRESENT_SHARE * (own + crossed)
-    return DistanceField(_distances(surface, mx, my, nx, ny, own, h), (float(low[0]), float(low[1])), h)
+def _pooled(grid: Array) -> Array:
+    """The sum of each cell and those around it."""
+    return np.asarray(ndimage.correlate(grid, np.ones((2 * POOL_CELLS + 1,) * 2), mode="constant"))
 
 
 def _distances(surface: np.ndarray, mx: Array, my: Array, nx: Array, ny: Array, own: Array, h: float) -> Floats:

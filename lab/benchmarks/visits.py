@@ -1,0 +1,278 @@
+"""`presage bench visits`: a map that is updated by a drive after every visit to a building that changes."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+from rich.table import Table
+
+from common.geometry import se2
+from common.geometry.se2 import Array
+from common.geometry.shapes import Obstacle
+from common.geometry.world import load_world
+from common.robot.scanner import Scanner
+from lab.accuracy.runner import provenance
+from lab.accuracy.scenes import ROBOT, Scene
+from lab.accuracy.tasks import is_at
+from lab.experiments.trials import run_trials
+from lab.integrity.buildings import Building, Room, make_building, random_place
+from lab.integrity.cases import BEAMS
+from lab.integrity.changes import MAX_PLACES
+from lab.integrity.furniture import Piece
+from lab.navigation.shortest_path import ShortestPaths
+from presage.learning.map_of_log import MapOptions, map_command
+from presage.logs.log import Reading
+from presage.terminal.output import check_file, make_folder, write_json
+from services.estimator.factory import EstimatorOptions, Geometry, prepare
+from services.estimator.precise.field import FieldModel
+from services.estimator.precise.learning import weights
+from services.estimator.precise.learning.field_learning import Recipe, learn_field
+from services.estimator.precise.learning.surfaces import Beams
+from services.estimator.shared.interface import Observation
+
+SPEED, TURN_RATE, PERIOD_S = 0.6, 0.5, 0.2  # m/s, rad/s and s between scans of a drive
+MARGIN_M = 0.02  # by which the robot is taken to be smaller, because it just fits between some pieces
+VISITED = 0.7  # share of the rooms that a drive enters, after the first one
+SAMPLES = 2000  # scans of the model of the present world
+CLOSED = 0.3  # probability for each door of a room that changes
+FIRST, BEFORE, AFTER, PRESENT = "first map", "before the update", "after the update", "learned at true poses"
+MODELS = (FIRST, BEFORE, AFTER, PRESENT)
+QUIET = Console(quiet=True)
+
+
+@dataclass(frozen=True)
+class VisitsJob:
+    """Visits to one building."""
+
+    world: str  # office, or the seed of a generated building
+    visits: int
+    scans: int  # localised before each update
+    seed: int
+    out: str  # folder of the maps, logs and models
+
+
+def bench_visits(
+    worlds: int,
+    visits: int,
+    seed: int,
+    scans: int,
+    out: Path,
+    json_file: Path | None,
+    workers: int,
+    console: Console,
+) -> int:
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0.
+
+    The maps, logs and models are written to ``out``.
+    """
+    check_file(json_file, "--json")
+    make_folder(out, "--out")
+    names = ["office", *map(str, range(seed, seed + worlds))]
+    jobs = [VisitsJob(name, visits, scans, seed, str(out)) for name in names]
+    results = run_trials("visits", visit, jobs, out, workers, console)
+    rows = [row for result in results for row in result["rows"]]
+    _print(rows, console)
+    write_json(json_file, {"rows": rows, "scans": scans, **provenance(seed)})
+    return 0
+
+
+def visit(job: VisitsJob) -> dict[str, Any]:
+    """Results of all visits to one building.
+
+    In half of the rooms, all furniture is moved before each visit but the first, and each door may be closed.
+    """
+    out = Path(job.out) / job.world
+    shutil.rmtree(out, ignore_errors=True)  # of an interrupted run
+    out.mkdir()
+    rng = np.random.default_rng([job.seed, 40])
+    building = _office() if job.world == "office" else make_building(int(job.world))
+    rooms = [room for room in building.rooms if room.door is not None]
+    changing = [rooms[k] for k in rng.permutation(len(rooms))[: (len(rooms) + 1) // 2]]
+    rows, first = [], out / "visit-1.yaml"
+    for number in range(1, job.visits + 1):
+        doors: list[Obstacle] = []
+        if number > 1:
+            building = rearranged(building, changing, rng)
+            panels = [room.door_panel() for room in changing]
+            doors = [panel for panel in panels if panel is not None and rng.random() < CLOSED]
+        scene = Scene.of(building.world_with(doors), BEAMS, [job.seed, number, 41])
+        row: dict[str, Any] = {"world": building.name, "visit": number}
+        before, after = out / f"visit-{number - 1}.yaml", out / f"visit-{number}.yaml"
+        poses = scene.poses(job.scans)
+        clean = scene.clean(poses)
+        scans = [scene.observe(ranges, float(k)) for k, ranges in enumerate(clean)]
+        row |= _update(scene, building, before, after)
+        if number > 1:
+            row["in_changed_room"] = np.any([contains(room, poses[:, :2]) for room in changing], axis=0).tolist()
+            for name, file in ((FIRST, first), (BEFORE, before), (AFTER, after)):
+                row[name] = _test(EstimatorOptions(str(file), models=out), scene.scanner, scans, poses)
+            exact = EstimatorOptions(scene.world, generative_model=_present_model(scene))
+            row[PRESENT] = _test(exact, scene.scanner, scans, poses)
+        rows.append(row)
+    return {"rows": rows}
+
+
+def rearranged(building: Building, rooms: list[Room], rng: np.random.Generator) -> Building:
+    """The building after all furniture of some rooms was moved to other places of these rooms, if there was room."""
+    moves = [any(contains(room, np.array(piece.pose[:2])[None])[0] for room in rooms) for piece in building.furniture]
+    floor, part = building.floor(), replace(building, rooms=tuple(rooms))
+    for piece, moved in zip(building.furniture, moves, strict=True):
+        if not moved:
+            floor.put(piece)
+    for piece, moved in zip(building.furniture, moves, strict=True):
+        if moved:
+            any(floor.put(random_place(part, piece, rng)) for _ in range(MAX_PLACES))
+    return building.furnished(floor.pieces)
+
+
+def contains(room: Room, places: Array) -> npt.NDArray[np.bool_]:
+    """Mask (N,) of the places (N, 2) m in map that lie in a room."""
+    box = room.box(room.width / 2, room.depth / 2, (room.width, room.depth)).box
+    assert box is not None  # noqa: S101 - for the type checker
+    return np.asarray((np.abs(places - box.center) < np.array(box.size) / 2).all(axis=1))
+
+
+def tour(scene: Scene, building: Building, share: float) -> Array:
+    """Poses (N, 3), `PERIOD_S` apart, of a drive to two places in each room, or in a ``share`` of them.
+
+    The robot turns all the time.
+    """
+    paths, rng = ShortestPaths(scene.world, ROBOT.radius - MARGIN_M), scene.rng
+    free = scene.world.sample_free(1000, rng, ROBOT.radius)
+    corridors = [room for room in building.rooms if room.door is None]
+    places = [next(place for place in free if any(contains(room, place[None])[0] for room in corridors))]
+    legs = []
+    for number in rng.permutation(len(building.rooms)):
+        room = building.rooms[number]
+        if room.door is not None and rng.random() > share:
+            continue
+        for place in free[contains(room, free)][-2:]:
+            leg = paths.path(places[-1], place)
+            if len(leg):
+                legs += [np.linspace(a, b, 2 + int(np.hypot(*(b - a)) / (SPEED * PERIOD_S))) for a, b in pairwise(leg)]
+                places.append(place)
+    driven = np.concatenate(legs)
+    return np.column_stack([driven, se2.wrap(TURN_RATE * PERIOD_S * np.arange(len(driven)))])
+
+
+def _update(scene: Scene, building: Building, before: Path, after: Path) -> dict[str, Any]:
+    """Updates the map with a drive; the first map is built at the true poses of a drive through all rooms."""
+    path, scanner = tour(scene, building, VISITED if before.exists() else 1.0), scene.scanner
+    log, models = after.with_suffix(".npz"), after.parent
+    np.savez(
+        log,
+        ranges=np.array([scene.observe(clean, 0.0).ranges for clean in scene.clean(path)]),
+        angles=scanner.angles(),
+        range_max=np.array(scanner.range_max),
+        stamps=PERIOD_S * np.arange(len(path)),
+        reference=path,
+    )
+    options = MapOptions(log, after, reading=Reading(mount=np.array(scanner.mount)), models=models)
+    begin = time.perf_counter()
+    if before.exists():
+        map_command(replace(options, refine=str(before)), QUIET, QUIET)
+    else:
+        map_command(replace(options, poses="reference"), QUIET, QUIET)
+    taken = time.perf_counter() - begin
+    table = np.loadtxt(after.with_suffix(".tum"))
+    numbers = np.round(table[:, 0] / PERIOD_S).astype(int)  # scans without a place are left out
+    errors = np.hypot(*(table[:, 1:3] - path[numbers, :2]).T)
+    return {
+        "drive_s": PERIOD_S * len(path),
+        "trajectory_rms_m": float(np.sqrt((errors**2).mean())),
+        "update_s": taken,
+        "map_bytes": after.with_suffix(".pgm").stat().st_size,
+        "model_bytes": weights.path_of(models, after.stem).stat().st_size,
+    }
+
+
+def _test(options: EstimatorOptions, scanner: Scanner, scans: list[Observation], poses: Array) -> list[float | None]:
+    """Errors in m of single scans from unknown poses; None if not found."""
+    estimator = prepare(options)(Geometry.of(scanner))
+    errors: list[float | None] = []
+    for scan, pose in zip(scans, poses, strict=True):
+        estimator.restart()
+        estimate = estimator.update(scan).pose
+        errors.append(float(np.hypot(*(estimate - pose)[:2])) if is_at(estimate, pose) else None)
+    return errors
+
+
+def _present_model(scene: Scene) -> FieldModel:
+    """A field learned from scans with noise at true poses in the present world."""
+    poses, mount, angles = scene.poses(SAMPLES), np.array(scene.scanner.mount), scene.scanner.angles()
+    ranges = np.array([scene.observe(clean, 0.0).ranges for clean in scene.clean(poses)])
+    return FieldModel(learn_field(Beams.of(poses, mount, angles, ranges), Recipe(0.05)))
+
+
+def _office() -> Building:
+    """The world `office` as walls, furniture that can be moved, and rooms with a door to the corridor."""
+    world = load_world("office")
+    furniture, walls = [], []
+    for obstacle in world.obstacles:
+        if obstacle.box is not None:
+            (x, y), yaw = obstacle.box.center, float(np.deg2rad(obstacle.box.yaw_deg))
+            furniture.append(Piece("box", obstacle.box.size, (x, y, yaw)))
+        elif obstacle.circle is not None:
+            size = 2 * obstacle.circle.radius
+            furniture.append(Piece("disc", (size, size), (*obstacle.circle.center, 0.0)))
+        else:
+            walls.append(obstacle)
+    rooms = (
+        Room((0.0, 0.0, 0.0), 4.9, 2.95, 2.2),
+        Room((4.95, 0.0, 0.0), 5.7, 2.95, 2.65),
+        Room((10.65, 0.0, 0.0), 7.35, 2.95, 2.7),
+        Room((7.75, 8.0, np.pi), 7.75, 3.05, 3.35),
+        Room((0.0, 2.95, 0.0), 18.0, 2.0),
+        Room((7.8, 5.0, 0.0), 10.2, 3.0),
+    )
+    return Building("office", tuple(world.boundary), tuple(walls), rooms, tuple(furniture))
+
+
+def summary(
+    rows: list[dict[str, Any]], visit: int | None, *, unchanged: bool = False
+) -> dict[str, tuple[float, float]]:
+    """Share of single scans found, and their median error in m, with each model at one visit or at all.
+
+    With ``unchanged``, only those in rooms that do not change.
+    """
+    result = {}
+    tested = [row for row in rows if PRESENT in row and visit in (None, row["visit"])]
+    for name in MODELS:
+        errors = [
+            error
+            for row in tested
+            for error, changed in zip(row[name], row["in_changed_room"], strict=True)
+            if not (unchanged and changed)
+        ]
+        found = [error for error in errors if error is not None]
+        result[name] = (len(found) / max(1, len(errors)), float(np.median(found)) if found else np.nan)
+    return result
+
+
+def _print(rows: list[dict[str, Any]], console: Console) -> None:
+    table = Table(title="Single scans found and their median error in mm; the same in unchanged rooms")
+    for title in ("visit", *MODELS, "update (s)", "trajectory RMS (mm)", "model (kB)"):
+        table.add_column(title)
+    visits = sorted({row["visit"] for row in rows if PRESENT in row})
+    for visit in [*visits, None]:
+        everywhere, still = summary(rows, visit), summary(rows, visit, unchanged=True)
+        updates = [row for row in rows if visit in (None, row["visit"])]
+        table.add_row(
+            "all" if visit is None else str(visit),
+            *(
+                f"{share:.0%}; {error * 1e3:.1f}; {still[name][0]:.0%}; {still[name][1] * 1e3:.1f}"
+                for name, (share, error) in everywhere.items()
+            ),
+            f"{max(row['update_s'] for row in updates):.0f}",
+            f"{max(row['trajectory_rms_m'] for row in updates) * 1e3:.1f}",
+            f"{max(row['model_bytes'] for row in updates) / 1e3:.0f}",
+        )
+    console.print(table)
