@@ -24,7 +24,7 @@ from presage.cli import recording as cli_recording
 from presage.cli import replay as cli_replay
 from presage.cli import security as cli_secure
 from presage.cli.session_options import Connect, RobotName
-from presage.session.stack import ignoring_interrupts, interruptible
+from presage.interrupts import ignoring_interrupts, interruptible
 from presage.terminal.options import (
     Config,
     EstimatorName,

@@ -10,8 +10,8 @@ from common.bus.bus import Link
 from common.errors import UserError
 from common.messages.definitions import Exploration, Goal, Pose, Status
 from common.messages.topics import GOAL, STATUS
+from presage.interrupts import ignoring_interrupts
 from presage.live.bus_watch import Watch, session
-from presage.session.stack import ignoring_interrupts
 
 ANSWER_TIMEOUT_S = 3.0
 STATUS_TIMEOUT_S = 30.0  # long enough to restart the mapper meanwhile

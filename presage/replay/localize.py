@@ -22,11 +22,11 @@ from common.geometry.se2 import Array
 from common.geometry.world import load_world
 from common.versions import commit, versions
 from presage.estimator import Estimator
+from presage.interrupts import ignoring_interrupts
 from presage.laser_scan import LaserScan
 from presage.logs.log import Reading
 from presage.logs.opening import kind_of
 from presage.logs.scan_files import Prior, Scans, read_scans
-from presage.session.stack import ignoring_interrupts
 from presage.terminal.output import check_file
 from presage.terminal.progress import progress, working
 from services.estimator.factory import EstimatorOptions, Name, check_start

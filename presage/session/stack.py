@@ -10,10 +10,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
-from types import FrameType, TracebackType
+from types import TracebackType
 
 from typing_extensions import Self
 
@@ -21,13 +21,11 @@ from common.bus.bus import Bus, Link
 from common.bus.security import Credentials
 from common.errors import UserError
 from common.processes import end_with_this_process
+from presage.interrupts import ignoring_interrupts
 from presage.session.ports import accepts, check_port, free_port
 
 COLOURS = {"router": 37, "simulator": 36, "estimator": 35, "mapper": 35, "controller": 33, "recorder": 32, "viewer": 34}
 SECURITY_VARIABLES = {"PRESAGE_SECURITY", "PRESAGE_ROLE"}  # choose this process's credentials, not the children's
-INTERRUPTS = [signal.SIGINT, signal.SIGTERM]
-if sys.platform != "win32":
-    INTERRUPTS.append(signal.SIGHUP)
 TERMINATION_TIMEOUT_S = 5.0  # between SIGTERM and SIGKILL
 # The controller stops the robot first; the recorder ends late, to record how the others stop.
 SHUTDOWN_ORDER = ("controller", "estimator", "mapper", "simulator", "viewer", "recorder", "router")
@@ -258,40 +256,3 @@ def _end(process: Process) -> int:
     if child.stdout is not None:
         child.stdout.close()
     return child.returncode
-
-
-@contextmanager
-def interruptible() -> Iterator[None]:
-    """Makes `INTERRUPTS` raise KeyboardInterrupt in the block, so that it cleans up as after Ctrl-C.
-
-    A script's shell starts background commands with SIGINT ignored, which is undone here. SIGHUP stays ignored where
-    it is, as under nohup.
-    """
-
-    def interrupt(_signal: int, _frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    handled = [
-        number
-        for number in INTERRUPTS
-        if number in {signal.SIGINT, signal.SIGTERM} or signal.getsignal(number) != signal.SIG_IGN
-    ]
-    previous = {s: signal.signal(s, interrupt) for s in handled}
-    try:
-        yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-
-
-@contextmanager
-def ignoring_interrupts() -> Iterator[None]:
-    """Ignores `INTERRUPTS` in the block, so that a second Ctrl-C does not interrupt the cleanup."""
-    previous: dict[int, Callable[[int, FrameType | None], object] | int | None] = {
-        s: signal.signal(s, signal.SIG_IGN) for s in INTERRUPTS
-    }
-    try:
-        yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)

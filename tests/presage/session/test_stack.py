@@ -7,7 +7,7 @@ import signal
 
 import pytest
 
-from presage.session.stack import interruptible
+from presage.interrupts import interruptible
 
 
 @pytest.fixture
