@@ -119,3 +119,8 @@ WORKDIR /tmp
 USER presage
 HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.containers.healthcheck", "estimator"]
 CMD ["sh", "-c", "cp -r /numba /tmp && exec python -m common.containers.run_per_robot together services.estimator"]
+
+# Instead of the estimator: maps an unknown building.
+FROM estimator AS mapper
+HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.containers.healthcheck", "mapper"]
+CMD ["sh", "-c", "cp -r /numba /tmp && exec python -m common.containers.run_per_robot each services.mapper --maps /recordings"]
