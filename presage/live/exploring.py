@@ -11,7 +11,6 @@ from common.errors import UserError
 from common.messages.definitions import Exploration, Goal, Pose, Status
 from common.messages.topics import GOAL, STATUS
 from presage.live.bus_watch import Watch, session
-from presage.session.stack import ignoring_interrupts
 
 ANSWER_TIMEOUT_S = 3.0
 STATUS_TIMEOUT_S = 30.0  # long enough to restart the mapper meanwhile
@@ -28,9 +27,8 @@ def explore(link: Link, console: Console) -> int:
             bus.put(GOAL, request.encode())
             return _follow(watch, request.seq, console)
         except KeyboardInterrupt:
-            with ignoring_interrupts():
-                _stop(watch, request)
-                console.print("stopped; the map is kept")
+            _stop(watch, request)
+            console.print("stopped; the map is kept")
             raise
 
 
