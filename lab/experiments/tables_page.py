@@ -25,6 +25,7 @@ MODULES = {
     "prediction": "lab.paper.prediction",
     "navigation": "lab.navigation.experiment",
     "docking": "lab.navigation.docking",
+    "exploration": "lab.exploration.experiment",
     "real": "lab.real_logs.experiment",
     "integrity": "lab.integrity.report",
 }

@@ -28,9 +28,8 @@ def explore(link: Link, console: Console) -> int:
             bus.put(GOAL, request.encode())
             return _follow(watch, request.seq, console)
         except KeyboardInterrupt:
-            with ignoring_interrupts():
-                _stop(watch, request)
-                console.print("stopped; the map is kept")
+            _stop(watch, request)
+            console.print("stopped; the map is kept")
             raise
 
 

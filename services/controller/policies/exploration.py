@@ -6,9 +6,9 @@ to where exploration began. Its expected free energy in nats is
     G(tour) = NATS_PER_METRE * length - information about the map
 
 A cell at the edge is free or occupied, which a scan tells: ln 2, times `MISS_PROBABILITY` for each earlier scan that
-should have told it and did not. So a view is worth any way through a building, and ways are compared by their length:
-the tour takes in all that is worth seeing, by the shortest way (as Kulich, Faigl & Preucil 2011 choose goals). Only
-its first place is driven to, as the next map has other edges.
+should have told it and did not. At `MIN_VIEW_NATS` a view is worth a way of 150 m, so the tour takes in all that is
+worth seeing, by the shortest way (as Kulich, Faigl & Preucil 2011 choose goals). Only its first place is driven to, as
+the next map has other edges.
 
 Approximations: the views are chosen greedily by what they tell; what lies beyond the edge is not predicted; and a scan
 tells nothing of what it sees at a distance where its beams are farther apart than the cells of the map.
@@ -25,6 +25,7 @@ import numpy.typing as npt
 
 from common.geometry import se2
 from common.robot.scan_geometry import Sweep
+from services.controller.policies.expected_free_energy import NATS_PER_METRE
 from services.controller.policies.geodesic_field import FreeSpaceGraph
 from services.controller.policies.visibility import visible
 
@@ -108,6 +109,9 @@ def choose_view(survey: Survey) -> View | None:
     if chosen[0] == first and tour[0] != 0:
         kept = [0, *(place + 1 for place in shortest_tour(cost[1:, 1:]))]  # from the present target on
         tour = kept if _length(cost, kept) < _length(cost, tour) + CHANGE_M else tour
+    energy = NATS_PER_METRE * _length(cost, tour) - float(edge.nats[gain[chosen].any(axis=0)].sum())
+    if energy >= NATS_PER_METRE * cost[0, -1]:  # that of returning at once
+        return None
     return _view(survey, places[chosen][tour], edge, gain[chosen[tour[0]]])
 
 
