@@ -10,7 +10,6 @@ from common.bus.bus import Link
 from common.errors import UserError
 from common.messages.definitions import Exploration, Goal, Pose, Status
 from common.messages.topics import GOAL, STATUS
-from presage.interrupts import ignoring_interrupts
 from presage.live.bus_watch import Watch, session
 
 ANSWER_TIMEOUT_S = 3.0
