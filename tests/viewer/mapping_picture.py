@@ -31,6 +31,7 @@ def main() -> None:
             seen.wait("store.map", 60)
             seen.page.locator("#explore").click()
             seen.wait("store.frame.status.exploration?.phase === 'finished'", TIMEOUT_S)
+            seen.wait("document.querySelector('#explore-label').textContent === 'Explore'")
             picture = Image.open(io.BytesIO(seen.page.screenshot())).convert("RGB")
             picture.save(FILE, optimize=True)
 
