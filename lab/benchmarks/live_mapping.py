@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import time
-from itertools import pairwise
 
 import numpy as np
 
@@ -25,7 +24,6 @@ from presage.session.running import link_of
 
 GAIN, REACH_M = 3.0, 0.25  # 1/s, of the distance from a point of the path; where the next one is due
 MAX_SPEED, MAX_TURN = 0.7, 1.0  # m/s, rad/s
-STEP_M = 0.05  # between the points of a route
 TIMEOUT_S = 5.0
 STUCK_NS = 60_000_000_000
 
@@ -33,13 +31,6 @@ STUCK_NS = 60_000_000_000
 def random_path(world: str, seconds: float, seed: int, start: Array) -> Array:
     """Poses (N, 3) of a drive between random places of a world, from ``start`` (3,)."""
     return Scene.of(load_world(world), 2, seed).path(seconds, MAX_SPEED, start)
-
-
-def path_of_route(route: str, start: Array) -> Array:
-    """Poses (N, 3) along lines between places ``x,y x,y ...`` in m from ``start`` (3,), with its heading."""
-    places = np.array([[0.0, 0.0], *(np.array(place.split(","), float) for place in route.split())])
-    legs = [np.linspace(a, b, 2 + int(np.hypot(*(b - a)) / STEP_M)) for a, b in pairwise(places)]
-    return np.array([[*(start[:2] + place), start[2]] for place in np.concatenate(legs)])
 
 
 def drive_path(bus: Bus, path: Array) -> tuple[Array, Array]:
@@ -74,9 +65,8 @@ def drive_path(bus: Bus, path: Array) -> tuple[Array, Array]:
 def main() -> None:
     """Drives, and prints errors and dropped scans."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--world", default="office", help="the world of the simulator, for random places")
+    parser.add_argument("--world", default="office", help="the world of the simulator")
     parser.add_argument("--seconds", type=float, default=600.0)
-    parser.add_argument("--route", default="", help="places x,y x,y ... in m from the start; defaults to random ones")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--connect", default="")
     args = parser.parse_args()
@@ -85,11 +75,7 @@ def main() -> None:
         first = Watch(bus, TRUTH).until(Truth, lambda _: True, TIMEOUT_S)
         if first is None:
             raise UserError("no truth comes: is a simulator running?")
-        start = first.pose.array()
-        if args.route:
-            path = path_of_route(args.route, start)
-        else:
-            path = random_path(args.world, args.seconds, args.seed, start)
+        path = random_path(args.world, args.seconds, args.seed, first.pose.array())
         position, heading = trajectory_errors(*drive_path(bus, path))
         print(
             f"{len(position)} beliefs in {time.monotonic() - began:.0f} s: "

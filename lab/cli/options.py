@@ -49,4 +49,6 @@ def show(experiment: ModuleType, run: Callable[[], Result], out: Path) -> None:
     print(f"\n{experiment.table(result.summary)}\n")
     if result.notes:
         console.print(*result.notes, sep="\n")
-    console.print(f"{out / result.name}.json, .csv, .trials.jsonl, .pdf, .png")
+    suffixes = (".json", ".csv", ".trials.jsonl", ".pdf", ".png")
+    written = [suffix for suffix in suffixes if (out / f"{result.name}{suffix}").exists()]
+    console.print(f"{out / result.name}{', '.join(written)}")

@@ -83,11 +83,13 @@ def run(
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Statistics of each explorer, over all of its trials."""
-    paths = {name: [row["path_m"] for row in rows if row["explorer"] == name] for name in EXPLORERS}
+    by_explorer = {name: [row for row in rows if row["explorer"] == name] for name in EXPLORERS}
+    # Paths are compared where both explorers came back.
+    came_back = [all(row["phase"] == "finished" for row in pair) for pair in zip(*by_explorer.values(), strict=True)]
+    path = {name: np.array([row["path_m"] for row in own])[came_back] for name, own in by_explorer.items()}
     found = {}
-    for name in EXPLORERS:
-        own = [row for row in rows if row["explorer"] == name]
-        ratio = np.array(paths[name]) / np.array(paths["nearest frontier"])
+    for name, own in by_explorer.items():
+        ratio = path[name] / path["nearest frontier"]
         found[name] = {
             "trials": len(own),
             "finished": sum(row["phase"] == "finished" for row in own),
@@ -99,9 +101,10 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
             "median_return_error_m": float(np.median([row["return_error_m"] for row in own])),
             "max_return_error_m": max(row["return_error_m"] for row in own),
             "trials_with_contact": sum(row["contact_scans"] > 0 for row in own),
-            "total_path_m": float(sum(paths[name])),
-            "median_path_ratio": float(np.median(ratio)),
-            "max_path_ratio": float(ratio.max()),
+            "compared": len(ratio),
+            "total_path_m": float(path[name].sum()),
+            "median_path_ratio": float(np.median(ratio)) if len(ratio) else None,
+            "max_path_ratio": float(ratio.max()) if len(ratio) else None,
             "total_seconds": float(sum(row["seconds"] for row in own)),
         }
     return found
@@ -121,7 +124,7 @@ def table(summary: Mapping[str, Mapping[str, Any]]) -> str:
             f"{1e3 * row['median_return_error_m']:.1f}; {1e3 * row['max_return_error_m']:.1f}",
             str(row["trials_with_contact"]),
             f"{row['total_path_m']:.0f}",
-            f"{row['median_path_ratio']:.2f}; {row['max_path_ratio']:.2f}",
+            f"{results.number(row['median_path_ratio'], 2)}; {results.number(row['max_path_ratio'], 2)}",
             f"{row['total_seconds']:.0f}",
         ]
         for name, row in summary.items()

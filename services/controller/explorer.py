@@ -6,7 +6,9 @@
 | EXPLORING, RETURNING | a view is worth the way | EXPLORING |
 | EXPLORING, RETURNING | no view is | RETURNING |
 | RETURNING | the robot has arrived | FINISHED |
-| RETURNING | the way back is refused, or the robot does not get on | FAILED |
+| RETURNING | the way back stays refused | FAILED |
+
+A view that is refused, or that the robot gets no nearer to for `STALLED_NS`, is given up.
 
 A goal of a user pauses it until `PAUSE_NS` after that goal was reached, refused or cancelled.
 """
@@ -52,7 +54,7 @@ class Explorer:
         self._arrivals = np.zeros((0, 3))
         self._unreachable = np.zeros((0, 2))
         self._over_since_ns: int | None = None  # stamp since which the goal of a user is over
-        self._progress = pose, 0  # where and when (ns) the robot last got on; 0 while it need not
+        self._progress = pose, 0  # where and when (ns) the robot last got on; 0 before it began
 
     @property
     def active(self) -> bool:
@@ -95,12 +97,20 @@ class Explorer:
             return False
         if self.paused:
             return self._resumes(state, stamp_ns)
-        if state.active and not self._stalled(stamp_ns):
-            return False
         assert self.goal is not None  # noqa: S101 - as it is not paused
-        self._end_goal(self.goal, reached=state.phase is Phase.REACHED)
-        self.goal = None
-        return self.active
+        stalled, reached = self._stalled(stamp_ns), state.phase is Phase.REACHED
+        if self.phase == "returning":
+            if not state.active and (reached or stalled):
+                self.phase = "finished" if reached else "failed"
+            return self.active and not state.active  # if refused: from a narrow place, the next choice may be another
+        if state.active and not stalled:
+            return False
+        if reached:
+            self._arrivals = np.concatenate([self._arrivals, self._pose[None]])
+        else:
+            self._unreachable = np.concatenate([self._unreachable, self.goal.pose.array()[None, :2]])
+        self.goal, self._progress = None, (self._pose, 0)
+        return True
 
     def _resumes(self, state: GoalState, stamp_ns: int) -> bool:
         """Whether the goal of a user has been over for long enough."""
@@ -109,7 +119,7 @@ class Explorer:
         elif self._over_since_ns is None or stamp_ns < self._over_since_ns:
             self._over_since_ns = stamp_ns
         elif stamp_ns - self._over_since_ns >= PAUSE_NS:
-            self.paused = False
+            self.paused, self._progress = False, (self._pose, 0)
         return not self.paused
 
     def _stalled(self, stamp_ns: int) -> bool:
@@ -120,25 +130,17 @@ class Explorer:
             return False
         return stamp_ns - since_ns > STALLED_NS
 
-    def _end_goal(self, goal: Goal, *, reached: bool) -> None:
-        if self.phase == "returning":
-            self.phase = "finished" if reached else "failed"
-        elif reached:
-            self._arrivals = np.concatenate([self._arrivals, self._pose[None]])
-        else:
-            self._unreachable = np.concatenate([self._unreachable, goal.pose.array()[None, :2]])
-
-    def next_goal(self, view: View | None, half_view: float) -> Goal | None:
+    def next_goal(self, view: View | None, half_view: float, *, under_way: bool) -> Goal | None:
         """The goal of a view that was chosen, or the way back if there is none; None if the goal stays the same.
 
-        ``half_view`` rad is what the scanner sees to either side.
+        ``half_view`` rad is what the scanner sees to either side; ``under_way``: the robot drives to the last goal.
         """
         phase: Literal["exploring", "returning"] = "returning" if view is None else "exploring"
         pose = self.home if view is None else view.pose
         same = self.goal is not None and np.hypot(*(self.goal.pose.array() - pose)[:2]) <= SAME_PLACE_M
-        if same and phase == self.phase:
+        if same and phase == self.phase and under_way:
             return None
-        self.phase, self._progress = phase, (self._pose, 0)
+        self.phase = phase
         goal = Goal(stamp_ns=0, seq=self.seq, pose=Pose.of(pose), tolerance=HOME_TOLERANCE_M)
         if view is not None:
             yaw_tolerance = None if half_view >= np.pi else half_view / 2

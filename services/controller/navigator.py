@@ -102,7 +102,7 @@ class Navigator:
     def use_view(self, view: View | None, survey: Survey) -> None:
         """Drive to the view that was chosen, or back to the start if there is none."""
         if self.explorer is not None and self.explorer.drives:
-            goal = self.explorer.next_goal(view, survey.view.sector.half)
+            goal = self.explorer.next_goal(view, survey.view.sector.half, under_way=self.goal_state.active)
             if goal is not None:
                 self._set_goal(goal)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.geometry.occupancy_grid import FREE, OccupancyGrid
+from common.geometry.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from common.messages.definitions import Map
 from common.robot.base import Robot
 from services.controller.growing_map import PlannedMap
@@ -130,6 +130,25 @@ def test_a_place_without_progress_is_given_up():
     survey = drive.navigator.take_survey()
     assert survey.unreachable.tolist() == [[8.0, 2.5]]
     assert not len(survey.arrivals)
+
+
+def test_a_way_back_that_stays_refused_fails():
+    drive = begin()
+    drive.explore((5.0, 2.5))
+    drive.until(lambda _: drive.navigator._view_due)
+    shut = GRID.values.copy()
+    shut[:, 70:76] = OCCUPIED
+    grid = OccupancyGrid.of(shut, 0.05, (0.0, 0.0, 0.0))
+    drive.use_map(PlannedMap.of(Map(stamp_ns=0, grid=grid, poses=np.array([START])), 0.27))
+    drive.explore(None)
+    count, status = drive.scans, drive.step()
+    while status.exploration.phase == "returning":
+        if drive.navigator._view_due:
+            drive.explore(None)
+        status = drive.step()
+    assert status.exploration.phase == "failed"
+    assert "cannot be reached" in status.reason
+    assert 7 * FULL_S < drive.scans - count < 10 * FULL_S
 
 
 def test_a_new_map_may_show_a_better_view_and_moves_the_start():
