@@ -32,6 +32,7 @@ MIN_SHARE = 0.2  # of a scan's elements that must match the local map
 # and the number that is taken to agree anyway, so that a few elements alone are no evidence.
 MIN_AGREEMENT, AGREEING = 0.78, 10
 LOST_SCANS = 10  # successive ones that do not match, before another piece begins
+NEAR = np.array([0.1, 0.1, 0.1])  # m, m, rad from the expected pose, where a match is no chance while the robot is lost
 NO_PIECE = -1
 # A scan of which less matches sees something new; it becomes a key scan earlier, after this share of the way.
 FAMILIAR_SHARE, EARLY = 0.7, 0.25
@@ -126,7 +127,9 @@ class FrontEnd:
         familiar = found is not None and found.share > FAMILIAR_SHARE
         pose = prior.mean if found is None else found.pose
         jumps = bool((np.abs(se2.between(last, pose)) > MAX_MOTION * period).any())
-        if jumps or (not familiar and (self._lost_scans or self._is_contradicted(pose, elements, ranges, angles))):
+        off = np.abs(se2.between(prior.mean, pose))
+        lost = bool(self._lost_scans) and (found is None or bool((off > NEAR).any()))
+        if jumps or (not familiar and (lost or self._is_contradicted(pose, elements, ranges, angles))):
             found, self._lost_scans = None, max(1, self._lost_scans)
         if found is None:
             self.lost += 1
