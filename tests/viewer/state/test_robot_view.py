@@ -62,7 +62,7 @@ def test_frames():
     assert header["odom"]["x"] == 3.0
     assert header["status"] == {
         "state": "navigating", "reason": "", "distance": 8.0, "goal": {"x": 9.0, "y": 2.0, "yaw": 0.0},
-        "energy": None,
+        "energy": None, "exploration": None,
     }  # fmt: skip
     assert header["cmd"] == {"vx": 0.3, "vy": 0.4, "wz": 0.0}
     assert header["error"] == pytest.approx(0.5)
