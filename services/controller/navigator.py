@@ -203,6 +203,10 @@ class Navigator:
         status = self.goal_state.status(stamp_ns, distance)
         return status.model_copy(update={"state": "manual", "reason": reason})
 
+    def status(self, stamp_ns: int) -> Status:
+        """The status between two beliefs."""
+        return self._explained(self.goal_state.status(stamp_ns, None))
+
     def _explained(self, status: Status) -> Status:
         return status if self.explorer is None else self.explorer.explain(status)
 
