@@ -171,10 +171,10 @@ class Navigator:
         if manual_twist is not None:
             self._suspend_goal()
             command, _ = self._command.limit(stamp_ns, manual_twist, self._scan_points)
-            return command, self._manual_status(stamp_ns, None)
+            return command, self._explained(self._manual_status(stamp_ns, None))
         self.goal_state.lose_belief("no belief: is the estimator running?")
         command, _ = self._command.limit(stamp_ns, np.zeros(3), self._scan_points)
-        return command, self.goal_state.status(stamp_ns, None)
+        return command, self.status(stamp_ns)
 
     def stop_without_belief(self, stamp_ns: int, reason: str) -> tuple[CmdVel, Status]:
         """Zero command and its status, if no belief came in time. Keeps the goal, to resume it with the next belief."""
@@ -183,7 +183,7 @@ class Navigator:
         command = self._command.stop(stamp_ns, paused=paused)
         self.policy.interrupt()
         self.goal_state.lose_belief(reason)
-        status = self.goal_state.status(stamp_ns, None)
+        status = self.status(stamp_ns)
         if not status.refused:  # otherwise keep showing why the goal was refused
             status = status.model_copy(update={"reason": reason})
         return command, status
@@ -202,6 +202,10 @@ class Navigator:
         reason = "driven by hand; the goal waits" if self.goal_state.active else "driven by hand"
         status = self.goal_state.status(stamp_ns, distance)
         return status.model_copy(update={"state": "manual", "reason": reason})
+
+    def status(self, stamp_ns: int) -> Status:
+        """The status between two beliefs."""
+        return self._explained(self.goal_state.status(stamp_ns, None))
 
     def _explained(self, status: Status) -> Status:
         return status if self.explorer is None else self.explorer.explain(status)

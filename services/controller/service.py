@@ -134,7 +134,7 @@ class ControllerService(Service):
             self.navigator.on_goal(message)
             self.log.info("goal", x=message.pose.x, y=message.pose.y, cancel=message.cancel, explore=message.explore)
             stamp_ns = self._last_answer[0] if self._last_answer else 0
-            self.publish(STATUS, self.navigator.goal_state.status(stamp_ns, None))
+            self.publish(STATUS, self.navigator.status(stamp_ns))
         elif isinstance(message, Belief):
             self._on_belief(message)
         elif isinstance(message, Map) and self.geodesic is not None and not self.settings.world:

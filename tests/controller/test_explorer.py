@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from common.geometry.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
-from common.messages.definitions import Map
+from common.messages.definitions import Drive, Map, Twist
 from common.robot.base import Robot
 from services.controller.growing_map import PlannedMap
 from services.controller.navigator import Navigator
@@ -22,7 +22,7 @@ def map_with(*poses) -> PlannedMap:
     return PlannedMap.of(Map(stamp_ns=0, grid=GRID, poses=np.array(poses, float)), 0.27)
 
 
-class Drive:
+class PerfectRobot:
     """A perfect robot, whose views are chosen by the test."""
 
     def __init__(self) -> None:
@@ -62,8 +62,8 @@ class Drive:
             self.navigator.use_view(view, survey)
 
 
-def begin() -> Drive:
-    drive = Drive()
+def begin() -> PerfectRobot:
+    drive = PerfectRobot()
     drive.navigator.on_goal(goal(0, 0, explore=True, seq=5))
     return drive
 
@@ -112,6 +112,16 @@ def test_a_goal_of_a_user_takes_precedence():
     assert drive.scans - count >= 2 * FULL_S - 1  # whoever waits for the goal sees that it was reached
     drive.explore((8.0, 2.5))
     assert drive.step().state == "exploring"
+
+
+def test_every_status_tells_the_progress():
+    drive = begin()
+    drive.explore((8.0, 2.5))
+    statuses = [drive.step(), drive.navigator.status(0), drive.navigator.stop_without_belief(0, "no belief")[1]]
+    drive.navigator.on_drive(Drive(stamp_ns=0, twist=Twist(vx=0.1)))
+    statuses += [drive.step(), drive.navigator.step_without_belief(drive.scans * PERIOD_NS)[1]]
+    assert [status.state for status in statuses] == ["exploring", "exploring", "lost", "manual", "manual"]
+    assert {status.exploration.seq for status in statuses} == {5}
 
 
 def test_cancelling_ends_it():
