@@ -60,6 +60,8 @@ class Joining:
             rest = [each for each in self._matches if in_map[each.closure.first]]
             rest = [each for each in rest if of_segment[each.closure.second] == of_segment[second]]
             if found := _agreeing(rest, segments, poses):
+                # Once only: if this join is taken back, the same matches must not lead to it again.
+                self._matches = [each for each in self._matches if all(each.closure is not used for used in found)]
                 return found
         return []
 
