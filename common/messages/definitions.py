@@ -128,8 +128,8 @@ class Belief(Stamped):
     # best first; the first one is at `pose`
     probability: Annotated[float, Field(ge=0, le=1)] | None = None  # that `pose` is within 0.2 m and 5 degrees of the
     # truth; nil if the estimator states none
-    protection: Floats | None = None  # (3,) m along x and y of base_link, and rad: errors exceeded once in
-    # 10^4 scans; nil if the estimator states none
+    protection: Floats | None = None  # (3,) m along x and y of base_link, and rad: errors to be exceeded
+    # once in 10^4 scans; nil if the estimator states none
     estimator: Name = ""
     frame_id: Name = "map"
 

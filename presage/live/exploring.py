@@ -21,14 +21,14 @@ def explore(link: Link, console: Console) -> int:
     with session(link) as bus:
         watch = Watch(bus, STATUS)
         if not bus.wait_matching(GOAL, ANSWER_TIMEOUT_S):
-            raise UserError("no controller receives goals: is it running?")
+            raise UserError("no controller is running: start one with `presage up --mapping`")
         request = Goal(stamp_ns=0, seq=time.time_ns(), pose=Pose(x=0.0, y=0.0), explore=True)
         try:
             bus.put(GOAL, request.encode())
             return _follow(watch, request.seq, console)
         except KeyboardInterrupt:
             _stop(watch, request)
-            console.print("stopped; the map is kept")
+            console.print("stopped; `presage save-map NAME` saves the map so far")
             raise
 
 
@@ -41,12 +41,15 @@ def _follow(watch: Watch, seq: int, console: Console) -> int:
         while status is not None:
             progress = _progress(status, seq)
             if progress is None:
-                raise UserError(status.reason if status.refused else "the exploration was cancelled")
+                raise UserError(
+                    status.reason if status.refused else "the exploration was cancelled, or another one began"
+                )
             so_far = f"{progress.area:.0f} m² mapped, {progress.path:.1f} m driven"
             line.update(f"{progress.phase}: {so_far}; {status.state} {status.reason}")
             if progress.phase == "finished":
                 seconds = (status.stamp_ns - began_ns) * 1e-9
                 console.print(f"finished: {so_far} in {seconds:.0f} s; the robot is back where it began")
+                console.print("`presage save-map NAME` saves the map")
                 return 0
             if progress.phase == "failed":
                 console.print(f"the robot cannot return to where it began: {status.reason}; {so_far}")

@@ -77,7 +77,8 @@ class Navigator:
         self.policy.set_goal(None)
         if self._map is None or self._pose is None:
             self.goal_state.start(
-                request, "cannot explore without a mapper's map: does a mapper run, and do scans arrive?"
+                request,
+                "cannot explore: no map from a mapper. Start with `presage up --mapping` and wait for the first scan",
             )
             return
         self.goal_state.cancel()

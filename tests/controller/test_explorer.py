@@ -73,7 +73,7 @@ def test_no_exploration_without_a_map():
     navigator.on_goal(goal(0, 0, explore=True, seq=5))
     status = navigator.goal_state.status(0, None)
     assert status.refused
-    assert "does a mapper run" in status.reason
+    assert "no map from a mapper" in status.reason
 
 
 def test_views_then_the_way_back():
