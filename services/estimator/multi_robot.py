@@ -81,7 +81,8 @@ class FleetRobot(EstimatorService):
         """Discards the belief; the result of a search that is running will not be used."""
         if self.search is not None:
             self.search.cancel()
-        self.search = self.estimator = self.geometry = self.waiting_scan = self.odom = self.command = self.last = None
+        self.odometry_sync.clear()
+        self.search = self.estimator = self.geometry = self.command = self.last = None
 
 
 class FleetService(Service):

@@ -25,6 +25,7 @@ from common.messages.topics import (
     Topic,
 )
 from common.robot.ranges import ranges_for_localisation
+from common.runtime.odometry_sync import OdometrySync, ScanWithOdometry
 from common.runtime.service import Service
 from services.estimator.factory import EstimatorOptions, Factory, Geometry, prepare
 from services.estimator.model_card import ModelInUse, model_in_use
@@ -90,9 +91,8 @@ class EstimatorService(Service):
         self.estimator: Estimator | None = None
         self.model: ModelInUse | str = "no scan has come yet"  # or the reason why it is unknown
         self.goal: Goal | None = None
-        self.odom: Odom | None = None
+        self.odometry_sync = OdometrySync()  # used if the prior is odometry
         self.command: CmdVel | None = None
-        self.waiting_scan: Scan | None = None  # a scan that waits for the odometry of its stamp
         self.last: tuple[int, Belief, Prediction] | None = None  # stamp in ns and results of the latest scan
 
     def open(self) -> None:
@@ -111,20 +111,10 @@ class EstimatorService(Service):
         elif isinstance(message, CmdVel):
             self.command = message
         elif isinstance(message, Odom):
-            self.odom = message
-            if self.waiting_scan is not None and message.stamp_ns >= self.waiting_scan.stamp_ns:
-                self._update_waiting()
+            self._update_all(self.odometry_sync.add_odometry(message))
         elif isinstance(message, Scan):
-            self._update_waiting()  # without its odometry, which did not come in time
-            if self.settings.prior == "odometry" and (self.odom is None or self.odom.stamp_ns < message.stamp_ns):
-                self.waiting_scan = message
-            else:
-                self._update(message)
-
-    def _update_waiting(self) -> None:
-        scan, self.waiting_scan = self.waiting_scan, None
-        if scan is not None:
-            self._update(scan)
+            wait = self.settings.prior == "odometry"
+            self._update_all(self.odometry_sync.add_scan(message) if wait else [(message, None)])
 
     def on_request(self, query: Query, request: Request) -> Reply:
         """Answers a request to localise again, to predict scans, or to describe the model."""
@@ -142,11 +132,12 @@ class EstimatorService(Service):
         self.estimator.restart(start if start is None or request.heading_known else start[:2])
         return Reply()
 
-    def _update(self, scan: Scan) -> None:
-        if self.last is not None and self.last[0] == scan.stamp_ns:
-            self._publish(*self.last[1:])  # a repeated scan gets the same belief again
-        elif (estimator := self._estimator_for(scan)) is not None:
-            self.update_estimator(scan, estimator, self._observation(scan))
+    def _update_all(self, scans: list[ScanWithOdometry]) -> None:
+        for scan, odom in scans:
+            if self.last is not None and self.last[0] == scan.stamp_ns:
+                self._publish(*self.last[1:])  # a repeated scan gets the same belief again
+            elif (estimator := self._estimator_for(scan)) is not None:
+                self.update_estimator(scan, estimator, self._observation(scan, odom))
 
     def update_estimator(self, scan: Scan, estimator: Estimator, observation: Observation) -> None:
         """Updates the estimator and publishes the posterior."""
@@ -187,9 +178,8 @@ class EstimatorService(Service):
         self.note = ""
         return self.estimator
 
-    def _observation(self, scan: Scan) -> Observation:
+    def _observation(self, scan: Scan, odom: Odom | None) -> Observation:
         prior = self.settings.prior
-        odom = self.odom if prior == "odometry" and self.odom and self.odom.stamp_ns == scan.stamp_ns else None
         if prior == "odometry" and odom is None:
             self.counters["scans_without_odometry"] += 1
         command = self.command if prior == "command" else None

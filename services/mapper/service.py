@@ -19,6 +19,7 @@ from common.messages.topics import BELIEF, MAP, ODOM, SAVE_MAP, SCAN, Query, Top
 from common.robot.motion_distortion import evenly_spaced
 from common.robot.ranges import ranges_for_localisation
 from common.robot.scan_geometry import Sweep
+from common.runtime.odometry_sync import OdometrySync
 from common.runtime.service import Service
 from services.mapper.settings import MapperSettings
 from services.mapper.slam.drive import Laser
@@ -30,7 +31,7 @@ from services.mapper.slam.search import search
 MAP_NAME = r"[A-Za-z0-9_-]{1,64}"
 UPDATE_PERIOD_NS = 1_000_000_000  # between the beginnings of two updates of the map, which leaves time for the scans
 REPEAT_PERIOD_NS = 5_000_000_000  # an unchanged map is published again after this time, for subscribers that came later
-ODOMETRY_TIMEOUT_NS = 1_000_000_000  # scans wait for their odometry unless there was none for this time
+MAX_ODOMETRY_SILENCE_NS = 1_000_000_000  # scans no longer wait for odometry if none came for this time
 
 
 class MapperService(Service):
@@ -51,8 +52,7 @@ class MapperService(Service):
         super().__init__(settings)
         self.mapper: Mapper | None = None
         self._belief: Belief | None = None  # of the latest scan
-        self._odom: Odom | None = None
-        self._waiting_scan: Scan | None = None  # waits for the odometry of its stamp
+        self._odometry_sync = OdometrySync(MAX_ODOMETRY_SILENCE_NS)
         self._pool = ThreadPoolExecutor(1, "update")
         self._update: Future[GrownMap] | None = None
         self._update_ns = self._published_ns = -UPDATE_PERIOD_NS  # stamps of the last update and of the last map
@@ -69,22 +69,15 @@ class MapperService(Service):
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
         """Maps a scan together with its odometry, if there is any."""
         if isinstance(message, Odom):
-            self._odom = message
-            if self._waiting_scan is not None and message.stamp_ns >= self._waiting_scan.stamp_ns:
-                self._add_waiting()
+            ready = self._odometry_sync.add_odometry(message)
         elif isinstance(message, Scan):
-            self._add_waiting()  # without its odometry, which did not come in time
-            self._waiting_scan = message
-            late = self._odom is not None and 0 < message.stamp_ns - self._odom.stamp_ns < ODOMETRY_TIMEOUT_NS
-            if not late:
-                self._add_waiting()
+            ready = self._odometry_sync.add_scan(message)
+        else:
+            return
+        for scan, odom in ready:
+            self._add(scan, odom)
 
-    def _add_waiting(self) -> None:
-        scan, self._waiting_scan = self._waiting_scan, None
-        if scan is not None:
-            self._add(scan)
-
-    def _add(self, scan: Scan) -> None:
+    def _add(self, scan: Scan, odom: Odom | None) -> None:
         if self._belief is not None and self._belief.stamp_ns == scan.stamp_ns:
             self.publish(BELIEF, self._belief)  # a repeated scan gets the same belief again
             return
@@ -92,8 +85,7 @@ class MapperService(Service):
         ranges = ranges_for_localisation(scan.ranges)
         if not np.array_equal(angles, mapper.laser.angles):  # some scanners' numbers of beams vary from turn to turn
             ranges = evenly_spaced(ranges, angles, Sweep.of_angles(mapper.laser.angles), -np.inf)
-        odom = self._odom.pose.array() if self._odom is not None and self._odom.stamp_ns == scan.stamp_ns else None
-        place = mapper.add(scan.stamp_ns * 1e-9, ranges, odom)
+        place = mapper.add(scan.stamp_ns * 1e-9, ranges, None if odom is None else odom.pose.array())
         if not place.matched:
             self.counters["unmatched_scans"] += 1
         self._belief = belief_message(scan, place)

@@ -179,9 +179,9 @@ def test_scan_waits_for_odometry(precise):
 
 def test_command_as_prior(precise):
     precise.on_message(CMD_VEL, CmdVel(stamp_ns=1, twist=Twist(vx=0.5)))
-    assert precise._observation(a_scan(2)).command is None
+    assert precise._observation(a_scan(2), None).command is None
     precise.settings = EstimatorSettings(prior="command")
-    assert precise._observation(a_scan(2)).command.tolist() == [0.5, 0, 0]
+    assert precise._observation(a_scan(2), None).command.tolist() == [0.5, 0, 0]
 
 
 @pytest.mark.parametrize("estimator", ["precise", "paper"])

@@ -1,0 +1,42 @@
+"""Pairs each scan with the odometry of its stamp, which may arrive later than the scan."""
+
+from __future__ import annotations
+
+import math
+
+from common.messages.definitions import Odom, Scan
+
+ScanWithOdometry = tuple[Scan, Odom | None]
+
+
+class OdometrySync:
+    """Holds a scan back until its odometry or the next scan arrives; then it goes on without odometry."""
+
+    def __init__(self, max_silence_ns: int | None = None) -> None:
+        """A scan does not wait if no odometry came for ``max_silence_ns`` before it; by default it always waits."""
+        self._max_silence_ns = max_silence_ns
+        self.clear()
+
+    def clear(self) -> None:
+        """Discards the waiting scan and the last odometry."""
+        self._odom: Odom | None = None
+        self._waiting: Scan | None = None
+
+    def add_odometry(self, odom: Odom) -> list[ScanWithOdometry]:
+        """Returns the scan that waited for this odometry, if any."""
+        self._odom = odom
+        return self._release() if self._waiting is not None and odom.stamp_ns >= self._waiting.stamp_ns else []
+
+    def add_scan(self, scan: Scan) -> list[ScanWithOdometry]:
+        """Returns the scans that no longer wait: the one before, and this one unless it waits itself."""
+        ready = self._release()
+        self._waiting = scan
+        silence_ns = math.inf if self._odom is None else scan.stamp_ns - self._odom.stamp_ns
+        waits = silence_ns > 0 and (self._max_silence_ns is None or silence_ns < self._max_silence_ns)
+        return ready if waits else ready + self._release()
+
+    def _release(self) -> list[ScanWithOdometry]:
+        scan, self._waiting = self._waiting, None
+        if scan is None:
+            return []
+        return [(scan, self._odom if self._odom is not None and self._odom.stamp_ns == scan.stamp_ns else None)]
