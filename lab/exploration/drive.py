@@ -15,95 +15,120 @@ from common.geometry import se2
 from common.geometry.occupancy_grid import FREE
 from common.geometry.se2 import Array
 from common.geometry.world import World
-from common.messages.definitions import Belief, Goal, Map, Pose
+from common.messages.definitions import Belief, Goal, Map, Odom, Pose, Scan, Twist
 from common.robot.base import Robot
 from common.robot.scanner import SCANNERS
 from lab.benchmarks.mapping import trajectory_errors
 from services.controller.growing_map import PlannedMap
 from services.controller.navigator import Navigator
-from services.controller.policies.exploration import Survey, View
+from services.controller.policies.exploration import Survey, Viewpoint
 from services.controller.policies.planner import GeodesicPolicy
 from services.mapper.service import belief_message, map_message
 from services.mapper.slam.drive import Laser
 from services.mapper.slam.mapper import Mapper
 from services.simulator.simulation import Setup, Simulation
 
-Choice = Callable[[Survey], View | None]
+ChooseViewpoint = Callable[[Survey], Viewpoint | None]
+CELL_M = 0.05  # of the map
 MAP_PERIOD_NS = 1_000_000_000  # between two versions of the map, as in the mapper's service
 MIN_PASSAGE_M = 0.7  # a narrower door may be refused (docs/navigation.md, limits)
 LAST_SCANS = 15  # while the robot comes to a stand
 
 
 @dataclass
-class Exploration:
+class ExplorationRun:
     """What happened, one entry for each scan."""
 
     truths: list[Array] = field(default_factory=list)  # (3,)
     beliefs: list[Array] = field(default_factory=list)  # (3,)
     contacts: list[Array] = field(default_factory=list)  # (3,) true poses with a contact
     held_back: int = 0  # scans at which the obstacle stop held the robot
-    lost: int = 0  # scans that did not match the map
+    unmatched: int = 0  # scans that did not match the map
     phase: str = "exploring"
     reason: str = ""  # of the last status
     map: Map | None = None
-    choice_ms: list[float] = field(default_factory=list)
+    choice_ms: list[float] = field(default_factory=list)  # duration of each choice of a viewpoint
     targets: list[Array] = field(default_factory=list)  # (3,) in map
 
 
+class RobotWithMapper:
+    """Mapper and controller of an exploring robot, and the record of its run."""
+
+    def __init__(self, robot: Robot, choose: ChooseViewpoint) -> None:
+        self.run, self.finished = ExplorationRun(), False
+        self._choose, self._policy = choose, GeodesicPolicy(robot, None)
+        self._navigator = Navigator(robot, preset=self._policy)
+        self._mapper: Mapper | None = None  # built for the first scan
+        self._map: PlannedMap | None = None
+        self._map_stamp_ns = -MAP_PERIOD_NS
+
+    def step(self, odom: Odom, scan: Scan) -> Twist:
+        """The velocity that answers a scan."""
+        belief = self._update_mapper(odom, scan)
+        self._navigator.on_scan(scan)
+        command, status = self._navigator.step(belief)
+        self.run.reason = status.reason
+        if self._navigator.explorer is None:
+            self._navigator.on_goal(Goal(stamp_ns=0, seq=1, pose=Pose(x=0.0, y=0.0), explore=True))
+        self._choose_viewpoint()
+        if self._navigator.explorer is not None:
+            self.run.phase = self._navigator.explorer.phase
+            self.finished = not self._navigator.explorer.active
+        return command.twist
+
+    def _update_mapper(self, odom: Odom, scan: Scan) -> Belief:
+        """Localises the scan, and uses a new version of the map once in `MAP_PERIOD_NS`."""
+        if self._mapper is None:
+            laser = Laser(scan.angles(), scan.mount.array(), scan.range_max, scan.time_increment)
+            self._mapper = Mapper(laser, CELL_M)
+        mapper = self._mapper
+        place = mapper.add(scan.stamp_ns * 1e-9, scan.ranges.astype(float), odom.pose.array())
+        self.run.beliefs.append(place.pose)
+        self.run.unmatched += not place.matched
+        if mapper.outdated and scan.stamp_ns - self._map_stamp_ns >= MAP_PERIOD_NS:
+            self._map_stamp_ns = scan.stamp_ns
+            mapper.use(mapper.update(mapper.key_scans()))
+            assert mapper.map is not None  # noqa: S101 - it was just made
+            self._use_map(map_message(scan.stamp_ns, mapper.map))
+        return belief_message(scan, place)
+
+    def _use_map(self, message: Map) -> None:
+        self.run.map = message
+        planned = PlannedMap.of(message, self._policy.robot.radius)
+        self._policy.use_map(planned.graph, jumped=self._map is not None and planned.jumped_from(self._map))
+        self._map = planned
+        self._navigator.on_map(planned)
+
+    def _choose_viewpoint(self) -> None:
+        survey = self._navigator.take_survey()
+        if survey is None:
+            return
+        began = time.perf_counter()
+        viewpoint = self._choose(survey)
+        self.run.choice_ms.append(1e3 * (time.perf_counter() - began))
+        if viewpoint is not None:
+            self.run.targets.append(viewpoint.pose)
+        self._navigator.use_viewpoint(viewpoint, survey)
+
+
 def explore(
-    world: World, robot: Robot, choice: Choice, start: Array, seed: int, limit_s: float, *, beams: int = 622
-) -> Exploration:
+    world: World, robot: Robot, choose: ChooseViewpoint, start: Array, seed: int, limit_s: float, *, beams: int = 622
+) -> ExplorationRun:
     """Explore a world from ``start`` (3,) until the explorer has finished or failed, or for ``limit_s`` s."""
-    policy, run = GeodesicPolicy(robot, None), Exploration()
-    navigator = Navigator(robot, preset=policy)
-    scanner = SCANNERS["tim571"].with_beams(beams)
-    mapper: Mapper | None = None
-    planned: PlannedMap | None = None
-    updated_ns, last = -MAP_PERIOD_NS, 0
-    with closing(Simulation(Setup(world, scanner, robot, _pose(start), seed, sweep=True))) as simulation:
-        while simulation.stamp_ns < limit_s * 1e9 and last < LAST_SCANS:
+    explorer, scanner = RobotWithMapper(robot, choose), SCANNERS["tim571"].with_beams(beams)
+    x, y, yaw = start.tolist()
+    run, last_scans = explorer.run, 0
+    with closing(Simulation(Setup(world, scanner, robot, (x, y, yaw), seed, sweep=True))) as simulation:
+        while simulation.stamp_ns < limit_s * 1e9 and last_scans < LAST_SCANS:
             odom, truth, scan = simulation.observe()
-            if mapper is None:
-                mapper = Mapper(Laser(scan.angles(), scan.mount.array(), scan.range_max, scan.time_increment), 0.05)
-            place = mapper.add(scan.stamp_ns * 1e-9, scan.ranges.astype(float), odom.pose.array())
-            belief: Belief = belief_message(scan, place)
             run.truths.append(truth.pose.array())
-            run.beliefs.append(place.pose)
             run.contacts += [truth.pose.array()] if truth.contact else []
             run.held_back += truth.stopped
-            run.lost += not place.matched
-            if mapper.outdated and scan.stamp_ns - updated_ns >= MAP_PERIOD_NS:
-                updated_ns = scan.stamp_ns
-                mapper.use(mapper.update(mapper.key_scans()))
-                assert mapper.map is not None  # noqa: S101 - it was just made
-                run.map = map_message(scan.stamp_ns, mapper.map)
-                new = PlannedMap.of(run.map, robot.radius)
-                policy.use_map(new.graph, jumped=planned is not None and new.jumped_from(planned))
-                planned = new
-                navigator.on_map(new)
-            navigator.on_scan(scan)
-            command, status = navigator.step(belief)
-            run.reason = status.reason
-            if navigator.explorer is None:
-                navigator.on_goal(Goal(stamp_ns=0, seq=1, pose=Pose(x=0.0, y=0.0), explore=True))
-            if (survey := navigator.take_survey()) is not None:
-                began = time.perf_counter()
-                view = choice(survey)
-                run.choice_ms.append(1e3 * (time.perf_counter() - began))
-                if view is not None:
-                    run.targets.append(view.pose)
-                navigator.use_view(view, survey)
-            if navigator.explorer is not None:
-                run.phase = navigator.explorer.phase
-                last += not navigator.explorer.active
-            simulation.command(scan.stamp_ns, command.twist)
+            twist = explorer.step(odom, scan)
+            last_scans += explorer.finished
+            simulation.command(scan.stamp_ns, twist)
             simulation.advance()
     return run
-
-
-def _pose(pose: Array) -> tuple[float, float, float]:
-    x, y, yaw = pose.tolist()
-    return x, y, yaw
 
 
 def reachable_area(world: World, radius: float, start: Array) -> shapely.Geometry:
@@ -113,7 +138,7 @@ def reachable_area(world: World, radius: float, start: Array) -> shapely.Geometr
     return shapely.buffer(shapely.union_all(parts), radius)
 
 
-def mapped_share(run: Exploration, area: shapely.Geometry) -> float:
+def mapped_share(run: ExplorationRun, area: shapely.Geometry) -> float:
     """Share of an area that is free in the map, by points 5 cm apart."""
     x0, y0, x1, y1 = shapely.bounds(area)
     x, y = np.meshgrid(np.arange(x0 + 0.025, x1, 0.05), np.arange(y0 + 0.025, y1, 0.05))
@@ -125,7 +150,7 @@ def mapped_share(run: Exploration, area: shapely.Geometry) -> float:
     return float(np.mean(run.map.grid.values_at(se2.transform(se2.inverse(run.truths[0]), points)) == FREE))
 
 
-def measure(run: Exploration, world: World, robot: Robot) -> dict[str, Any]:
+def measure(run: ExplorationRun, world: World, robot: Robot) -> dict[str, Any]:
     """The numbers of one exploration."""
     truths, beliefs = np.array(run.truths), np.array(run.beliefs)
     area, tight = (reachable_area(world, radius, truths[0]) for radius in (MIN_PASSAGE_M / 2, robot.radius))
@@ -140,7 +165,7 @@ def measure(run: Exploration, world: World, robot: Robot) -> dict[str, Any]:
         "return_error_m": float(np.hypot(*(truths[-1] - truths[0])[:2])),
         "contact_scans": len(run.contacts),
         "held_back_scans": run.held_back,
-        "lost_scans": run.lost,
+        "lost_scans": run.unmatched,
         "seconds": len(truths) / 15,
         "belief_rms_m": float(np.sqrt((errors**2).mean())),
         "choices": len(run.choice_ms),

@@ -22,10 +22,10 @@ from lab.experiments.trials import run_trials
 from lab.exploration.drive import explore, measure
 from lab.exploration.nearest_frontier import nearest_frontier
 from lab.integrity.buildings import make_building
-from services.controller.policies.exploration import choose_view
+from services.controller.policies.exploration import choose_viewpoint
 
 EXPERIMENT_ID = 21  # part of the random seeds
-EXPLORERS = {"presage": choose_view, "nearest frontier": nearest_frontier}
+EXPLORERS = {"presage": choose_viewpoint, "nearest frontier": nearest_frontier}
 START_CLEARANCE_M = 0.5
 MIN_SHARE, MAX_RETURN_ERROR_M = 0.95, 0.02  # required
 

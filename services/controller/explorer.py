@@ -3,14 +3,14 @@
 | from | event | to |
 |---|---|---|
 | - | a goal with `explore` | EXPLORING |
-| EXPLORING, RETURNING | a view is worth the way | EXPLORING |
-| EXPLORING, RETURNING | no view is | RETURNING |
+| EXPLORING, RETURNING | a viewpoint is worth the way | EXPLORING |
+| EXPLORING, RETURNING | no viewpoint is | RETURNING |
 | RETURNING | the robot has arrived | FINISHED |
 | RETURNING | the way back stays refused | FAILED |
 
-A view that is refused, or that the robot gets no nearer to for `STALLED_NS`, is given up.
+A viewpoint is given up if it is refused, or if the robot does not move towards it for `STALLED_NS`.
 
-A goal of a user pauses it until `PAUSE_NS` after that goal was reached, refused or cancelled.
+A goal of a user pauses the exploration until `PAUSE_NS` after that goal was reached, refused or cancelled.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from services.controller.goal_state import GoalState
     from services.controller.growing_map import PlannedMap
-    from services.controller.policies.exploration import ScannerView, Survey, View
+    from services.controller.policies.exploration import FieldOfView, Survey, Viewpoint
 
 PAUSE_NS = 2_000_000_000  # for which the robot stands at a goal of a user
-STALLED_NS = 8_000_000_000  # without a motion of STALLED_M after which a place counts as unreachable
+STALLED_NS = 8_000_000_000  # without a motion of `STALLED_M`, after which the goal counts as unreachable
 STALLED_M = 0.2
-VIEW_TOLERANCE_M = 0.1
+VIEWPOINT_TOLERANCE_M = 0.1
 HOME_TOLERANCE_M = 0.005
-SAME_PLACE_M = 0.1  # a view this close to the present goal is the same
+SAME_PLACE_M = 0.1  # a viewpoint this close to the present goal is the same
 
 
 class Explorer:
@@ -44,7 +44,7 @@ class Explorer:
         """Begin at a pose (3,) in a map; ``seq`` is the number of the request."""
         self.seq, self.map = seq, planned
         self.phase: Literal["exploring", "returning", "finished", "failed"] = "exploring"
-        self.goal: Goal | None = None  # its own goal
+        self.goal: Goal | None = None  # of the exploration, not of a user
         self.paused = False  # the goal of a user takes precedence
         self.path_m = 0.0
         self._pose = pose
@@ -53,8 +53,8 @@ class Explorer:
         self._home = se2.between(planned.message.poses[self._home_key], pose)
         self._arrivals = np.zeros((0, 3))
         self._unreachable = np.zeros((0, 2))
-        self._over_since_ns: int | None = None  # stamp since which the goal of a user is over
-        self._progress = pose, 0  # where and when (ns) the robot last got on; 0 before it began
+        self._user_goal_over_since_ns: int | None = None
+        self._last_moved = pose, 0  # pose and stamp in ns; the stamp is 0 before the first step towards a goal
 
     @property
     def active(self) -> bool:
@@ -74,77 +74,90 @@ class Explorer:
 
     def pause(self) -> None:
         """A user has set a goal, or cancelled it."""
-        self.goal, self.paused, self._over_since_ns = None, True, None
+        self.goal, self.paused, self._user_goal_over_since_ns = None, True, None
 
     def move(self, pose: Array) -> None:
         """The robot is at a pose (3,)."""
         self.path_m += float(np.hypot(*(pose - self._pose)[:2]))
         self._pose = pose
 
-    def survey(self, view: ScannerView) -> Survey:
-        """What the choice of the next view depends on."""
+    def survey(self, field_of_view: FieldOfView) -> Survey:
+        """What the choice of the next viewpoint depends on."""
         from services.controller.policies.exploration import Survey  # compiles
 
         target = None
         if self.goal is not None and self.phase == "exploring":
             target = self.goal.pose.array()[:2]
         poses, home = self.map.message.poses, self.home[:2]
-        return Survey(self.map.graph, poses, self._arrivals, view, self._pose, home, target, self._unreachable)
+        return Survey(self.map.graph, poses, self._arrivals, field_of_view, self._pose, home, target, self._unreachable)
 
-    def needs_goal(self, state: GoalState, stamp_ns: int) -> bool:
-        """Whether the present goal has just ended, so that a view must be chosen; notes how it ended."""
-        if not self.active or not (self.paused or self.goal is not None):
+    def update(self, state: GoalState, stamp_ns: int) -> bool:
+        """Takes the state of the robot's goal after a scan. Returns whether a viewpoint must be chosen now."""
+        if not self.active:
             return False
         if self.paused:
-            return self._resumes(state, stamp_ns)
-        assert self.goal is not None  # noqa: S101 - as it is not paused
-        stalled, reached = self._stalled(stamp_ns), state.phase is Phase.REACHED
-        if self.phase == "returning":
-            if not state.active and (reached or stalled):
-                self.phase = "finished" if reached else "failed"
-            return self.active and not state.active  # if refused: from a narrow place, the next choice may be another
-        if state.active and not stalled:
+            return self._resume_after_user_goal(state, stamp_ns)
+        if self.goal is None:
             return False
-        if reached:
-            self._arrivals = np.concatenate([self._arrivals, self._pose[None]])
-        else:
-            self._unreachable = np.concatenate([self._unreachable, self.goal.pose.array()[None, :2]])
-        self.goal, self._progress = None, (self._pose, 0)
-        return True
+        stalled = self._has_stalled(stamp_ns)
+        if self.phase == "returning":
+            return self._update_return(state, stalled=stalled)
+        return self._update_viewpoint(self.goal, state, stalled=stalled)
 
-    def _resumes(self, state: GoalState, stamp_ns: int) -> bool:
-        """Whether the goal of a user has been over for long enough."""
+    def _resume_after_user_goal(self, state: GoalState, stamp_ns: int) -> bool:
+        """Ends the pause if the goal of a user has been over for `PAUSE_NS`; returns whether it did."""
         if state.active:
-            self._over_since_ns = None
-        elif self._over_since_ns is None or stamp_ns < self._over_since_ns:
-            self._over_since_ns = stamp_ns
-        elif stamp_ns - self._over_since_ns >= PAUSE_NS:
-            self.paused, self._progress = False, (self._pose, 0)
+            self._user_goal_over_since_ns = None
+        elif self._user_goal_over_since_ns is None or stamp_ns < self._user_goal_over_since_ns:
+            self._user_goal_over_since_ns = stamp_ns
+        elif stamp_ns - self._user_goal_over_since_ns >= PAUSE_NS:
+            self.paused, self._last_moved = False, (self._pose, 0)
         return not self.paused
 
-    def _stalled(self, stamp_ns: int) -> bool:
-        """Whether the robot has not got on for `STALLED_NS`."""
-        place, since_ns = self._progress
+    def _has_stalled(self, stamp_ns: int) -> bool:
+        """Whether the robot has not moved by `STALLED_M` for `STALLED_NS`; notes when it moves."""
+        place, since_ns = self._last_moved
         if np.hypot(*(self._pose - place)[:2]) > STALLED_M or not 0 < since_ns <= stamp_ns:
-            self._progress = self._pose, stamp_ns
+            self._last_moved = self._pose, stamp_ns
             return False
         return stamp_ns - since_ns > STALLED_NS
 
-    def next_goal(self, view: View | None, half_view: float, *, under_way: bool) -> Goal | None:
-        """The goal of a view that was chosen, or the way back if there is none; None if the goal stays the same.
+    def _update_return(self, state: GoalState, *, stalled: bool) -> bool:
+        """Ends the exploration if the robot is back, or cannot get back; returns whether to try once more."""
+        if state.active:
+            return False
+        if state.phase is Phase.REACHED:
+            self.phase = "finished"
+        elif stalled:
+            self.phase = "failed"
+        return self.active  # the way was refused: from a narrow place, the next attempt may find another one
 
-        ``half_view`` rad is what the scanner sees to either side; ``under_way``: the robot drives to the last goal.
+    def _update_viewpoint(self, goal: Goal, state: GoalState, *, stalled: bool) -> bool:
+        """Notes whether the viewpoint was reached or cannot be; returns whether either is so."""
+        if state.active and not stalled:
+            return False
+        if state.phase is Phase.REACHED:
+            self._arrivals = np.concatenate([self._arrivals, self._pose[None]])
+        else:
+            self._unreachable = np.concatenate([self._unreachable, goal.pose.array()[None, :2]])
+        self.goal, self._last_moved = None, (self._pose, 0)
+        return True
+
+    def next_goal(self, viewpoint: Viewpoint | None, half_field_of_view: float, *, under_way: bool) -> Goal | None:
+        """The goal of the viewpoint that was chosen, or the way back if there is none; None if the goal stays the same.
+
+        The scanner sees ``half_field_of_view`` rad to either side. ``under_way``: the robot drives to the last goal.
         """
-        phase: Literal["exploring", "returning"] = "returning" if view is None else "exploring"
-        pose = self.home if view is None else view.pose
+        phase: Literal["exploring", "returning"] = "returning" if viewpoint is None else "exploring"
+        pose = self.home if viewpoint is None else viewpoint.pose
         same = self.goal is not None and np.hypot(*(self.goal.pose.array() - pose)[:2]) <= SAME_PLACE_M
         if same and phase == self.phase and under_way:
             return None
         self.phase = phase
         goal = Goal(stamp_ns=0, seq=self.seq, pose=Pose.of(pose), tolerance=HOME_TOLERANCE_M)
-        if view is not None:
-            yaw_tolerance = None if half_view >= np.pi else half_view / 2
-            goal = goal.model_copy(update={"tolerance": VIEW_TOLERANCE_M, "yaw_tolerance": yaw_tolerance})
+        if viewpoint is not None:
+            yaw_tolerance = None if half_field_of_view >= np.pi else half_field_of_view / 2
+            goal = goal.model_copy(update={"tolerance": VIEWPOINT_TOLERANCE_M, "yaw_tolerance": yaw_tolerance})
         self.goal = goal
         return goal
 

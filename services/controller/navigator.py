@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.geometry.world import World
     from services.controller.growing_map import PlannedMap
-    from services.controller.policies.exploration import Survey, View
+    from services.controller.policies.exploration import Survey, Viewpoint
 
 
 @dataclass
@@ -48,7 +48,7 @@ class Navigator:
         self._map: PlannedMap | None = None  # the mapper's, if there is one
         self._pose: Array | None = None  # (3,) base_link in map, of the latest belief that tracks
         self.explorer: Explorer | None = None  # the last exploration, unless it was cancelled
-        self._view_due = False  # the exploration is to choose a view
+        self._viewpoint_due = False  # the exploration is to choose a viewpoint
         self._scan: Scan | None = None
         self._scan_points = np.zeros((0, 2))  # m in base_link
 
@@ -82,28 +82,30 @@ class Navigator:
             )
             return
         self.goal_state.cancel()
-        self.explorer, self._view_due = Explorer(request.seq, self._pose, self._map), True
+        self.explorer, self._viewpoint_due = Explorer(request.seq, self._pose, self._map), True
 
     def on_map(self, planned: PlannedMap) -> None:
         """Explore in a new version of the mapper's map; the policy gets it from the caller."""
         self._map = planned
         if self.explorer is not None:
             self.explorer.map = planned
-            self._view_due = self.explorer.drives
+            self._viewpoint_due = self.explorer.drives
 
     def take_survey(self) -> Survey | None:
-        """If the exploration is to choose a view now: what the choice depends on. The answer goes to `use_view`."""
-        due, self._view_due = self._view_due, False
+        """What the choice of a viewpoint depends on, if one is due. The answer is to be passed to `use_viewpoint`."""
+        due, self._viewpoint_due = self._viewpoint_due, False
         if not due or self.explorer is None or self._map is None or self._scan is None or not self.explorer.drives:
             return None
-        from services.controller.policies.exploration import ScannerView  # compiles
+        from services.controller.policies.exploration import FieldOfView  # compiles
 
-        return self.explorer.survey(ScannerView.of(self._scan, self._map.message.grid.resolution))
+        return self.explorer.survey(FieldOfView.of(self._scan, self._map.message.grid.resolution))
 
-    def use_view(self, view: View | None, survey: Survey) -> None:
-        """Drive to the view that was chosen, or back to the start if there is none."""
+    def use_viewpoint(self, viewpoint: Viewpoint | None, survey: Survey) -> None:
+        """Drive to the viewpoint that was chosen, or back to the start if there is none."""
         if self.explorer is not None and self.explorer.drives:
-            goal = self.explorer.next_goal(view, survey.view.sector.half, under_way=self.goal_state.active)
+            goal = self.explorer.next_goal(
+                viewpoint, survey.field_of_view.sector.half, under_way=self.goal_state.active
+            )
             if goal is not None:
                 self._set_goal(goal)
 
@@ -153,8 +155,8 @@ class Navigator:
         command, limited_by_scan = self._command.limit(belief.stamp_ns, desired, self._scan_points)
         moving = is_moving(self._command.velocity)
         self.goal_state.update_progress(belief.stamp_ns, self.decision, moving=moving, limited_by_scan=limited_by_scan)
-        if self.explorer is not None and self.explorer.needs_goal(self.goal_state, belief.stamp_ns):
-            self._view_due = True
+        if self.explorer is not None and self.explorer.update(self.goal_state, belief.stamp_ns):
+            self._viewpoint_due = True
         status = self._explained(self.goal_state.status(belief.stamp_ns, distance))
         if (terms := self.decision.terms) is not None:
             status = status.model_copy(update={"energy": PolicyEnergy(**terms)})

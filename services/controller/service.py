@@ -33,7 +33,7 @@ from services.controller.settings import ControllerSettings
 
 if TYPE_CHECKING:
     from services.controller.growing_map import PlannedMap
-    from services.controller.policies.exploration import Survey, View
+    from services.controller.policies.exploration import Survey, Viewpoint
     from services.controller.policies.geodesic_field import CostField
     from services.controller.policies.planner import GeodesicPolicy
 
@@ -80,7 +80,7 @@ class ControllerService(Service):
         self.geodesic: GeodesicPolicy | None = None  # the policy if the preset is `geodesic`
         self._map: PlannedMap | None = None  # the mapper's, if the policy plans in it
         self._map_job: BackgroundJob[PlannedMap] = BackgroundJob(self._wake)
-        self._view_job: BackgroundJob[tuple[View | None, Survey]] = BackgroundJob(self._wake)
+        self._viewpoint_job: BackgroundJob[tuple[Viewpoint | None, Survey]] = BackgroundJob(self._wake)
         self.self_filter = settings.build_self_filter()
         self._wait: BeliefWait = NoBelief()
         self._belief_received_s = 0.0  # time.monotonic() of the latest belief
@@ -146,7 +146,7 @@ class ControllerService(Service):
     def close(self) -> None:
         """Wait for the threads."""
         self._map_job.close()
-        self._view_job.close()
+        self._viewpoint_job.close()
 
     def _wake(self) -> None:
         self.loop.inbox.wake()
@@ -208,7 +208,7 @@ class ControllerService(Service):
         self._wait = Answered()
         began = time.thread_time_ns()
         answer = self.navigator.step(belief)
-        self._choose_view()
+        self._choose_viewpoint()
         took_us = (time.thread_time_ns() - began + cpu_ns) // 1000
         self.counters["steps"] += 1
         self.counters["step_us"] += took_us
@@ -224,7 +224,7 @@ class ControllerService(Service):
 
     def due(self) -> float | None:
         """Seconds until the deadline of the present wait, 0 if a job is done; None if there is nothing to wait for."""
-        return 0.0 if self._map_job.ready or self._view_job.ready else self._deadline()
+        return 0.0 if self._map_job.ready or self._viewpoint_job.ready else self._deadline()
 
     def _deadline(self) -> float | None:
         """Seconds until the deadline of the present wait; None before the first belief, and after a timeout."""
@@ -240,8 +240,8 @@ class ControllerService(Service):
         if self._map_job.ready:
             self._use_map(self._map_job.take())
             return
-        if self._view_job.ready:
-            self.navigator.use_view(*self._view_job.take())
+        if self._viewpoint_job.ready:
+            self.navigator.use_viewpoint(*self._viewpoint_job.take())
             return
         if isinstance(self._wait, AwaitsScan):
             self._process(self._wait.belief)
@@ -258,14 +258,14 @@ class ControllerService(Service):
         self.geodesic.use_map(planned.graph, jumped=self._map is not None and planned.jumped_from(self._map))
         self._map = planned
         self.navigator.on_map(planned)
-        self._choose_view()
+        self._choose_viewpoint()
 
-    def _choose_view(self) -> None:
-        """If the exploration is to choose a view, do so in a thread."""
+    def _choose_viewpoint(self) -> None:
+        """If the exploration is to choose a viewpoint, do so in a thread."""
         if (survey := self.navigator.take_survey()) is not None:
-            from services.controller.policies.exploration import choose_view
+            from services.controller.policies.exploration import choose_viewpoint
 
-            self._view_job.submit(lambda: (choose_view(survey), survey))
+            self._viewpoint_job.submit(lambda: (choose_viewpoint(survey), survey))
 
     def _send(self, command: CmdVel, status: Status) -> None:
         self.publish(STATUS, status)

@@ -9,12 +9,12 @@ from common.messages.definitions import Drive, Map, Twist
 from common.robot.base import Robot
 from services.controller.growing_map import PlannedMap
 from services.controller.navigator import Navigator
-from services.controller.policies.exploration import View
+from services.controller.policies.exploration import Viewpoint
 from services.controller.policies.planner import GeodesicPolicy
 from tests.controller.driving import PERIOD_NS, belief, goal, room, scan
 
 HALL, START = room(10, 5), (2.0, 2.5, 0.0)
-FULL_S, HALF_VIEW = 15, 2.36  # scans per second; rad
+SCANS_PER_S = 15
 GRID = OccupancyGrid.of(np.full((100, 200), FREE, np.uint8), 0.05, (0.0, 0.0, 0.0))
 
 
@@ -23,7 +23,7 @@ def map_with(*poses) -> PlannedMap:
 
 
 class PerfectRobot:
-    """A perfect robot, whose views are chosen by the test."""
+    """A perfect robot, whose viewpoints are chosen by the test."""
 
     def __init__(self) -> None:
         self.policy = GeodesicPolicy(Robot(), None)
@@ -54,12 +54,12 @@ class PerfectRobot:
         raise AssertionError(status)
 
     def explore(self, *places) -> None:
-        """Begin to explore, or go on with views at these places in m."""
+        """Begin to explore, or go on with viewpoints at these places in m."""
         for place in places:
-            view = None if place is None else View(np.array([*place, 0.0]), 9.0, np.array([place]))
+            viewpoint = None if place is None else Viewpoint(np.array([*place, 0.0]), 9.0, np.array([place]))
             survey = self.navigator.take_survey()
             assert survey is not None
-            self.navigator.use_view(view, survey)
+            self.navigator.use_viewpoint(viewpoint, survey)
 
 
 def begin() -> PerfectRobot:
@@ -76,7 +76,7 @@ def test_no_exploration_without_a_map():
     assert "no map from a mapper" in status.reason
 
 
-def test_views_then_the_way_back():
+def test_viewpoints_then_the_way_back():
     drive = begin()
     drive.explore((5.0, 2.5))
     status = drive.step()
@@ -87,7 +87,7 @@ def test_views_then_the_way_back():
         5,
     )
     assert np.isclose(status.exploration.area, 50.0)
-    drive.until(lambda _: drive.navigator._view_due)
+    drive.until(lambda _: drive.navigator._viewpoint_due)
     assert np.hypot(*(drive.pose[:2] - [5.0, 2.5])) < 0.1
     drive.explore(None)
     assert drive.step().exploration.phase == "returning"
@@ -104,12 +104,12 @@ def test_a_goal_of_a_user_takes_precedence():
     drive.until(lambda _: drive.pose[0] > 3.0)
     drive.navigator.on_goal(goal(3.0, 1.5, seq=6))
     drive.use_map(map_with(START, (3.0, 2.5, 0.0)))
-    assert drive.navigator.take_survey() is None  # no view is chosen meanwhile
+    assert drive.navigator.take_survey() is None  # no viewpoint is chosen meanwhile
     status = drive.until(lambda status: status.state == "reached")
     assert (status.goal_seq, status.exploration.phase) == (6, "exploring")
     count = drive.scans
-    drive.until(lambda _: drive.navigator._view_due)
-    assert drive.scans - count >= 2 * FULL_S - 1  # whoever waits for the goal sees that it was reached
+    drive.until(lambda _: drive.navigator._viewpoint_due)
+    assert drive.scans - count >= 2 * SCANS_PER_S - 1  # whoever waits for the goal sees that it was reached
     drive.explore((8.0, 2.5))
     assert drive.step().state == "exploring"
 
@@ -136,7 +136,7 @@ def test_cancelling_ends_it():
 def test_a_place_without_progress_is_given_up():
     drive = begin()
     drive.explore((8.0, 2.5))
-    drive.until(lambda _: drive.navigator._view_due, moves=False)
+    drive.until(lambda _: drive.navigator._viewpoint_due, moves=False)
     survey = drive.navigator.take_survey()
     assert survey.unreachable.tolist() == [[8.0, 2.5]]
     assert not len(survey.arrivals)
@@ -145,7 +145,7 @@ def test_a_place_without_progress_is_given_up():
 def test_a_way_back_that_stays_refused_fails():
     drive = begin()
     drive.explore((5.0, 2.5))
-    drive.until(lambda _: drive.navigator._view_due)
+    drive.until(lambda _: drive.navigator._viewpoint_due)
     shut = GRID.values.copy()
     shut[:, 70:76] = OCCUPIED
     grid = OccupancyGrid.of(shut, 0.05, (0.0, 0.0, 0.0))
@@ -153,15 +153,15 @@ def test_a_way_back_that_stays_refused_fails():
     drive.explore(None)
     count, status = drive.scans, drive.step()
     while status.exploration.phase == "returning":
-        if drive.navigator._view_due:
+        if drive.navigator._viewpoint_due:
             drive.explore(None)
         status = drive.step()
     assert status.exploration.phase == "failed"
     assert "cannot be reached" in status.reason
-    assert 7 * FULL_S < drive.scans - count < 10 * FULL_S
+    assert 7 * SCANS_PER_S < drive.scans - count < 10 * SCANS_PER_S
 
 
-def test_a_new_map_may_show_a_better_view_and_moves_the_start():
+def test_a_new_map_may_show_a_better_viewpoint_and_moves_the_start():
     drive = begin()
     drive.explore((8.0, 2.5))
     drive.step()
@@ -169,5 +169,5 @@ def test_a_new_map_may_show_a_better_view_and_moves_the_start():
     survey = drive.navigator.take_survey()
     assert survey.target.tolist() == [8.0, 2.5]
     assert survey.home.tolist() == [2.1, 2.5]
-    drive.navigator.use_view(View(np.array([4.0, 4.0, 0.0]), 9.0, np.zeros((1, 2))), survey)
+    drive.navigator.use_viewpoint(Viewpoint(np.array([4.0, 4.0, 0.0]), 9.0, np.zeros((1, 2))), survey)
     assert drive.step().goal.y == 4.0

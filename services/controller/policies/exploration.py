@@ -1,17 +1,17 @@
 """Exploration: where to drive next in a building of which a part is unknown.
 
-A policy is a tour: from the robot through places from which a scanner sees cells at the edge of what is known, and back
-to where exploration began. Its expected free energy in nats is
+A policy is a tour: from the robot through viewpoints, from which a scan sees the frontier between known free and
+unknown space, and back to where exploration began. Its expected free energy in nats is
 
     G(tour) = NATS_PER_METRE * length - information about the map
 
-A cell at the edge is free or occupied, which a scan tells: ln 2, times `MISS_PROBABILITY` for each earlier scan that
-should have told it and did not. At `MIN_VIEW_NATS` a view is worth a way of 150 m, so the tour takes in all that is
-worth seeing, by the shortest way (as Kulich, Faigl & Preucil 2011 choose goals). Only its first place is driven to, as
-the next map has other edges.
+A frontier cell is free or occupied, which a scan tells: ln 2, times `MISS_PROBABILITY` for each earlier scan that
+should have told it and did not. At `MIN_VIEWPOINT_NATS` a viewpoint is worth a way of 150 m, so the tour has all that
+are worth a stop, by the shortest way (as Kulich, Faigl & Preucil 2011 choose goals). The robot drives only to its first
+viewpoint, as the next map has another frontier.
 
-Approximations: the views are chosen greedily by what they tell; what lies beyond the edge is not predicted; and a scan
-tells nothing of what it sees at a distance where its beams are farther apart than the cells of the map.
+Approximations: the viewpoints are chosen greedily by their information; what lies beyond the frontier is not predicted;
+and a scan tells nothing about cells so far away that its beams are farther apart than the cells of the map.
 """
 
 from __future__ import annotations
@@ -41,52 +41,53 @@ if TYPE_CHECKING:
     Cells = npt.NDArray[np.intp]
 
 MISS_PROBABILITY = 0.5  # that a scan does not tell whether a cell that it should see is free
-MIN_CELL_NATS = 0.1  # cells that tell less are given up: scans do not reach them
-MIN_VIEW_NATS = 3.0  # a view of less than half a metre of the edge is not worth stopping for
-VIEW_SPACING_M = 0.4
-SPARE_ROOM_M = 0.05
-MAX_VIEWS = 12  # of a tour; those that tell most
-CHANGE_M = 0.5  # by which a tour with another first place must be shorter, so that the robot does not dither
-UNREACHABLE_RANGE_M = 0.4  # around a place that could not be reached, no other is tried
-ARRIVAL_SCANS = 4  # an arrival counts as so many scans, as more of them would tell nothing new
-ARRIVAL_RANGE_M = 0.2  # a view this close to an arrival tells nothing of what was in sight there
+MIN_CELL_NATS = 0.1  # frontier cells with less information are given up: scans do not reach them
+MIN_VIEWPOINT_NATS = 3.0  # a viewpoint that sees less than half a metre of the frontier is not worth a stop
+VIEWPOINT_SPACING_M = 0.4
+EXTRA_CLEARANCE_M = 0.05  # around the robot, because walls that are seen later may be nearer
+MAX_VIEWPOINTS = 12  # of a tour: those with most information
+MIN_SHORTENING_M = 0.5  # by which a tour must be shorter to replace the present target, so that the robot goes on
+UNREACHABLE_RANGE_M = 0.4  # no viewpoint is this close to a place that could not be reached
+ARRIVAL_SCANS = 4  # an arrival at a viewpoint counts as this many scans, because more would tell nothing new
+ARRIVAL_RANGE_M = 0.2  # a viewpoint this close to an arrival tells nothing about what was in sight there
+MAX_MOVED_VIEWPOINTS = 3  # length of the parts of a tour that are tried at other places in it
 
 
 @dataclass(frozen=True)
-class ScannerView:
+class FieldOfView:
     """What one scan sees."""
 
     sector: Sector
     range_m: float  # up to which its beams are as dense as the cells of the map
 
     @classmethod
-    def of(cls, scan: Scan, cell: float) -> ScannerView:
-        """The view of the scanner that took a scan, for a map with cells of ``cell`` m."""
+    def of(cls, scan: Scan, cell: float) -> FieldOfView:
+        """The field of view of the scanner that took a scan, for a map with cells of ``cell`` m."""
         sweep = Sweep.of(scan)
         return cls(sweep.sector(scan.mount.yaw), float(min(scan.range_max, cell / max(sweep.spacing, 1e-6))))
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What is known of the building and of the exploration so far."""
+    """What is known about the building and about the exploration so far."""
 
     graph: FreeSpaceGraph  # of the growing map
     scans: Array  # (K, 3) base_link in map where the scans of the map were taken
-    arrivals: Array  # (A, 3) base_link in map where the robot arrived at a view
-    view: ScannerView
+    arrivals: Array  # (A, 3) base_link in map where the robot arrived at a viewpoint
+    field_of_view: FieldOfView
     pose: Array  # (3,) of the robot in map
     home: Array  # (2,) m in map, where the tour ends
-    target: Array | None  # (2,) m in map, to which the robot drives now
+    target: Array | None  # (2,) m in map, the viewpoint to which the robot drives now
     unreachable: Array  # (N, 2) m in map, places to which no way was found
 
 
 @dataclass(frozen=True)
-class View:
+class Viewpoint:
     """A place from which a scan tells something about the map."""
 
-    pose: Array  # (3,) in map, facing the edge of what is known
-    nats: float  # that a scan from there is expected to tell
-    tour: Array  # (V, 2) m in map, the places of the whole tour from this one on, without its end
+    pose: Array  # (3,) in map, facing the frontier
+    nats: float  # expected information of a scan from there
+    tour: Array  # (V, 2) m in map, all viewpoints of the tour from this one on
 
 
 @dataclass(frozen=True)
@@ -94,29 +95,38 @@ class Frontier:
     """Unknown cells beside known free ones."""
 
     cells: Cells  # (F,) flat indices
-    nats: Array  # (F,) that a scan of each is expected to tell
+    nats: Array  # (F,) expected information of a scan of each
 
 
-def choose_view(survey: Survey) -> View | None:
-    """The first place of the tour of least expected free energy; None if no view is worth the way."""
-    edge, known = frontier_of(survey), known_space(survey.graph)
-    places, gain, first = candidate_views(survey, edge, known)
-    chosen = cover(gain, edge.nats, first)
-    if not chosen:
+@dataclass(frozen=True)
+class Candidates:
+    """Places that may become viewpoints."""
+
+    places: Array  # (P, 2) m in map
+    sees: Mask  # (P, F) whether a scan from a place would tell something new about a frontier cell
+    target: int | None  # index of the present target; None if there is none, or it cannot be reached
+
+
+def choose_viewpoint(survey: Survey) -> Viewpoint | None:
+    """The first viewpoint of the tour of least expected free energy; None if no viewpoint is worth the way."""
+    frontier, known = find_frontier(survey), known_space(survey.graph)
+    candidates = find_candidates(survey, frontier, known)
+    selected = select_viewpoints(candidates.sees, frontier.nats, candidates.target)
+    if not selected:
         return None
-    cost = _costs_between(known, [survey.pose[:2], *places[chosen], survey.home])
+    cost = _travel_costs(known, [survey.pose[:2], *candidates.places[selected], survey.home])
     tour = shortest_tour(cost)
-    if chosen[0] == first and tour[0] != 0:
-        kept = [0, *(place + 1 for place in shortest_tour(cost[1:, 1:]))]  # from the present target on
-        tour = kept if _length(cost, kept) < _length(cost, tour) + CHANGE_M else tour
-    energy = NATS_PER_METRE * _length(cost, tour) - float(edge.nats[gain[chosen].any(axis=0)].sum())
-    if energy >= NATS_PER_METRE * cost[0, -1]:  # that of returning at once
+    if selected[0] == candidates.target:
+        tour = _prefer_target(tour, cost)
+    information = float(frontier.nats[candidates.sees[selected].any(axis=0)].sum())
+    returning_at_once = NATS_PER_METRE * cost[0, -1]
+    if NATS_PER_METRE * _length(cost, tour) - information >= returning_at_once:
         return None
-    return _view(survey, places[chosen][tour], edge, gain[chosen[tour[0]]])
+    return _viewpoint(survey, candidates.places[selected][tour], frontier, candidates.sees[selected[tour[0]]])
 
 
-def frontier_of(survey: Survey) -> Frontier:
-    """The edge of what is known, where scans still tell something."""
+def find_frontier(survey: Survey) -> Frontier:
+    """The unknown cells beside known free ones about which scans still tell something."""
     free = survey.graph.free
     beside = np.zeros_like(free.unknown)
     passable = ~_opaque(free)
@@ -126,65 +136,60 @@ def frontier_of(survey: Survey) -> Frontier:
     beside[:, :-1] |= passable[:, 1:]
     cells = np.flatnonzero(free.unknown & beside & (free.clearance > 0))
     scans = np.concatenate([survey.scans, np.repeat(survey.arrivals, ARRIVAL_SCANS, axis=0)])
-    misses = np.sum(_seen(survey, scans[:, :2], cells) & _in_sector(survey, scans, cells), axis=0)
+    misses = np.sum(_in_sight(survey, scans[:, :2], cells) & _in_sector(survey, scans, cells), axis=0)
     nats = np.log(2) * MISS_PROBABILITY**misses
     return Frontier(cells[nats >= MIN_CELL_NATS], nats[nats >= MIN_CELL_NATS])
 
 
 def known_space(graph: FreeSpaceGraph) -> FreeSpaceGraph:
-    """The graph of the places that are known to be free, with some room to spare: walls seen later may be nearer."""
+    """The graph of the places that are known to be free, with `EXTRA_CLEARANCE_M`."""
     free = graph.free
     return FreeSpaceGraph(
-        replace(free, clearance=np.where(free.unknown, -1.0, free.clearance)), graph.radius + SPARE_ROOM_M
+        replace(free, clearance=np.where(free.unknown, -1.0, free.clearance)), graph.radius + EXTRA_CLEARANCE_M
     )
 
 
-def candidate_views(survey: Survey, edge: Frontier, known: FreeSpaceGraph) -> tuple[Array, Mask, int | None]:
-    """Places (P, 2) m that can be reached, and which cells of the edge a scan from each of them sees (P, F).
-
-    The first place is that of the robot. Also returns the index of the present target, or None if it cannot be reached.
-    """
+def find_candidates(survey: Survey, frontier: Frontier, known: FreeSpaceGraph) -> Candidates:
+    """The place of the robot, places on a lattice that it can reach, and its present target."""
     grid = known.grid
     field = known.cost_field(survey.pose[:2], known.min_clearance)
-    if field is None or not len(edge.cells):
-        return np.zeros((0, 2)), np.zeros((0, len(edge.cells)), bool), None
-    reachable = np.isfinite(field.cost)
-    step = max(1, round(VIEW_SPACING_M / grid.resolution))
+    if field is None or not len(frontier.cells):
+        return Candidates(np.zeros((0, 2)), np.zeros((0, len(frontier.cells)), bool), None)
+    step = max(1, round(VIEWPOINT_SPACING_M / grid.resolution))
     lattice = np.zeros(grid.shape, bool)
     lattice[step // 2 :: step, step // 2 :: step] = True
-    cells = np.flatnonzero(reachable & lattice)
-    places = np.concatenate([field.goal[None], grid.centres(cells)])
-    first = None
+    cells = np.flatnonzero(np.isfinite(field.cost) & lattice)
+    places, target = np.concatenate([field.goal[None], grid.centres(cells)]), None
     if survey.target is not None and np.isfinite(field.cost.ravel()[grid.cell_of(survey.target)]):
-        places, first = np.concatenate([places, survey.target[None]]), len(places)
-    gain = _seen(survey, places, edge.cells)
+        places, target = np.concatenate([places, survey.target[None]]), len(places)
+    sees = _in_sight(survey, places, frontier.cells)
     if len(survey.unreachable):
         distance = np.hypot(*np.moveaxis(places[:, None] - survey.unreachable, -1, 0)).min(axis=1)
-        gain &= (distance > UNREACHABLE_RANGE_M)[:, None]
+        sees &= (distance > UNREACHABLE_RANGE_M)[:, None]
     if len(survey.arrivals):
         near = np.hypot(*np.moveaxis(places[:, None] - survey.arrivals[:, :2], -1, 0)) < ARRIVAL_RANGE_M
-        gain &= ~(near @ _in_sector(survey, survey.arrivals, edge.cells))
-    return places, gain, first
+        sees &= ~(near @ _in_sector(survey, survey.arrivals, frontier.cells))
+    return Candidates(places, sees, target)
 
 
-def cover(gain: Mask, nats: Array, first: int | None = None) -> list[int]:
-    """Places that together see all cells worth seeing, chosen greedily by the information that each adds.
+def select_viewpoints(sees: Mask, nats: Array, target: int | None = None) -> list[int]:
+    """Indices of places that together see all cells worth a stop, chosen greedily by the information that each adds.
 
-    ``gain`` (P, F) says which cells each place sees, and ``nats`` (F,) what these tell. Place ``first`` is taken first
-    if it tells enough by itself.
+    ``sees`` (P, F) is whether a place sees a cell, and ``nats`` (F,) are the information of the cells. The place
+    ``target`` comes first if it is worth a stop by itself.
     """
-    chosen: list[int] = []
+    selected: list[int] = []
     left = nats.copy()
-    while len(chosen) < MAX_VIEWS and len(gain):
-        total = gain @ left
-        best = int(np.argmax(total))
-        if not chosen and first is not None and total[first] >= MIN_VIEW_NATS:
-            best = first
-        if total[best] < MIN_VIEW_NATS:
+    while len(selected) < MAX_VIEWPOINTS and len(sees):
+        added = sees @ left
+        best = int(np.argmax(added))
+        if not selected and target is not None and added[target] >= MIN_VIEWPOINT_NATS:
+            best = target
+        if added[best] < MIN_VIEWPOINT_NATS:
             break
-        chosen.append(best)
-        left[gain[best]] = 0.0
-    return chosen
+        selected.append(best)
+        left[sees[best]] = 0.0
+    return selected
 
 
 def shortest_tour(cost: Array) -> list[int]:
@@ -217,9 +222,17 @@ def _variations(tour: list[int]) -> list[list[int]]:
         for end in range(begin + 1, count + 1):
             part, rest = tour[begin:end], [*tour[:begin], *tour[end:]]
             found.append([*tour[:begin], *part[::-1], *tour[end:]])
-            if len(part) <= 3:
+            if len(part) <= MAX_MOVED_VIEWPOINTS:
                 found += [[*rest[:at], *part, *rest[at:]] for at in range(len(rest) + 1)]
     return found
+
+
+def _prefer_target(tour: list[int], cost: Array) -> list[int]:
+    """The shortest tour that begins with place 0, the present target, unless ``tour`` is clearly shorter."""
+    if tour[0] == 0:
+        return tour
+    target_first = [0, *(place + 1 for place in shortest_tour(cost[1:, 1:]))]
+    return target_first if _length(cost, target_first) < _length(cost, tour) + MIN_SHORTENING_M else tour
 
 
 def _length(cost: Array, tour: Sequence[int]) -> float:
@@ -227,7 +240,7 @@ def _length(cost: Array, tour: Sequence[int]) -> float:
     return float(sum(cost[a, b] for a, b in pairwise([0, *(place + 1 for place in tour), len(cost) - 1])))
 
 
-def _costs_between(graph: FreeSpaceGraph, places: Sequence[Array]) -> Array:
+def _travel_costs(graph: FreeSpaceGraph, places: Sequence[Array]) -> Array:
     """Costs (N, N) m of the ways between places (2,) m; a way that is not known counts as very long."""
     longest = 10.0 * sum(graph.grid.shape) * graph.grid.resolution
     cells = graph.grid.cell_of(np.array(places))
@@ -244,26 +257,26 @@ def _opaque(free: FreeSpace) -> Mask:
     return np.asarray(free.unknown | (free.clearance < free.grid.resolution / 2 - 1e-9))
 
 
-def _seen(survey: Survey, places: Array, cells: Cells) -> Mask:
-    """Whether a scanner at places (P, 2) m that looks all round sees the cells (F,) with these flat indices; (P, F)."""
+def _in_sight(survey: Survey, places: Array, cells: Cells) -> Mask:
+    """Whether nothing hides the cells (F,) with these flat indices from a scanner at places (P, 2) m; (P, F)."""
     free = survey.graph.free
     size, corner = free.grid.resolution, np.array(free.grid.origin)
     targets = (free.grid.centres(cells) - corner) / size
-    reach, blind = survey.view.range_m / size, survey.graph.radius / size
+    reach, blind = survey.field_of_view.range_m / size, survey.graph.radius / size
     return np.asarray(visible(_opaque(free), (places - corner) / size, targets, reach, blind))
 
 
 def _in_sector(survey: Survey, poses: Array, cells: Cells) -> Mask:
     """Whether cells (F,) lie in the directions that the scanner sees from poses (P, 3); (P, F)."""
-    sector = survey.view.sector
+    sector = survey.field_of_view.sector
     offset = survey.graph.grid.centres(cells) - poses[:, None, :2]
     bearing = np.arctan2(offset[..., 1], offset[..., 0]) - poses[:, None, 2] - sector.centre
     return np.asarray(np.abs(se2.wrap(bearing)) <= sector.half + 1e-9)
 
 
-def _view(survey: Survey, tour: Array, edge: Frontier, sees: Mask) -> View:
-    """The first place of a tour (V, 2) m, which sees these cells of the edge (F,)."""
-    place, nats = tour[0], edge.nats[sees]
-    middle = (nats[:, None] * (survey.graph.grid.centres(edge.cells[sees]) - place)).sum(axis=0)
-    heading = float(se2.wrap(np.arctan2(middle[1], middle[0]) - survey.view.sector.centre))
-    return View(np.array([*place, heading]), float(nats.sum()), tour)
+def _viewpoint(survey: Survey, tour: Array, frontier: Frontier, sees: Mask) -> Viewpoint:
+    """The first place of a tour (V, 2) m as a viewpoint; it sees the frontier cells in the mask ``sees`` (F,)."""
+    place, nats = tour[0], frontier.nats[sees]
+    middle = (nats[:, None] * (survey.graph.grid.centres(frontier.cells[sees]) - place)).sum(axis=0)
+    heading = float(se2.wrap(np.arctan2(middle[1], middle[0]) - survey.field_of_view.sector.centre))
+    return Viewpoint(np.array([*place, heading]), float(nats.sum()), tour)

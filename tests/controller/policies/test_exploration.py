@@ -1,4 +1,4 @@
-"""The choice of the next view, on small grids and against brute force."""
+"""The choice of the next viewpoint, on small grids and against brute force."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import pytest
 
 from common.robot.scan_geometry import ALL_ROUND, Sector
 from services.controller.policies.exploration import (
-    MIN_VIEW_NATS,
-    ScannerView,
+    MIN_VIEWPOINT_NATS,
+    FieldOfView,
     Survey,
-    candidate_views,
-    choose_view,
-    cover,
-    frontier_of,
+    choose_viewpoint,
+    find_candidates,
+    find_frontier,
     known_space,
+    select_viewpoints,
     shortest_tour,
 )
 from services.controller.policies.free_space import FreeSpace, Grid
@@ -42,7 +42,7 @@ def survey_of(rows: str, pose=(1.2, 1.2, 0.0), *, scans=(), arrivals=(), sector=
         graph,
         np.reshape(scans, (-1, 3)),
         np.reshape(arrivals, (-1, 3)),
-        ScannerView(sector, 5.0),
+        FieldOfView(sector, 5.0),
         np.array(pose),
         np.array(pose[:2]),
         target,
@@ -78,31 +78,31 @@ def test_cells_that_are_seen():
 
 def test_frontier():
     survey = survey_of(CORRIDOR)
-    edge = frontier_of(survey)
-    x, y = survey.graph.grid.centres(edge.cells).T
+    frontier = find_frontier(survey)
+    x, y = survey.graph.grid.centres(frontier.cells).T
     assert np.allclose(x, 5.65)
     assert np.allclose(np.sort(y), 0.85 + 0.1 * np.arange(8))
-    assert np.allclose(edge.nats, np.log(2))
-    assert not len(frontier_of(survey_of(CLOSED)).cells)
+    assert np.allclose(frontier.nats, np.log(2))
+    assert not len(find_frontier(survey_of(CLOSED)).cells)
 
 
 @pytest.mark.parametrize(("yaw", "halved"), [(0.0, True), (np.pi, False)])
 def test_each_scan_that_saw_nothing_halves_the_information(yaw, halved):
     """Only scans that looked there count."""
-    edge = frontier_of(survey_of(CORRIDOR, scans=[(1.2, 1.2, yaw)], sector=Sector(0.0, np.pi / 2)))
-    assert np.allclose(edge.nats.max(), np.log(2))  # the cells beside the walls are not in full view
-    assert bool(np.isclose(edge.nats.min(), np.log(2) / 2)) is halved
+    frontier = find_frontier(survey_of(CORRIDOR, scans=[(1.2, 1.2, yaw)], sector=Sector(0.0, np.pi / 2)))
+    assert np.allclose(frontier.nats.max(), np.log(2))  # the cells beside the walls are not in full view
+    assert bool(np.isclose(frontier.nats.min(), np.log(2) / 2)) is halved
 
 
-def test_information_of_a_view_is_that_of_the_cells_it_sees():
+def test_information_of_a_viewpoint_is_that_of_the_cells_it_sees():
     """Against a line from each place to each cell, sampled densely."""
     survey = survey_of(CROSSROADS, pose=(2.8, 2.0, 0.0))
-    edge, known = frontier_of(survey), known_space(survey.graph)
-    places, seen, _ = candidate_views(survey, edge, known)
-    assert len(places) > 3
-    centres, free = survey.graph.grid.centres(edge.cells), survey.graph.free
+    frontier, known = find_frontier(survey), known_space(survey.graph)
+    candidates = find_candidates(survey, frontier, known)
+    assert len(candidates.places) > 3
+    centres, free = survey.graph.grid.centres(frontier.cells), survey.graph.free
     opaque = (free.unknown | (free.clearance < 0)).ravel()
-    for place, row in zip(places, seen, strict=True):
+    for place, row in zip(candidates.places, candidates.sees, strict=True):
         for cell, says in zip(centres, row, strict=True):
             line = place + np.linspace(0, 1, 200)[:, None] * (cell - place)
             line = line[np.hypot(*(line - cell).T) > 2 * CELL]
@@ -110,13 +110,13 @@ def test_information_of_a_view_is_that_of_the_cells_it_sees():
             assert clear or not says  # what is seen is in sight; at the edge of a shadow the reverse need not hold
 
 
-def test_cover_takes_what_is_worth_a_stop():
+def test_selected_viewpoints_are_worth_a_stop():
     seen = np.array([[1, 1, 0, 0, 0], [0, 1, 1, 1, 0], [0, 0, 0, 0, 1]], bool)
-    nats = np.array([2.0, 2.0, 2.0, 2.0, MIN_VIEW_NATS - 0.1])
-    assert cover(seen, nats) == [1]  # 6 nats; then place 0 adds 2 and place 2 adds 2.9, which are too few
-    assert cover(seen, nats + 1.1) == [1, 2, 0]
-    assert cover(seen, nats + 1.1, first=0) == [0, 1, 2]
-    assert cover(seen, np.zeros(5)) == []
+    nats = np.array([2.0, 2.0, 2.0, 2.0, MIN_VIEWPOINT_NATS - 0.1])
+    assert select_viewpoints(seen, nats) == [1]  # 6 nats; then place 0 adds 2 and place 2 adds 2.9, which are too few
+    assert select_viewpoints(seen, nats + 1.1) == [1, 2, 0]
+    assert select_viewpoints(seen, nats + 1.1, target=0) == [0, 1, 2]
+    assert select_viewpoints(seen, np.zeros(5)) == []
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -132,13 +132,13 @@ def test_tour_is_the_shortest_of_all(seed):
 
 
 def test_choice_is_the_first_place_of_the_tour_of_least_expected_free_energy():
-    """Against all orders of the views: both ends are worth the way, so the shorter tour decides."""
+    """Against all orders of the viewpoints: both ends are worth the way, so the shorter tour decides."""
     survey = survey_of(CROSSROADS, pose=(2.8, 2.0, 0.0))
-    view = choose_view(survey)
-    assert view is not None
-    assert view.nats >= MIN_VIEW_NATS - 1.5
+    viewpoint = choose_viewpoint(survey)
+    assert viewpoint is not None
+    assert viewpoint.nats >= MIN_VIEWPOINT_NATS - 1.5
     known = known_space(survey.graph)
-    stops = [survey.pose[:2], *view.tour, survey.home]
+    stops = [survey.pose[:2], *viewpoint.tour, survey.home]
 
     def length(order):
         tour = [stops[0], *(stops[k] for k in order), stops[-1]]
@@ -154,14 +154,14 @@ def test_choice_is_the_first_place_of_the_tour_of_least_expected_free_energy():
 
 
 def test_nothing_is_left_to_see():
-    assert choose_view(survey_of(CLOSED)) is None
+    assert choose_viewpoint(survey_of(CLOSED)) is None
     # The robot has arrived where it sees the end of the corridor, and the map is still the same.
     survey = survey_of(CORRIDOR)
-    view = choose_view(survey)
-    assert view is not None
-    assert choose_view(survey_of(CORRIDOR, arrivals=[(*view.pose[:2], 0.0)] * 2)) is None
+    viewpoint = choose_viewpoint(survey)
+    assert viewpoint is not None
+    assert choose_viewpoint(survey_of(CORRIDOR, arrivals=[(*viewpoint.pose[:2], 0.0)] * 2)) is None
 
 
 def test_unreachable_places_are_not_chosen():
     shut = CORRIDOR.replace("#......?", "#..#...?")
-    assert choose_view(survey_of(shut)) is None
+    assert choose_viewpoint(survey_of(shut)) is None

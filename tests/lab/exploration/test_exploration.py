@@ -10,7 +10,7 @@ from common.robot.base import Robot
 from lab.exploration.drive import explore, measure, reachable_area
 from lab.exploration.experiment import EXPLORERS, summarise, table
 from lab.exploration.nearest_frontier import nearest_frontier
-from services.controller.policies.exploration import choose_view
+from services.controller.policies.exploration import choose_viewpoint
 from tests.controller.policies.test_exploration import CLOSED, CROSSROADS, survey_of
 
 # A room, and behind a wall with a door another one that cannot be seen from the start.
@@ -23,7 +23,7 @@ START = np.array([1.5, 1.0, np.pi])
 
 
 def test_two_rooms_are_explored():
-    run = explore(ROOMS, Robot(), choose_view, START, seed=1, limit_s=120.0, beams=207)
+    run = explore(ROOMS, Robot(), choose_viewpoint, START, seed=1, limit_s=120.0, beams=207)
     row = measure(run, ROOMS, Robot())
     assert row["phase"] == "finished", row["reason"]
     assert row["mapped_share"] > 0.95
@@ -34,9 +34,9 @@ def test_two_rooms_are_explored():
 
 def test_the_baseline_drives_to_the_nearest_frontier():
     survey = survey_of(CROSSROADS, pose=(2.8, 2.0, 0.0))
-    view = nearest_frontier(survey)
-    assert view is not None
-    assert view.pose[1] > 2.4  # the way up and left is shorter than that down and right
+    viewpoint = nearest_frontier(survey)
+    assert viewpoint is not None
+    assert viewpoint.pose[1] > 2.4  # the way up and left is shorter than that down and right
     assert nearest_frontier(survey_of(CLOSED)) is None
 
 
