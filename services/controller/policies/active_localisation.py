@@ -39,7 +39,7 @@ MAX_PLACES = 60
 CHOICE_PERIOD_NS = 1_000_000_000  # minimum time between two choices of a place
 MAX_SPEED = 0.5  # m/s, because it is not known what is behind and beside the robot
 INITIAL_WAIT_NS = 1_000_000_000  # time for the estimator to localise before the robot moves
-VIEW_LENGTH_M = 1.0  # scans from places this far apart are nearly independent
+CORRELATION_LENGTH_M = 1.0  # scans from places this far apart are nearly independent
 MAX_VISITED = 100  # positions kept, VISITED_SPACING_M apart
 VISITED_SPACING_M = 0.25
 STALLED_NS = 3_000_000_000  # time without motion after which a place counts as visited, because no way leads there
@@ -97,7 +97,7 @@ class VisitedPlaces:
     def novelty(self, places: Array) -> Array:
         """Share (M,) of the information of a scan that is new at places (M, 2) m in base_link."""
         distance = np.hypot(*np.moveaxis(places[:, None] - self.positions, -1, 0)).min(axis=1)
-        return np.asarray(-np.expm1(-(distance**2) / (2 * VIEW_LENGTH_M**2)))
+        return np.asarray(-np.expm1(-(distance**2) / (2 * CORRELATION_LENGTH_M**2)))
 
 
 class ActiveLocaliser:
@@ -133,11 +133,11 @@ class ActiveLocaliser:
 
         Returns None if no predictions are needed now.
         """
-        poses, weights = _likely(belief)
+        poses, weights = _likely_hypotheses(belief)
         stamp = belief.stamp_ns
         if len(poses) < 2 or (self._requested is not None and 0 <= stamp - self._requested[0] < CHOICE_PERIOD_NS):
             return None
-        displacements, lengths = self._places(poses[0])
+        displacements, lengths = self._candidate_places(poses[0])
         if self._place is not None:
             displacements = np.concatenate([self._place[0][None], displacements])
             lengths = np.concatenate([[np.hypot(*self._place[0][:2])], lengths])
@@ -158,16 +158,16 @@ class ActiveLocaliser:
         best = int(np.argmin(energy.total))
         self._place = motions.displacements[best], energy.of(best, energy.total)
 
-    def decide(self, belief: Belief, scan: Scan, points: Array, velocity: Array, view: Sector) -> Decision:
-        """Choose a velocity; ``points`` (K, 2) m in base_link are obstacles, ``view`` is what the scanner sees."""
+    def decide(self, belief: Belief, scan: Scan, points: Array, velocity: Array, field_of_view: Sector) -> Decision:
+        """Choose a velocity; ``points`` (K, 2) m in base_link are obstacles."""
         motion = self._visited.move(belief.stamp_ns, velocity)
         if self._place is not None:
             self._place = (se2.between(motion, self._place[0]), self._place[1])
         static = np.zeros(len(points), bool)
         surroundings = Surroundings(
-            _no_walls, points, static, 0.0, self.min_point_distance, view=view, may_turn=self.may_turn
+            _no_walls, points, static, 0.0, self.min_point_distance, field_of_view=field_of_view, may_turn=self.may_turn
         )
-        poses, _ = _likely(belief)
+        poses, _ = _likely_hypotheses(belief)
         if len(poses) > 1:
             self._unknown_since_ns = None
             if self._place is not None:
@@ -178,9 +178,9 @@ class ActiveLocaliser:
             self._unknown_since_ns = belief.stamp_ns
         if belief.stamp_ns - self._unknown_since_ns < INITIAL_WAIT_NS:
             return Decision(reason=f"the belief is {belief.state}: looking", state="lost")
-        return self._look_elsewhere(belief, scan, surroundings, velocity)
+        return self._drive_to_open_space(belief, scan, surroundings, velocity)
 
-    def _places(self, pose: Array) -> tuple[Array, Array]:
+    def _candidate_places(self, pose: Array) -> tuple[Array, Array]:
         """Displacements (M, 3) in base_link and path lengths (M,) m of the places around a hypothesis (3,)."""
         field = self.graph.cost_field(pose[:2], self.min_point_distance + PLACE_SPACING_M)
         if field is None:
@@ -220,9 +220,9 @@ class ActiveLocaliser:
         attractor = se2.rotate(-pose[2], field.attractor(pose[:2], path) - pose[:2])
         return self._approach(attractor, surroundings, velocity, Decision(reason=reason, path=path, terms=terms))
 
-    def _look_elsewhere(self, belief: Belief, scan: Scan, surroundings: Surroundings, velocity: Array) -> Decision:
+    def _drive_to_open_space(self, belief: Belief, scan: Scan, surroundings: Surroundings, velocity: Array) -> Decision:
         """Drive straight to where a scan is expected to tell most, by the room that the present scan shows."""
-        bearing, room = _room(scan)
+        bearing, room = _open_ranges(scan)
         length = np.minimum(room - self.min_point_distance, MAX_USEFUL_ROOM_M)
         reason = f"the belief is {belief.state}: going where there is room, to see more"
         if room.max() < MIN_ROOM_M:
@@ -279,14 +279,14 @@ def drive_energy(
     )
 
 
-def _likely(belief: Belief) -> tuple[Array, Array]:
+def _likely_hypotheses(belief: Belief) -> tuple[Array, Array]:
     """Poses (K, 3) and weights (K,) of the likely hypotheses of an ambiguous belief, best first."""
     likely = [h for h in belief.hypotheses if h.weight >= MIN_WEIGHT and belief.state == "ambiguous"][:MAX_HYPOTHESES]
     poses = np.array([h.pose.array() for h in likely]).reshape(-1, 3)
     return poses, np.array([h.weight for h in likely])
 
 
-def _room(scan: Scan) -> tuple[Array, Array]:
+def _open_ranges(scan: Scan) -> tuple[Array, Array]:
     """Bearing (B,) rad in base_link of each beam, and the room in its direction (B,) m: the least range around it."""
     ranges = np.where(np.isneginf(scan.ranges), 0.0, scan.ranges.astype(np.float64))
     ranges = np.minimum(ranges, MAX_USEFUL_ROOM_M)

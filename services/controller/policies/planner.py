@@ -71,7 +71,7 @@ class GeodesicPolicy:
         self._planned: tuple[int, npt.NDArray[Any]] = (-REPLAN_PERIOD_NS, np.zeros(0, int))
         self._field_outdated = False
         self._vetted_component: int | None = None  # the component from which the goal was found to be reachable
-        self._view = ALL_ROUND
+        self._field_of_view = ALL_ROUND
         # Least distance from the goal in m, and the stamp at which the robot got there; None until it is near the goal.
         self._nearest: tuple[float, int] | None = None
         self._standing_since_ns: int | None = None
@@ -139,8 +139,8 @@ class GeodesicPolicy:
         self.graph.set_metre_cost(grid.interpolate(cost, self.free.grid.centres()))
 
     def observe(self, scan: Scan, belief: Belief) -> None:
-        """Update the scanner's view, and while tracking the obstacles and the component of the graph."""
-        self._view = Sweep.of(scan).sector(scan.mount.yaw)
+        """Update the scanner's field of view, and while tracking the obstacles and the component of the graph."""
+        self._field_of_view = Sweep.of(scan).sector(scan.mount.yaw)
         self._scan = scan
         if belief.state != "tracking":
             return  # the pose is not reliable; obstacles found so far are kept
@@ -216,7 +216,7 @@ class GeodesicPolicy:
         if self.epistemic or belief.state != "ambiguous":
             points = safety.scan_points(self._scan)
             points = points[np.hypot(*points.T) < OBSTACLE_RANGE_M]
-            return self.localiser.decide(belief, self._scan, points, velocity, self._view)
+            return self.localiser.decide(belief, self._scan, points, velocity, self._field_of_view)
         decision = self.decide(belief, velocity)
         decision.reason = decision.reason or f"the belief is {belief.state}: going by its best guess"
         return decision
@@ -276,7 +276,7 @@ class GeodesicPolicy:
             moving[near],
             self.graph.min_clearance,
             self.robot.radius + OBSTACLE_GAP_M,
-            view=self._view,
+            field_of_view=self._field_of_view,
             may_turn=not self.keep_heading,
         )
 

@@ -23,12 +23,14 @@ if TYPE_CHECKING:
 
 HEADING_FADE_M = 0.3  # closer to the attractor, the cost of turning towards it fades out
 BLIND_SPEED = 0.25  # m/s into directions that the scanner does not see, for a base that may not turn; others turn first
-VIEW_MARGIN_RAD = np.pi / 4  # the view must extend this far beyond the direction of motion, because the body is wide
-MIN_VIEW_DIVISOR = 3  # with a narrow view, motion is still allowed in this fraction of it around its centre
+# The field of view must extend this far beyond the direction of motion, because the body is wide. In a narrow one,
+# motion is still allowed in the part around its centre that this divisor gives.
+FIELD_OF_VIEW_MARGIN_RAD, FIELD_OF_VIEW_DIVISOR = np.pi / 4, 3
 CHANGE_COST_S = 0.02  # m to go that a change of the velocity by 1 m/s must gain, so that policies do not alternate
 LINE_SAMPLES = (np.arange(6) + 0.5) / 6  # shares of the line to the attractor at which its information is looked up
 MOTION_SAMPLES = 5  # every so many steps of a motion
 HINDERED_M = 0.05  # m to go that obstacles must cost before the status says so
+GAP_TOLERANCE_M = 1e-3
 
 
 @dataclass(frozen=True)
@@ -41,21 +43,23 @@ class Surroundings:
     min_wall_distance: float  # m from the robot's centre
     min_point_distance: float  # m from the robot's centre
     walking_speed: float = 1.0  # m/s assumed for moving points
-    view: Sector = ALL_ROUND  # directions that the scanner sees
+    field_of_view: Sector = ALL_ROUND  # directions that the scanner sees
     may_turn: bool = True  # if the base may turn, it never has to move into a direction that the scanner does not see
 
     def sees(self, bearings: Array | float) -> npt.NDArray[np.bool_]:
         """Whether the scanner sees all that the body can meet on the way into ``bearings`` (...,) rad; (...,) bool."""
-        if self.view.half >= np.pi:
+        if self.field_of_view.half >= np.pi:
             return np.ones(np.shape(bearings), bool)
-        off_centre = np.abs(se2.wrap(bearings - self.view.centre))
-        max_off_centre = max(self.view.half - VIEW_MARGIN_RAD, self.view.half / MIN_VIEW_DIVISOR)
+        off_centre = np.abs(se2.wrap(bearings - self.field_of_view.centre))
+        max_off_centre = max(
+            self.field_of_view.half - FIELD_OF_VIEW_MARGIN_RAD, self.field_of_view.half / FIELD_OF_VIEW_DIVISOR
+        )
         return np.asarray(off_centre <= max_off_centre + 1e-9)
 
     @property
     def forward(self) -> float:
-        """Bearing in rad to turn towards a target: 0 if the scanner sees ahead, otherwise the middle of its view."""
-        return 0.0 if bool(self.sees(0.0)) else self.view.centre
+        """Bearing in rad to turn towards a target: 0 if the scanner sees ahead, else its field of view's middle."""
+        return 0.0 if bool(self.sees(0.0)) else self.field_of_view.centre
 
     def gaps(
         self, poses: Array, times: Array, standing_after: Array | float = np.inf, max_gap: float = np.inf
@@ -110,14 +114,14 @@ class PoseBelief:
         """Variance of the position, m², over both axes."""
         return float(self.covariance[0, 0] + self.covariance[1, 1])
 
-    def outlook(self, motions: Array, attractor: Array, seconds: float) -> tuple[Array, Array]:
+    def ambiguity_and_gain(self, motions: Array, attractor: Array, seconds: float) -> tuple[Array, Array]:
         """Ambiguity and information gain (N,) nats about the pose, of motions (N, T, 3) and the line to the attractor.
 
         The motions and the attractor (2,) m are in base_link, and take ``seconds``.
         """
         if self.scans is None:
             return np.zeros(len(motions)), np.zeros(len(motions))
-        ends, length = motions[:, -1, :2], np.hypot(*np.diff(motions[..., :2], axis=1).T).sum(axis=0)
+        ends, length = motions[:, -1, :2], path_lengths(motions)
         line = ends[:, None] + LINE_SAMPLES[:, None] * (attractor - ends)[:, None]
         points = se2.transform(self.pose, np.concatenate([motions[:, ::MOTION_SAMPLES, :2], line], axis=1))
         onwards = np.hypot(*(attractor - ends).T)
@@ -126,10 +130,9 @@ class PoseBelief:
         metres[:, : -len(LINE_SAMPLES)] *= length[:, None] / (points.shape[1] - len(LINE_SAMPLES))
         ambiguity = np.sum(metres * self.scans.grid.interpolate(self.scans.ambiguity, points), axis=1)
         loss = metres * self.scans.grid.interpolate(self.scans.loss, points)
+        information_at_ends = self.scans.matrix[self.scans.grid.cell_of(se2.transform(self.pose, ends))]
+        information = information_at_ends * seconds / motion.STEP_S
         predicted = self.covariance + efe.MOTION_NOISE * length[:, None, None]
-        information = (
-            self.scans.matrix[self.scans.grid.cell_of(se2.transform(self.pose, ends))] * seconds / motion.STEP_S
-        )
         before = efe.remaining_entropy(self.covariance, np.zeros((3, 3)))
         gain = before - efe.remaining_entropy(predicted, information)
         return ambiguity, gain - np.sum(loss[:, -len(LINE_SAMPLES) :], axis=1)
@@ -154,26 +157,23 @@ def select_policy(
     sampled once around the attractor, and once more around the best of them. One whose motion is not free, or may not
     stay free until the robot stands, is excluded: its risk is infinite.
     """
-    belief = belief or PoseBelief()
-    policies = _visible_policies(motion.candidate_policies(current, attractor, robot), surroundings)
-    sampled = _evaluate(current, policies, attractor, surroundings, robot, belief)
-    near = _visible_policies(motion.refined_policies(policies[sampled.best], robot), surroundings)
-    refined = _evaluate(current, near, attractor, surroundings, robot, belief, braking_is_free=False)
-    policies, chosen = (policies, sampled) if sampled.least <= refined.least else (near, refined)
-    hindered = sampled.least_if_free < chosen.least - HINDERED_M * NATS_PER_METRE
+    evaluator = _Evaluator(current, attractor, surroundings, robot, belief or PoseBelief())
+    sampled = evaluator.evaluate(motion.candidate_policies(current, attractor, robot), braking_is_free=True)
+    refined = evaluator.evaluate(motion.refined_policies(sampled.policies[sampled.best], robot))
+    chosen = sampled if sampled.least <= refined.least else refined
+    hindered = float(sampled.energy.total.min()) < chosen.least - HINDERED_M * NATS_PER_METRE
     best = chosen.best
-    return SelectedPolicy(policies[best, :3], chosen.poses[best], chosen.terms, hindered=hindered)
+    return SelectedPolicy(chosen.policies[best, :3], chosen.poses[best], chosen.terms, hindered=hindered)
 
 
 @dataclass(frozen=True)
 class _Evaluation:
-    poses: Array  # (N, T, 3)
-    energy: ExpectedFreeEnergy
-    free: npt.NDArray[np.bool_]  # (N,)
+    """Policies and their expected free energy."""
 
-    @property
-    def allowed(self) -> Array:
-        return np.where(self.free, self.energy.total, np.inf)
+    policies: Array  # (N, 5)
+    poses: Array  # (N, T, 3) to which they lead
+    energy: ExpectedFreeEnergy
+    allowed: Array  # (N,) total energy in nats; +inf for policies that are not allowed
 
     @property
     def best(self) -> int:
@@ -187,49 +187,52 @@ class _Evaluation:
     def terms(self) -> dict[str, float]:
         return self.energy.of(self.best, self.allowed)
 
-    @property
-    def least_if_free(self) -> float:
-        return float(self.energy.total.min())
+
+class _Evaluator:
+    """Evaluates policies in one situation."""
+
+    def __init__(
+        self, current: Array, attractor: Array, surroundings: Surroundings, robot: Robot, belief: PoseBelief
+    ) -> None:
+        self.current, self.attractor, self.surroundings = current, attractor, surroundings
+        self.robot, self.belief = robot, belief
+        # If the robot is too close to something already, every motion that leads away from it counts as free.
+        present_gap = float(surroundings.gaps(np.zeros((1, 1, 3)), np.zeros(1), max_gap=WALL_COST_RANGE_M)[0, 0])
+        self._min_gap = min(0.0, present_gap) - GAP_TOLERANCE_M
+
+    def evaluate(self, policies: Array, *, braking_is_free: bool = False) -> _Evaluation:
+        """Expected free energy of those of the policies (N, 5) into directions that the scanner sees.
+
+        With ``braking_is_free``, policy 0, which brakes, is always allowed, even if an obstacle may approach meanwhile.
+        """
+        policies = _visible_policies(policies, self.surroundings)
+        poses, times, standing_after = motion.rollouts(self.current, policies, self.robot)
+        deviation = np.sqrt(self.belief.variance / 2)
+        gaps = self.surroundings.gaps(poses, times, standing_after, WALL_COST_RANGE_M + 2 * deviation)
+        free = np.all(gaps >= self._min_gap, axis=1)
+        if braking_is_free:
+            free[0] = True
+        metres = self._risk_metres(policies, poses, gaps, deviation)
+        ambiguity, information = self.belief.ambiguity_and_gain(poses, self.attractor, float(times[-1]))
+        energy = ExpectedFreeEnergy(NATS_PER_METRE * metres, ambiguity, information, np.zeros(len(policies)))
+        return _Evaluation(policies, poses, energy, np.where(free, energy.total, np.inf))
+
+    def _risk_metres(self, policies: Array, poses: Array, gaps: Array, deviation: float) -> Array:
+        """Risk (N,) in m to go, with the ``deviation`` m of the belief's position.
+
+        It is the distance to go, on average on the way and at the end, where the last pose stands for all that follows;
+        the metres of the motion, more if its narrowest gap is small; and the change of velocity.
+        """
+        distance = efe.expected_distance(remaining_distance(poses, self.attractor, self.robot), self.belief.variance)
+        closeness = efe.expected_square(1 - gaps.min(axis=1) / WALL_COST_RANGE_M, deviation / WALL_COST_RANGE_M)
+        effort = CHANGE_COST_S * np.hypot(*(policies[:, :2] - self.current[:2]).T)
+        near_obstacles = MAX_WALL_COST * closeness * path_lengths(poses)
+        return np.asarray(distance.mean(axis=1) + distance[:, -1] + near_obstacles + effort)
 
 
-def _evaluate(
-    current: Array,
-    policies: Array,
-    attractor: Array,
-    surroundings: Surroundings,
-    robot: Robot,
-    belief: PoseBelief,
-    *,
-    braking_is_free: bool = True,
-) -> _Evaluation:
-    """Expected free energy of policies (N, 5).
-
-    The risk is the distance to go, on average on the way and at the end, where the last pose stands for all that
-    follows; the metres of the motion, more if its narrowest gap is small; and the change of velocity.
-    """
-    poses, times, standing_after = motion.rollouts(current, policies, robot)
-    deviation = np.sqrt(belief.variance / 2)
-    gaps = surroundings.gaps(poses, times, standing_after, WALL_COST_RANGE_M + 2 * deviation)
-    free = _is_free(gaps, surroundings)
-    if braking_is_free:  # policy 0, braking, is always allowed, even if an obstacle may approach meanwhile
-        free[0] = True
-    distance = efe.expected_distance(remaining_distance(poses, attractor, robot), belief.variance)
-    length = np.hypot(*np.diff(poses[..., :2], axis=1).T).sum(axis=0)
-    closeness = efe.expected_square(1 - gaps.min(axis=1) / WALL_COST_RANGE_M, deviation / WALL_COST_RANGE_M)
-    effort = CHANGE_COST_S * np.hypot(*(policies[:, :2] - current[:2]).T)
-    metres = distance.mean(axis=1) + distance[:, -1] + MAX_WALL_COST * closeness * length + effort
-    ambiguity, information = belief.outlook(poses, attractor, float(times[-1]))
-    energy = ExpectedFreeEnergy(NATS_PER_METRE * metres, ambiguity, information, np.zeros(len(policies)))
-    return _Evaluation(poses, energy, free)
-
-
-def _is_free(gaps: Array, surroundings: Surroundings) -> npt.NDArray[np.bool_]:
-    """Whether motions with these gaps (N, T) m are free, (N,) bool.
-
-    If the robot is too close to something already, every motion that leads away from it counts as free.
-    """
-    present_gap = float(surroundings.gaps(np.zeros((1, 1, 3)), np.zeros(1), max_gap=WALL_COST_RANGE_M)[0, 0])
-    return np.asarray(np.all(gaps >= min(0.0, present_gap) - 1e-3, axis=1))
+def path_lengths(poses: Array) -> Array:
+    """Length (N,) m of each path of poses (N, T, 3)."""
+    return np.asarray(np.hypot(*np.diff(poses[..., :2], axis=1).T).sum(axis=0))
 
 
 def remaining_distance(poses: Array, attractor: Array, robot: Robot) -> Array:

@@ -125,8 +125,8 @@ def test_moving_and_static_obstacles(point, moving, hindered):
 
 def test_unseen_directions():
     behind, view = np.array([-3.0, 0.0]), Sector(0.0, np.deg2rad(135))
-    action = select_policy(np.zeros(3), behind, around(view=view), ROBOT).action
+    action = select_policy(np.zeros(3), behind, around(field_of_view=view), ROBOT).action
     assert abs(np.arctan2(action[1], action[0])) <= np.pi / 2 + 1e-9  # the body is wide
     assert abs(turn_to_attractor(action, behind, ROBOT, may_turn=True)[2]) > 1.0
-    kept = select_policy(np.zeros(3), behind, around(view=view, may_turn=False), ROBOT).action
+    kept = select_policy(np.zeros(3), behind, around(field_of_view=view, may_turn=False), ROBOT).action
     assert 0 < np.hypot(*kept[:2]) <= 0.25 + 1e-9
