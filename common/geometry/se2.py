@@ -63,6 +63,13 @@ def rotate(yaw: float, vector: npt.ArrayLike) -> Array:
     return np.stack([cos * v[..., 0] - sin * v[..., 1], sin * v[..., 0] + cos * v[..., 1]], axis=-1)
 
 
+def rotation(yaw: float) -> Array:
+    """Matrix R (3, 3) that turns x and y by ``yaw`` rad; R C R.T turns a covariance C of x, y, yaw into the parent."""
+    matrix = np.eye(3)
+    matrix[:2, :2] = rotate(yaw, np.eye(2)).T
+    return matrix
+
+
 def transform(pose: npt.ArrayLike, points: npt.ArrayLike) -> Array:
     """Transform points (..., 2) in m from the frame with the given ``pose`` (3,) to its parent frame."""
     p = np.asarray(pose, float)

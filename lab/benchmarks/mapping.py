@@ -134,7 +134,7 @@ def _rows(name: str, drive: RawDrive, errors: Callable[[Array], Errors], console
                 **dict(zip(COLUMNS, map(float, values), strict=True)),
                 "position_rms_m": float(np.sqrt((position**2).mean())),
                 "closures": len(built.closures),
-                "lost": built.lost,
+                "lost": built.unmatched,
                 "placed": float(placed),
                 "duration_s": float(drive.stamps[-1] - drive.stamps[0]),
                 "seconds": taken,

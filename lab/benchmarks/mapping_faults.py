@@ -134,7 +134,7 @@ def map_drive(drive: RawDrive, truth: Array, world: World) -> dict[str, Any]:
         "position_max_m": float(position.max()),
         "false_walls": false_walls(placed, drive.ranges[known], drive.laser, world),
         "closures": len(built.closures),
-        "lost": built.lost,
+        "lost": built.unmatched,
         "seconds": taken,
     }
 

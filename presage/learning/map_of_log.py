@@ -26,7 +26,7 @@ from presage.terminal.progress import working
 from services.estimator.precise.learning import drive_learning, weights
 from services.mapper.slam.drive import Laser, RawDrive
 from services.mapper.slam.grid import grid_of_scans
-from services.mapper.slam.trajectory import bend, build_trajectory
+from services.mapper.slam.trajectory import build_trajectory, distribute_corrections
 
 MIN_SCANS = 2
 SIMULATED_SCANS = 2000  # in the rough map, for the model where the drive saw nothing
@@ -142,8 +142,8 @@ def _build_poses(
 
         built = build_trajectory(drive, report)
     console.print(
-        f"{len(built.keys)} key scans, {len(built.closures)} loop closures, {built.lost} scans that matched nothing "
-        f"before; {'with' if odom is not None else 'without'} odometry",
+        f"{len(built.keys)} key scans, {len(built.closures)} loop closures, "
+        f"{built.unmatched} scans that matched nothing before; {'with' if odom is not None else 'without'} odometry",
         soft_wrap=True,
     )
     unplaced = float(np.isnan(built.poses).any(axis=1).mean())
@@ -164,4 +164,4 @@ def _build_poses(
         f"{placement.deviation * 1e3:.0f} mm",
         soft_wrap=True,
     )
-    return bend(built.poses, keys, placement.poses, np.zeros(len(keys), int))
+    return distribute_corrections(built.poses, keys, placement.poses, np.zeros(len(keys), int))

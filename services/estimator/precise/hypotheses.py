@@ -221,7 +221,6 @@ def protection_level(mode: Mode, covariance: Array, elsewhere: float) -> Array |
     """
     if elsewhere >= EXCEEDED:
         return None
-    axes = np.eye(3)
-    axes[:2, :2] = se2.rotate(float(mode.pose[2]), np.eye(2))
-    deviation = np.sqrt(np.diagonal(axes @ covariance @ axes.T))
+    turn = se2.rotation(-float(mode.pose[2]))
+    deviation = np.sqrt(np.diagonal(turn @ covariance @ turn.T))
     return np.asarray(NormalDist().inv_cdf(1 - (EXCEEDED - elsewhere) / 2) * deviation)

@@ -150,7 +150,7 @@ class LocalMap:
         """
         if not self.scans or len(points) < MIN_POINTS:
             return None
-        turn = rotation(-self.frame[2])
+        turn = se2.rotation(-float(self.frame[2]))
         covariance = turn @ prior.covariance @ turn.T
         local_prior = replace(prior, mean=self.local(prior.mean), covariance=covariance)
         found = self._best(self.local(starts), points, local_prior)
@@ -164,7 +164,7 @@ class LocalMap:
 
     def candidate(self, match: Match) -> Candidate:
         """The pose in map that a match gives."""
-        turn = rotation(self.frame[2])
+        turn = se2.rotation(float(self.frame[2]))
         covariance = self.covariance + turn @ match.covariance @ turn.T
         return Candidate("recent scans", se2.compose(self.frame, match.pose), covariance, 1.0)
 
@@ -261,10 +261,3 @@ def _nearest_of_neighbours(ranges: Array, beam: npt.NDArray[np.intp]) -> Array:
     """The smallest (K,) of the ranges (B,) at each beam (K,) and its two neighbours; the first and last have one."""
     around = np.stack([ranges[np.clip(beam + k, 0, len(ranges) - 1)] for k in (-1, 0, 1)])
     return np.asarray(np.where(np.isnan(around), -np.inf, around).min(axis=0))
-
-
-def rotation(yaw: float) -> Array:
-    """Matrix (3, 3) that rotates a covariance of x, y, yaw by ``yaw`` rad."""
-    matrix = np.eye(3)
-    matrix[:2, :2] = se2.rotate(float(yaw), np.eye(2)).T
-    return matrix

@@ -127,9 +127,8 @@ def _velocity_variance(pose: Array, covariance: Array, period: float) -> Array:
     the variance of p. With a slow scanner this is little compared with the possible acceleration.
     """
     share = min(1.0, period / SMOOTHING_TIME_S)
-    axes = np.eye(3)
-    axes[:2, :2] = se2.rotate(float(pose[2]), np.eye(2))
-    return np.asarray(2 * share * (1 + share) * np.diagonal(axes @ covariance @ axes.T))
+    turn = se2.rotation(-float(pose[2]))
+    return np.asarray(2 * share * (1 + share) * np.diagonal(turn @ covariance @ turn.T))
 
 
 def _propagate(

@@ -23,8 +23,8 @@ class BackEnd:
         self.laser = laser
         self.poses = np.zeros((0, 3))  # of the key scans, corrected; comparable only if links connect them
         self.closures: list[Closure] = []
-        self._uncertainty: Uncertainty | None = None  # of the segments; None after a change
-        self._known: set[tuple[int, int]] = set()  # pairs of segments that were tried
+        self._uncertainty: Uncertainty | None = None  # of the segments; computed again after a change
+        self._tried: set[tuple[int, int]] = set()  # pairs of segments
         self._joining = Joining()
 
     def extend(self, scans: KeyScans) -> None:
@@ -51,31 +51,35 @@ class BackEnd:
         if self._uncertainty is None:
             references = np.array([segment.reference for segment in segments], int)
             self._uncertainty = Uncertainty(self.poses, self._links(scans), references)
-        found = find_closures(segments, self.poses, self._uncertainty, self._known, window, report)
+        found = find_closures(segments, self.poses, self._uncertainty, self._tried, window, report)
         self._add(found, scans)
 
     def join_pieces(self, scans: KeyScans, *, growing: bool = False) -> bool:
-        """Searches the map for pieces without a link to it; returns whether one was found."""
+        """Searches the map for a piece without a link to it; returns whether one was found."""
         if not scans.pieces.any():
             return False
         segments = self._segments(scans, growing=growing)
-        self._separate(segments)
+        self._separate_if_contradicted(segments)
         component = self._components(scans)
         if not component.any():
             return False
         found = self._joining.find(segments, self.poses, component)
         if not found:
             return False
-        link = found[0].link
-        first, second = (component == component[k] for k in (link.first, link.second))
-        if np.argmax(first) < np.argmax(second):  # the earlier one stays
-            origin = se2.compose(se2.compose(self.poses[link.first], link.pose), se2.inverse(self.poses[link.second]))
-            self.poses[second] = se2.compose(origin, self.poses[second])
-        else:
-            back = se2.compose(self.poses[link.second], se2.inverse(link.pose))
-            self.poses[first] = se2.compose(se2.compose(back, se2.inverse(self.poses[link.first])), self.poses[first])
+        self._move_later_part(found[0].link, component)
         self._add(found, scans)
         return True
+
+    def _move_later_part(self, link: Link, component: npt.NDArray[np.int_]) -> None:
+        """Moves the later one of two components to where a link between them says that it is."""
+        first, second = (component == component[k] for k in (link.first, link.second))
+        if np.argmax(first) < np.argmax(second):
+            place = se2.compose(self.poses[link.first], link.pose)
+            later, origin = second, se2.compose(place, se2.inverse(self.poses[link.second]))
+        else:
+            place = se2.compose(self.poses[link.second], se2.inverse(link.pose))
+            later, origin = first, se2.compose(place, se2.inverse(self.poses[link.first]))
+        self.poses[later] = se2.compose(origin, self.poses[later])
 
     def in_map(self, scans: KeyScans) -> npt.NDArray[np.bool_]:
         """Mask (K,) of the key scans that belong to the map: the largest part of the drive that links connect."""
@@ -90,16 +94,14 @@ class BackEnd:
         self._drop_implausible()
         self.poses = optimise(self.poses, self._links(scans))
 
-    def _separate(self, segments: list[Segment]) -> None:
+    def _separate_if_contradicted(self, segments: list[Segment]) -> None:
         """Separates the last piece from the others if its last segment contradicts them."""
-        last = segments[-1]
+        last, number = segments[-1], len(segments) - 1
         pieces = [{segments[k].piece for k in (each.first, each.second)} for each in self.closures]
-        between = [last.piece in each and len(each) > 1 for each in pieces]
+        joins_last = [last.piece in each and len(each) > 1 for each in pieces]
         others = [k for k, each in enumerate(segments) if each.piece != last.piece]
-        if any(between) and is_contradicted(
-            len(segments) - 1, self.poses[last.reference], others, segments, self.poses
-        ):
-            self.closures = [each for each, joins in zip(self.closures, between, strict=True) if not joins]
+        if any(joins_last) and is_contradicted(number, self.poses[last.reference], others, segments, self.poses):
+            self.closures = [each for each, joins in zip(self.closures, joins_last, strict=True) if not joins]
             self._uncertainty = None
 
     def _segments(self, scans: KeyScans, *, growing: bool) -> list[Segment]:

@@ -1,7 +1,7 @@
-"""Surface elements of a scan: short pieces of surface with a position and a normal.
+"""Surface elements of a scan: short lines with a position and a normal.
 
-A piece is a line fitted to neighbouring beams, so it carries their information with less noise, and it has a front: its
-normal points to the scanner. The two sides of a thin wall therefore stay apart.
+An element is a line fitted to neighbouring beams, so it carries their information with less noise. Its normal points to
+the scanner, so the two sides of a thin wall are never confused.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from common.robot.ranges import is_surface
 
-HALF_WIDTH_M = 0.06  # of a piece, across the beams
-SPACING_M = 0.1  # between pieces, across the beams
+HALF_WIDTH_M = 0.06  # of an element, across the beams
+SPACING_M = 0.1  # between elements, across the beams
 MIN_GAP_M, GAP_BEAMS = 0.12, 6.0  # neighbours farther apart than both, in m and in distances between beams, are apart
-MAX_ROUGHNESS_M = 0.03  # standard deviation of the points across the piece; rougher ones are corners
+MAX_ROUGHNESS_M = 0.03  # standard deviation of the points from the line; rougher elements are corners
 MIN_POINTS = 3
 
 
@@ -30,16 +30,16 @@ class Elements:
     normals: Array  # (K, 2) unit vectors towards free space
     lengths: Array  # (K,) m along the surface, up to the neighbours
 
-    def moved(self, pose: Array) -> Elements:
+    def transformed(self, pose: Array) -> Elements:
         """The elements in the parent frame of the frame with ``pose`` (3,)."""
         return Elements(se2.transform(pose, self.points), se2.rotate(float(pose[2]), self.normals), self.lengths)
 
-    def part(self, which: npt.NDArray[np.integer | np.bool_]) -> Elements:
+    def select(self, which: npt.NDArray[np.integer | np.bool_]) -> Elements:
         """Some of the elements."""
         return Elements(self.points[which], self.normals[which], self.lengths[which])
 
     def divided(self) -> Elements:
-        """The same surfaces in pieces of at most `SPACING_M`; those of far ones are as long as the beams are apart."""
+        """The same surfaces in elements of at most `SPACING_M`; far ones were as long as the beams are apart."""
         count = np.maximum(np.ceil(self.lengths / SPACING_M), 1).astype(int)
         which = np.repeat(np.arange(len(self)), count)
         number = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
@@ -52,7 +52,7 @@ class Elements:
         return len(self.points)
 
 
-def joined(elements: list[Elements]) -> Elements:
+def concatenate(elements: list[Elements]) -> Elements:
     """All elements of a list, in one frame."""
     points, normals, lengths = zip(*((e.points, e.normals, e.lengths) for e in elements), strict=True)
     return Elements(np.concatenate(points), np.concatenate(normals), np.concatenate(lengths))
@@ -70,20 +70,33 @@ def elements_of_scan(ranges: Array, angles: Array, mount: Array, range_max: floa
     surface = np.concatenate([[0], np.cumsum(apart)])
     # Distance along the scan across the beams, with a jump from one surface to the next.
     along = np.concatenate([[0.0], np.cumsum((r[1:] + r[:-1]) / 2 * np.diff(hit) * step + apart * 10 * HALF_WIDTH_M)])
+    return _fit_lines(points, *_windows(along, surface)).transformed(mount)
+
+
+def _windows(along: Array, surface: npt.NDArray[np.int_]) -> tuple[npt.NDArray[np.int_], npt.NDArray[np.int_]]:
+    """First point, and the one after the last, of each element; all of them on one ``surface`` (N,).
+
+    ``along`` (N,) m are the places of the points along the scan.
+    """
     middle = np.flatnonzero(np.diff(np.floor(along / SPACING_M), prepend=-1.0) > 0)
     first = np.minimum(np.searchsorted(along, along[middle] - HALF_WIDTH_M), middle - 1)
     last = np.maximum(np.searchsorted(along, along[middle] + HALF_WIDTH_M, side="right"), middle + 2)
     first = np.maximum(first, np.searchsorted(surface, surface[middle]))
     last = np.minimum(last, np.searchsorted(surface, surface[middle], side="right"))
+    return first, last
+
+
+def _fit_lines(points: Array, first: npt.NDArray[np.int_], last: npt.NDArray[np.int_]) -> Elements:
+    """Lines through points ``first`` to ``last`` - 1 of ``points`` (N, 2) m in laser, without corners."""
     x, y = points.T
     sums = np.concatenate([np.zeros((1, 5)), np.cumsum(np.stack([x, y, x * x, x * y, y * y], axis=-1), axis=0)])
     count = last - first
     mx, my, xx, xy, yy = ((sums[last] - sums[first]) / np.maximum(count, 1)[:, None]).T
-    xx, xy, yy = xx - mx**2, xy - mx * my, yy - my**2
+    xx, xy, yy = xx - mx**2, xy - mx * my, yy - my**2  # covariance
     across = np.arctan2(2 * xy, xx - yy) / 2 + np.pi / 2
     normals = np.column_stack([np.cos(across), np.sin(across)])
     normals *= -np.sign(normals[:, 0] * mx + normals[:, 1] * my)[:, None]  # towards the scanner
-    smallest = (xx + yy) / 2 - np.sqrt(((xx - yy) / 2) ** 2 + xy**2)
+    smallest = (xx + yy) / 2 - np.sqrt(((xx - yy) / 2) ** 2 + xy**2)  # eigenvalue: variance across the line
     flat = (count >= MIN_POINTS) & (smallest < MAX_ROUGHNESS_M**2)
     lengths = np.hypot(*(points[last - 1] - points[first]).T) / 2
-    return Elements(np.column_stack([mx, my])[flat], normals[flat], lengths[flat]).moved(mount)
+    return Elements(np.column_stack([mx, my])[flat], normals[flat], lengths[flat])

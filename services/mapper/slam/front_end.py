@@ -1,7 +1,8 @@
 """The front end: the motion between scans, from each scan's registration to the last key scans.
 
-A scan that contradicts the last key scans is not used: something hides the surroundings, or the robot was carried off.
-If the next scans do so as well, another piece of the drive begins, of which no place in the former pieces is known.
+A scan that contradicts the last key scans is suspect: something hides the surroundings, or the robot was carried off.
+It gets no place. After `MAX_SUSPECT_SCANS` in a row, another piece of the drive begins, whose place relative to the
+former pieces is unknown.
 """
 
 from __future__ import annotations
@@ -17,36 +18,43 @@ from common.geometry.se2 import Array
 from common.robot.motion_distortion import beam_times, correct_beams, evenly_spaced
 from common.robot.scan_geometry import Sweep
 from services.mapper.slam.drive import Laser, RawDrive
-from services.mapper.slam.elements import Elements, elements_of_scan, joined
+from services.mapper.slam.elements import Elements, concatenate, elements_of_scan
 from services.mapper.slam.pose_graph import Link
-from services.mapper.slam.registration import MIN_PARTNERS, PRIOR_SCALE, Prior, Registration, Surface, register
+from services.mapper.slam.registration import (
+    MIN_PARTNERS,
+    PRIOR_SCALE,
+    PosePrior,
+    Registration,
+    Surface,
+    register,
+)
 from services.mapper.slam.search import search
-from services.mapper.slam.segments import Segment, Views, agreement
+from services.mapper.slam.segments import PosedScans, Segment, compare
 
 KEY_DISTANCE_M, KEY_TURN_RAD = 0.4, 0.5  # from the last key scan, before another one is taken
 KEY_SHARE = 0.1  # of the median range, if that is a larger distance
+# A scan of which a smaller share matches sees something new. It becomes a key scan after this share of the distance.
+FAMILIAR_SHARE, EARLY_KEY_SHARE = 0.7, 0.25
 SEARCH_WINDOW, SEARCH_RANGE_M = np.array([0.3, 0.3, 0.4]), 10.0  # around the prior; of the elements that take part
 LOCAL_SCANS = 12  # key scans in the local map
 MIN_SHARE = 0.2  # of a scan's elements that must match the local map
-# Share of agreeing elements, among those that agree with or contradict the local map, at a pose that may be right;
-# and the number that is taken to agree anyway, so that a few elements alone are no evidence.
-MIN_AGREEMENT, AGREEING = 0.78, 10
-LOST_SCANS = 10  # successive ones that do not match, before another piece begins
-NEAR = np.array([0.1, 0.1, 0.1])  # m, m, rad from the expected pose, where a match is no chance while the robot is lost
+# Share of agreeing elements, among those that agree with or contradict the local map, at a pose that may be right; and
+# the number of elements that are taken to agree in addition, so that a few contradictions alone are no evidence.
+MIN_AGREEMENT, PRIOR_AGREEMENT = 0.78, 10
+MAX_SUSPECT_SCANS = 10  # in a row; the last of them begins another piece
+CLOSE_TO_PRIOR = np.array([0.1, 0.1, 0.1])  # m, m, rad: after a suspect scan, a match farther away may be chance
 NO_PIECE = -1
-# A scan of which less matches sees something new; it becomes a key scan earlier, after this share of the way.
-FAMILIAR_SHARE, EARLY = 0.7, 0.25
 # Standard deviations of the motion. With odometry: of its error, as a share of the motion. Without: of the change of
 # the velocity in one second, m/s and rad/s, and of the velocity itself where the last one is unknown.
 ODOMETRY_PATH, ODOMETRY_TURN_BY_PATH, ODOMETRY_TURN = 0.4, 0.5, 1.0  # m/m, rad/m, rad/rad
-# Scans over which these deviations are learned, and the largest error that counts, in deviations.
-LEARNED_SCANS, MAX_SURPRISE = 100, 10.0
-STANDING = np.array([0.002, 0.002, 0.002])  # m, m, rad
 ACCELERATION = np.array([1.0, 1.0, 3.0])
 MAX_VELOCITY = np.array([1.0, 1.0, 1.5])
+STANDING_DEVIATION = np.array([0.002, 0.002, 0.002])  # m, m, rad: in addition to both
 MAX_MOTION = 3 * MAX_VELOCITY  # in one second; a robot that seems to move faster was carried off
+# Scans over which these deviations are learned, and the largest error that counts, in deviations.
+LEARNING_SCANS, MAX_LEARNED_SIGMAS = 100, 10.0
 # Errors of a registration that do not average out, for each key scan: moving things, the surfaces' roughness.
-REGISTRATION = np.array([0.005, 0.005, 0.002])
+REGISTRATION_DEVIATION = np.array([0.005, 0.005, 0.002])
 
 
 @dataclass(frozen=True)
@@ -68,7 +76,7 @@ class Track:
     pieces: npt.NDArray[np.int_]  # (N,) of the drive, or `NO_PIECE`
     keys: list[int]  # scans that are key scans
     key_scans: KeyScans
-    lost: int  # scans that did not match
+    unmatched: int  # scans
 
 
 @dataclass(frozen=True)
@@ -77,79 +85,64 @@ class Place:
 
     pose: Array  # (3,)
     covariance: Array  # (3, 3) relative to the last key scans
-    matched: bool  # otherwise only the motion model tells the pose
-    piece: int = 0  # of the drive, or `NO_PIECE` if the surroundings contradict the pose
+    matched: bool  # otherwise only the motion model gives the pose
+    piece: int = 0  # of the drive, or `NO_PIECE` for a suspect scan
+
+
+@dataclass(frozen=True)
+class _Scan:
+    """A scan, corrected for the robot's motion."""
+
+    elements: Elements
+    ranges: Array  # (B,) m
+    angles: Array  # (B,) rad
 
 
 class FrontEnd:
     """Registers scan after scan, and keeps the key scans."""
 
     def __init__(self, laser: Laser) -> None:
-        self.laser = laser
-        self.stamps: list[float] = []  # s, of all scans
-        self.poses: list[Array] = []  # (3,) of all scans
-        self.pieces: list[int] = []  # of all scans
-        self.keys: list[int] = []  # scans that are key scans
-        self.lost = 0  # scans that did not match
-        self._sweep = Sweep.of_angles(laser.angles)
-        self._elements: list[Elements] = []  # of the key scans
-        self._ranges: list[Array] = []  # of the key scans
+        self.laser, self._sweep = laser, Sweep.of_angles(laser.angles)
+        # One entry for each scan.
+        self.stamps: list[float] = []  # s
+        self.poses: list[Array] = []  # (3,)
+        self.pieces: list[int] = []
+        self.unmatched = 0  # number of them that did not match
+        # One entry for each key scan.
+        self.keys: list[int] = []  # its number among all scans
+        self._key_pieces: list[int] = []
+        self._elements: list[Elements] = []
+        self._ranges: list[Array] = []
         self._links: list[Link] = []
-        self._key_pieces: list[int] = []  # of the key scans
-        self._surface: Surface  # of the local map
-        self._local: Segment  # the local map with what its scans saw through
-        self._lost_scans = 0  # since one matched, if one of them contradicted the local map
-        self._odom: Array | None = None  # of the last scan
+        # The local map: its surfaces, and the same with what its scans saw through.
+        self._surface: Surface
+        self._local: Segment
+        # The motion.
+        self._odom: Array | None = None  # (3,) of the last scan
         self._velocity: Array | None = None  # (3,) base_link
         self._scale = np.ones(3)  # of the deviations of the motion, learned
         self._since_key = np.zeros((3, 3))  # covariance of the motion since the last key scan, by the motion model
+        self._suspect_scans = 0  # in a row until now
 
     def add(self, stamp: float, ranges: Array, odom: Array | None = None) -> Place:
         """Registers a scan ``ranges`` (B,) m at ``stamp`` s, later than the one before, with or without odometry."""
-        laser, first = self.laser, not self.stamps
-        period = 0.0 if first else stamp - self.stamps[-1]
-        motion, deviation = (np.zeros(3), np.zeros(3)) if first else self._motion(period, odom)
-        ranges, angles = self._corrected(ranges, motion, period)
-        elements = elements_of_scan(ranges, angles, laser.mount, laser.range_max)
+        period = stamp - self.stamps[-1] if self.stamps else 0.0
+        motion, deviation = self._predict_motion(period, odom)
+        scan = self._correct(ranges, motion, period)
         used_odometry, self._odom = self._odom is not None and odom is not None, odom
         self.stamps.append(stamp)
-        if first:
-            return self._begin_piece(np.zeros(3), elements, ranges, angles)
-        last = self.poses[-1]
-        _, by_step = se2.compose_jacobians(last, motion)
-        covariance = (by_step * (self._scale * deviation) ** 2) @ by_step.T
-        prior = Prior(se2.compose(last, motion), np.asarray(np.linalg.inv(covariance), float))
-        coasting = last if self._velocity is None else se2.compose(last, self._velocity * period)
-        found = _best_registration(self._surface, elements, prior, coasting)
-        if found is not None and found.share < MIN_SHARE:
-            found = None
+        if len(self.stamps) == 1:
+            return self._begin_piece(np.zeros(3), scan)
+        prior, covariance = self._prior(motion, deviation)
         self._since_key = self._since_key + PRIOR_SCALE**2 * covariance
-        familiar = found is not None and found.share > FAMILIAR_SHARE
-        pose = prior.mean if found is None else found.pose
-        jumps = bool((np.abs(se2.between(last, pose)) > MAX_MOTION * period).any())
-        off = np.abs(se2.between(prior.mean, pose))
-        lost = bool(self._lost_scans) and (found is None or bool((off > NEAR).any()))
-        if jumps or (not familiar and (lost or self._is_contradicted(pose, elements, ranges, angles))):
-            found, self._lost_scans = None, max(1, self._lost_scans)
-        if found is None:
-            self.lost += 1
-            self._velocity = None if used_odometry else self._velocity
-            if self._lost_scans:
-                return self._add_lost(prior.mean, elements, ranges, angles)
-            place, information = Place(prior.mean, self._since_key, False, self._key_pieces[-1]), np.zeros((3, 3))
-        else:
-            self._lost_scans = 0
-            self._velocity = se2.between(last, found.pose) / period
-            if familiar:
-                self._scale = _learned(self._scale, self._scale * deviation, prior.mean, found)
-            place = Place(found.pose, found.covariance + np.diag(REGISTRATION**2), True, self._key_pieces[-1])
-            information = found.information
-        self._append(place)
-        if self._is_key(place.pose, elements, familiar=found is None or familiar):
-            key = self.poses[self.keys[-1]]
-            self._links.append(_link(len(self.keys) - 1, key, place.pose, information, self._since_key))
-            self._add_key(elements, ranges, angles)
-        return place
+        found = self._register(scan, prior, period)
+        suspect = self._is_suspect(scan, found, prior, period)
+        if found is not None and not suspect:
+            return self._add_matched(scan, found, prior, deviation, period)
+        self.unmatched += 1
+        if used_odometry:
+            self._velocity = None
+        return self._add_suspect(scan, prior.mean) if suspect else self._add_unmatched(scan, prior.mean)
 
     def key_scans(self) -> KeyScans:
         """The key scans so far."""
@@ -159,9 +152,9 @@ class FrontEnd:
 
     def track(self) -> Track:
         """The drive so far."""
-        return Track(np.array(self.poses), np.array(self.pieces), self.keys.copy(), self.key_scans(), self.lost)
+        return Track(np.array(self.poses), np.array(self.pieces), self.keys.copy(), self.key_scans(), self.unmatched)
 
-    def _motion(self, period: float, odom: Array | None) -> tuple[Array, Array]:
+    def _predict_motion(self, period: float, odom: Array | None) -> tuple[Array, Array]:
         """Motion (3,) in base_link in the ``period`` since the scan before, and its standard deviations (3,)."""
         velocity = self._velocity
         if odom is not None and self._odom is not None:
@@ -170,75 +163,143 @@ class FrontEnd:
             either = np.abs([motion, np.zeros(3) if velocity is None else velocity * period])
             moved, turned = np.hypot(either[:, 0], either[:, 1]).max(), either[:, 2].max()
             path, turn = ODOMETRY_PATH * moved, ODOMETRY_TURN_BY_PATH * moved + ODOMETRY_TURN * turned
-            return motion, STANDING + np.array([path, path, turn])
+            return motion, STANDING_DEVIATION + np.array([path, path, turn])
         if velocity is None:
-            return np.zeros(3), STANDING + MAX_VELOCITY * period
-        return velocity * period, STANDING + np.minimum(ACCELERATION * period, MAX_VELOCITY) * period
+            return np.zeros(3), STANDING_DEVIATION + MAX_VELOCITY * period
+        return velocity * period, STANDING_DEVIATION + np.minimum(ACCELERATION * period, MAX_VELOCITY) * period
 
-    def _corrected(self, ranges: Array, motion: Array, period: float) -> tuple[Array, Array]:
-        """Ranges (B,) and angles (B,) as if measured at the stamp; ``motion`` (3,) since the scan before."""
-        laser = self.laser
-        if not laser.time_increment or not period:
-            return ranges, laser.angles
-        times = beam_times(len(laser.angles), laser.time_increment)
-        return correct_beams(ranges, laser.angles, times[:, None] * (motion / period), laser.mount)
+    def _correct(self, ranges: Array, motion: Array, period: float) -> _Scan:
+        """The scan as if measured at its stamp, with a ``motion`` (3,) since the scan before."""
+        laser, angles = self.laser, self.laser.angles
+        if laser.time_increment and period:
+            times = beam_times(len(angles), laser.time_increment)
+            ranges, angles = correct_beams(ranges, angles, times[:, None] * (motion / period), laser.mount)
+        return _Scan(elements_of_scan(ranges, angles, laser.mount, laser.range_max), ranges, angles)
 
-    def _is_contradicted(self, pose: Array, elements: Elements, ranges: Array, angles: Array) -> bool:
-        """Whether a scan at a pose contradicts the local map more than moving things would make it."""
+    def _prior(self, motion: Array, deviation: Array) -> tuple[PosePrior, Array]:
+        """The pose after a motion, and the covariance (3, 3) of the motion."""
+        last = self.poses[-1]
+        _, by_step = se2.compose_jacobians(last, motion)
+        covariance = (by_step * (self._scale * deviation) ** 2) @ by_step.T
+        return PosePrior(se2.compose(last, motion), np.asarray(np.linalg.inv(covariance), float)), covariance
+
+    def _register(self, scan: _Scan, prior: PosePrior, period: float) -> Registration | None:
+        """Registers a scan to the local map, from the prior's mean; None if too little matches.
+
+        If only a part matches, also from the pose at the velocity so far, and from the results of a search.
+        """
+        surface, elements = self._surface, scan.elements
+        found = register(surface, elements, prior.mean, prior)
+        if found is not None and found.share > FAMILIAR_SHARE:
+            return found
+        last = self.poses[-1]
+        starts = [last if self._velocity is None else se2.compose(last, self._velocity * period)]
+        near = elements.select(np.hypot(*elements.points.T) < SEARCH_RANGE_M)
+        if len(near):
+            starts += list(search(surface.elements, near, prior.mean, SEARCH_WINDOW))
+        others = [register(surface, elements, start, prior) for start in starts]
+        matches = [each for each in (found, *others) if each is not None]
+        best = min(matches, key=lambda each: each.cost, default=None)
+        return None if best is None or best.share < MIN_SHARE else best
+
+    def _is_suspect(self, scan: _Scan, found: Registration | None, prior: PosePrior, period: float) -> bool:
+        """Whether a scan shows that something hides the surroundings, or that the robot was carried off."""
+        pose = prior.mean if found is None else found.pose
+        if (np.abs(se2.between(self.poses[-1], pose)) > MAX_MOTION * period).any():
+            return True
+        if found is not None and found.share > FAMILIAR_SHARE:
+            return False
+        far = bool((np.abs(se2.between(prior.mean, pose)) > CLOSE_TO_PRIOR).any())
+        if self._suspect_scans and (found is None or far):
+            return True
+        return self._contradicts_local_map(scan, pose)
+
+    def _contradicts_local_map(self, scan: _Scan, pose: Array) -> bool:
+        """Whether a scan at a pose (3,) contradicts the local map more than moving things would make it."""
         mount = self.laser.mount
-        scan = Segment(0, 0, elements, Views(mount[None], self._even(ranges, angles)[None], self.laser.angles))
-        _, both, against = agreement(self._local, self._surface, scan, pose)
-        return both + AGREEING < MIN_AGREEMENT * (both + AGREEING + against)
+        views = PosedScans(mount[None], self._evenly_spaced(scan)[None], self.laser.angles)
+        found = compare(self._local, self._surface, Segment(0, 0, scan.elements, views), pose)
+        agreeing = found.agreeing + PRIOR_AGREEMENT
+        return agreeing < MIN_AGREEMENT * (agreeing + found.contradicting)
 
-    def _add_lost(self, pose: Array, elements: Elements, ranges: Array, angles: Array) -> Place:
-        """Adds a scan of unknown pose; after some of them, another piece begins."""
-        self._lost_scans += 1
-        if self._lost_scans > LOST_SCANS and len(elements) >= MIN_PARTNERS:
-            return self._begin_piece(pose, elements, ranges, angles)
+    def _add_matched(
+        self, scan: _Scan, found: Registration, prior: PosePrior, deviation: Array, period: float
+    ) -> Place:
+        self._suspect_scans = 0
+        self._velocity = se2.between(self.poses[-1], found.pose) / period
+        familiar = found.share > FAMILIAR_SHARE
+        if familiar:
+            self._scale = _learn_scale(self._scale, self._scale * deviation, prior.mean, found)
+        covariance = found.covariance + np.diag(REGISTRATION_DEVIATION**2)
+        place = Place(found.pose, covariance, matched=True, piece=self._key_pieces[-1])
+        self._append(place)
+        self._add_key_if_due(scan, found.information, familiar=familiar)
+        return place
+
+    def _add_unmatched(self, scan: _Scan, pose: Array) -> Place:
+        """Adds a scan of which too little matches, at the pose that the motion model predicts."""
+        place = Place(pose, self._since_key, matched=False, piece=self._key_pieces[-1])
+        self._append(place)
+        self._add_key_if_due(scan, np.zeros((3, 3)), familiar=True)
+        return place
+
+    def _add_suspect(self, scan: _Scan, pose: Array) -> Place:
+        """Adds a scan whose pose is unknown; after several of them, another piece begins."""
+        self._suspect_scans += 1
+        if self._suspect_scans >= MAX_SUSPECT_SCANS and len(scan.elements) >= MIN_PARTNERS:
+            return self._begin_piece(pose, scan)
         place = Place(pose, self._since_key, matched=False, piece=NO_PIECE)
         self._append(place)
         return place
 
-    def _begin_piece(self, pose: Array, elements: Elements, ranges: Array, angles: Array) -> Place:
+    def _begin_piece(self, pose: Array, scan: _Scan) -> Place:
         """Begins a piece with a scan, whose pose (3,) may be any."""
-        self._velocity, self._lost_scans = None, 0
-        place = Place(pose, np.diag(REGISTRATION**2), matched=True, piece=max(self._key_pieces, default=-1) + 1)
+        self._velocity, self._suspect_scans = None, 0
+        piece = max(self._key_pieces, default=-1) + 1
+        place = Place(pose, np.diag(REGISTRATION_DEVIATION**2), matched=True, piece=piece)
         self._append(place)
-        self._add_key(elements, ranges, angles)
+        self._add_key(scan)
         return place
 
     def _append(self, place: Place) -> None:
         self.poses.append(place.pose)
         self.pieces.append(place.piece)
 
-    def _is_key(self, pose: Array, elements: Elements, *, familiar: bool) -> bool:
-        off = se2.between(self.poses[self.keys[-1]], pose)
-        far = max(KEY_DISTANCE_M, KEY_SHARE * _median_range(elements))
-        way = max(np.hypot(off[0], off[1]) / far, abs(off[2]) / KEY_TURN_RAD)
-        return bool(way >= (1.0 if familiar else EARLY))
+    def _add_key_if_due(self, scan: _Scan, information: Array, *, familiar: bool) -> None:
+        """Makes the last scan, registered with an ``information`` (3, 3), a key scan if it is far from the last one."""
+        last_key, pose = self.poses[self.keys[-1]], self.poses[-1]
+        off = se2.between(last_key, pose)
+        distance = max(KEY_DISTANCE_M, KEY_SHARE * _median_range(scan.elements))
+        way = max(np.hypot(off[0], off[1]) / distance, abs(off[2]) / KEY_TURN_RAD)
+        if way >= (1.0 if familiar else EARLY_KEY_SHARE):
+            self._links.append(_link(len(self.keys) - 1, last_key, pose, information, self._since_key))
+            self._add_key(scan)
 
-    def _add_key(self, elements: Elements, ranges: Array, angles: Array) -> None:
-        """Makes the last scan a key scan."""
+    def _add_key(self, scan: _Scan) -> None:
+        """Makes the last scan a key scan, and updates the local map."""
+        piece = self.pieces[-1]
         self.keys.append(len(self.poses) - 1)
-        self._elements.append(elements)
-        self._ranges.append(self._even(ranges, angles))
-        self._key_pieces.append(self.pieces[-1])
-        recent = [k for k in range(-min(LOCAL_SCANS, len(self.keys)), 0) if self._key_pieces[k] == self.pieces[-1]]
-        poses = np.array([self.poses[self.keys[k]] for k in recent])
-        local = joined([self._elements[k].moved(pose) for k, pose in zip(recent, poses, strict=True)])
-        self._surface = Surface(local)
-        seen = np.array([self._ranges[k] for k in recent])
-        views = Views(se2.compose(poses, self.laser.mount), seen, self.laser.angles)
-        self._local = Segment(0, 0, local, views)
+        self._key_pieces.append(piece)
+        self._elements.append(scan.elements)
+        self._ranges.append(self._evenly_spaced(scan))
         self._since_key = np.zeros((3, 3))
+        recent = [k for k in range(-min(LOCAL_SCANS, len(self.keys)), 0) if self._key_pieces[k] == piece]
+        poses = np.array([self.poses[self.keys[k]] for k in recent])
+        local = concatenate([self._elements[k].transformed(pose) for k, pose in zip(recent, poses, strict=True)])
+        views = PosedScans(
+            se2.compose(poses, self.laser.mount), np.array([self._ranges[k] for k in recent]), self.laser.angles
+        )
+        self._surface, self._local = Surface(local), Segment(0, 0, local, views)
 
-    def _even(self, ranges: Array, angles: Array) -> Array:
-        """Ranges (B,) at the laser's own angles."""
-        return evenly_spaced(ranges, angles, self._sweep, -np.inf) if self.laser.time_increment else ranges
+    def _evenly_spaced(self, scan: _Scan) -> Array:
+        """The ranges (B,) of a scan at the laser's own angles."""
+        if not self.laser.time_increment:
+            return scan.ranges
+        return evenly_spaced(scan.ranges, scan.angles, self._sweep, -np.inf)
 
 
-def track(drive: RawDrive, report: Callable[[float], None] = lambda _done: None) -> Track:
-    """Tracks the scans of a drive."""
+def track_drive(drive: RawDrive, report: Callable[[float], None] = lambda _done: None) -> Track:
+    """Tracks the scans of a drive; reports the share that is done."""
     front_end = FrontEnd(drive.laser)
     for k, (stamp, ranges) in enumerate(zip(drive.stamps, drive.ranges, strict=True)):
         front_end.add(float(stamp), ranges, None if drive.odom is None else drive.odom[k])
@@ -246,43 +307,25 @@ def track(drive: RawDrive, report: Callable[[float], None] = lambda _done: None)
     return front_end.track()
 
 
-def _best_registration(surface: Surface, elements: Elements, prior: Prior, coasting: Array) -> Registration | None:
-    """Registers a scan from the prior's mean.
-
-    If much of it does not match, also from ``coasting`` (3,), the pose at the velocity so far, and from the results of
-    a search.
-    """
-    found = register(surface, elements, prior.mean, prior)
-    if found is not None and found.share > FAMILIAR_SHARE:
-        return found
-    near = elements.part(np.hypot(*elements.points.T) < SEARCH_RANGE_M)
-    starts = [coasting]
-    if len(near):
-        starts += list(search(surface.elements, near, prior.mean, SEARCH_WINDOW))
-    others = [register(surface, elements, start, prior) for start in starts]
-    matches = [each for each in (found, *others) if each is not None]
-    return min(matches, key=lambda each: each.cost, default=None)
-
-
 def _median_range(elements: Elements) -> float:
     return float(np.median(np.hypot(*elements.points.T))) if len(elements) else 0.0
 
 
-def _learned(scale: Array, deviation: Array, expected: Array, found: Registration) -> Array:
+def _learn_scale(scale: Array, deviation: Array, expected: Array, found: Registration) -> Array:
     """The factor (3,) of the motion's deviations after one more scan, by expectation maximisation.
 
     Odometries differ tenfold.
     """
-    turn = np.eye(3)
-    turn[:2, :2] = se2.rotate(float(expected[2]), np.eye(2))
+    turn = se2.rotation(-float(expected[2]))
     variance = np.diag(turn @ found.covariance @ turn.T)
     squared = (se2.between(expected, found.pose) ** 2 + variance) / deviation**2
-    return np.asarray(scale * np.sqrt(1 + (np.minimum(squared, MAX_SURPRISE**2) - 1) / LEARNED_SCANS))
+    return np.asarray(scale * np.sqrt(1 + (np.minimum(squared, MAX_LEARNED_SIGMAS**2) - 1) / LEARNING_SCANS))
 
 
 def _link(number: int, first: Array, second: Array, information: Array, motion: Array) -> Link:
     """The link between two successive key scans; ``information`` and ``motion`` are in the frame of the track."""
-    turn = np.eye(3)
-    turn[:2, :2] = se2.rotate(float(first[2]), np.eye(2))
-    seen = np.linalg.inv(np.linalg.inv(turn @ information @ turn.T + 1e-6 * np.eye(3)) + np.diag(REGISTRATION**2))
-    return Link(number, number + 1, se2.between(first, second), seen + np.linalg.inv(turn @ motion @ turn.T))
+    turn = se2.rotation(-float(first[2]))
+    noise = np.linalg.inv(turn @ information @ turn.T + 1e-6 * np.eye(3))
+    by_registration = np.linalg.inv(noise + np.diag(REGISTRATION_DEVIATION**2))
+    by_motion = np.linalg.inv(turn @ motion @ turn.T)
+    return Link(number, number + 1, se2.between(first, second), by_registration + by_motion)

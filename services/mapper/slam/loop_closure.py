@@ -16,18 +16,19 @@ from common.geometry.se2 import Array
 from services.mapper.slam.pose_graph import Link, Uncertainty
 from services.mapper.slam.registration import Surface, register
 from services.mapper.slam.search import search
-from services.mapper.slam.segments import Segment, agreement, submap
+from services.mapper.slam.segments import Agreement, Segment, compare, submap
 
 MAX_DISTANCE_M = 6.0  # between the references of segments that are matched
 MIN_APART = 3  # segments between two that are matched
 MAX_TARGETS = 2  # for each segment in one round
 SIGMAS = 3.0  # standard deviations of the graph within which to look
-DIRECT = np.array([0.3, 0.3, 0.1])  # m, m, rad: a smaller window needs no search
+NO_SEARCH_WINDOW = np.array([0.3, 0.3, 0.1])  # m, m, rad: a smaller window needs no search
 MIN_MATCHED, MIN_SHARE = 60, 0.85  # elements, and their share among those that match or contradict
-AMBIGUOUS = 0.8  # as many matched elements elsewhere, relative to the best, mean that the place is not unique
+RIVAL_SHARE = 0.8  # of the best score: a better match at another place means that the place is not unique
+SAME_PLACE_M, SAME_PLACE_RAD = 0.3, 0.15
 MAX_SQUARED_DEVIATION = 16.3  # chi squared with three degrees of freedom, 0.1 %
 # Standard deviations of a match beyond its noise: the segment is not quite rigid.
-MATCH = np.array([0.01, 0.01, 0.003])
+MATCH_DEVIATION = np.array([0.01, 0.01, 0.003])
 
 
 @dataclass(frozen=True)
@@ -44,28 +45,28 @@ def find_closures(
     segments: Sequence[Segment],
     poses: Array,
     uncertainty: Uncertainty,
-    known: set[tuple[int, int]],
+    tried: set[tuple[int, int]],
     window: float,
     report: Callable[[float], None] = lambda _done: None,
 ) -> list[Closure]:
     """Closures between pairs of segments whose position relative to one another is known to within ``window`` m.
 
-    ``poses`` (N, 3) are of the key scans, ``uncertainty`` that of the segments' references, ``known`` the pairs
-    already tried.
+    ``poses`` (N, 3) are of the key scans, ``uncertainty`` that of the segments' references, ``tried`` the pairs
+    that were tried before.
     """
     found, places = [], poses[[segment.reference for segment in segments]]
     for second in range(len(segments)):
         report(second / len(segments))
-        for first in _targets(second, places, uncertainty, window, known):
-            known.add((first, second))
-            closure = _match(segments, first, second, poses, uncertainty)
+        for first in _targets(second, places, uncertainty, window, tried):
+            tried.add((first, second))
+            closure = _close_loop(segments, first, second, poses, uncertainty)
             if closure is not None:
                 found.append(closure)
     return _consistent(found, poses, uncertainty)
 
 
 def _targets(
-    second: int, places: Array, uncertainty: Uncertainty, window: float, known: set[tuple[int, int]]
+    second: int, places: Array, uncertainty: Uncertainty, window: float, tried: set[tuple[int, int]]
 ) -> list[int]:
     """Earlier segments near ``second``, nearest first, apart from one another."""
     distance = np.hypot(*(places[: max(0, second - MIN_APART), :2] - places[second, :2]).T)
@@ -73,7 +74,7 @@ def _targets(
     for first in np.argsort(distance):
         if distance[first] > MAX_DISTANCE_M + window or len(chosen) == MAX_TARGETS:
             break
-        if (int(first), second) in known or not uncertainty.linked(int(first), second):
+        if (int(first), second) in tried or not uncertainty.linked(int(first), second):
             continue
         if any(abs(first - other) < MIN_APART for other in chosen):
             continue
@@ -83,40 +84,73 @@ def _targets(
     return chosen
 
 
-def _match(
+@dataclass(frozen=True)
+class SegmentMatch:
+    """A pose at which one segment matches another."""
+
+    agreement: Agreement
+    pose: Array  # (3,) of the second segment in the first
+    covariance: Array  # (3, 3)
+
+    @property
+    def score(self) -> float:
+        """Number of matched elements, less where others contradict."""
+        return self.agreement.matched * self.agreement.share
+
+    @property
+    def is_good(self) -> bool:
+        """Whether enough elements match, and few contradict."""
+        return self.agreement.matched >= MIN_MATCHED and self.agreement.share >= MIN_SHARE
+
+    def closure(self, first: int, second: int, references: tuple[int, int], *, wide: bool) -> Closure:
+        """The loop closure between two segments with these ``references``."""
+        link = Link(*references, self.pose, np.asarray(np.linalg.inv(self.covariance), float), robust=True)
+        return Closure(first, second, link, wide)
+
+
+def match_segments(first: Segment, surface: Surface, second: Segment, start: Array) -> SegmentMatch | None:
+    """Matches the second segment with the first from ``start`` (3,); ``surface`` has the elements of the first."""
+    found = register(surface, second.elements, start)
+    if found is None:
+        return None
+    covariance = np.linalg.inv(found.information + np.eye(3)) + np.diag(MATCH_DEVIATION**2)
+    return SegmentMatch(compare(first, surface, second, found.pose), found.pose, np.asarray(covariance, float))
+
+
+def _close_loop(
     segments: Sequence[Segment], first: int, second: int, poses: Array, uncertainty: Uncertainty
 ) -> Closure | None:
+    """The closure between two segments; None if they do not match well, or at several places."""
     target, moved = submap(segments, first, poses), segments[second]
     predicted = se2.between(poses[target.reference], poses[moved.reference])
     covariance = uncertainty.of_pair(first, second)
     window = SIGMAS * np.sqrt(np.diag(covariance))
-    wide = bool((window > DIRECT).any())
+    wide = bool((window > NO_SEARCH_WINDOW).any())
     surface = Surface(target.elements)
     starts = search(surface.elements, moved.elements, predicted, window) if wide else predicted[None]
-    matches = []
-    for start in starts:
-        found = register(surface, moved.elements, start)
-        if found is None:
-            continue
-        matched, both, against = agreement(target, surface, moved, found.pose)
-        share = both / max(1, both + against)
-        link_covariance = np.linalg.inv(found.information + np.eye(3)) + np.diag(MATCH**2)
-        off = found.pose - predicted
-        off[2] = se2.wrap(off[2])
-        if off @ np.linalg.solve(covariance + link_covariance, off) < MAX_SQUARED_DEVIATION:
-            matches.append((matched * share, matched, share, found.pose, link_covariance))
+    found = [match_segments(target, surface, moved, start) for start in starts]
+    matches = [each for each in found if each is not None and _is_plausible(each, predicted, covariance)]
     if not matches:
         return None
-    matches.sort(key=lambda each: -each[0])
-    score, matched, share, pose, link_covariance = matches[0]
-    if matched < MIN_MATCHED or share < MIN_SHARE:
+    matches.sort(key=lambda each: -each.score)
+    best = matches[0]
+    if not best.is_good or any(_is_rival(each, best) for each in matches[1:]):
         return None
-    for other, _, _, elsewhere, _ in matches[1:]:
-        off = elsewhere - pose
-        if other > AMBIGUOUS * score and (np.hypot(off[0], off[1]) > 0.3 or abs(se2.wrap(off[2])) > 0.15):
-            return None
-    link = Link(target.reference, moved.reference, pose, np.linalg.inv(link_covariance), robust=True)
-    return Closure(first, second, link, wide)
+    return best.closure(first, second, (target.reference, moved.reference), wide=wide)
+
+
+def _is_plausible(match: SegmentMatch, predicted: Array, covariance: Array) -> bool:
+    """Whether a match agrees with the pose (3,) that the graph predicts within ``covariance`` (3, 3)."""
+    off = match.pose - predicted
+    off[2] = se2.wrap(off[2])
+    return bool(off @ np.linalg.solve(covariance + match.covariance, off) < MAX_SQUARED_DEVIATION)
+
+
+def _is_rival(match: SegmentMatch, best: SegmentMatch) -> bool:
+    """Whether a match is at another place than the best one, and nearly as good."""
+    off = match.pose - best.pose
+    elsewhere = bool(np.hypot(off[0], off[1]) > SAME_PLACE_M or abs(se2.wrap(off[2])) > SAME_PLACE_RAD)
+    return match.score > RIVAL_SHARE * best.score and elsewhere
 
 
 def _consistent(closures: list[Closure], poses: Array, uncertainty: Uncertainty) -> list[Closure]:
@@ -125,27 +159,27 @@ def _consistent(closures: list[Closure], poses: Array, uncertainty: Uncertainty)
         closure
         for closure in closures
         if not closure.wide
-        or any(_support(closure, other, poses, uncertainty) for other in closures if other is not closure)
+        or any(_supports(closure, other, poses, uncertainty) for other in closures if other is not closure)
     ]
 
 
-def _support(a: Closure, b: Closure, poses: Array, uncertainty: Uncertainty) -> bool:
+def _supports(a: Closure, b: Closure, poses: Array, uncertainty: Uncertainty) -> bool:
     """Whether two closures confirm one another: the circle through both of them closes, and could have failed to."""
     if not (uncertainty.linked(a.first, b.first) and uncertainty.linked(a.second, b.second)):
         return False
     there = uncertainty.of_pair(a.first, b.first)
     back = uncertainty.of_pair(a.second, b.second)
     covariance = there + back + np.linalg.inv(a.link.information) + np.linalg.inv(b.link.information)
-    if (np.sqrt(np.diag(covariance)) > 2 * DIRECT).any():
+    if (np.sqrt(np.diag(covariance)) > 2 * NO_SEARCH_WINDOW).any():
         return False
     way = se2.between(poses[a.link.first], poses[b.link.first])
     other_way = se2.between(poses[a.link.second], poses[b.link.second])
     off = se2.between(se2.compose(a.link.pose, other_way), se2.compose(way, b.link.pose))
-    turned = _at(a, b, poses)
-    return bool(off @ np.linalg.solve(turned + covariance, off) < MAX_SQUARED_DEVIATION)
+    by_headings = _covariance_by_headings(a, b, poses)
+    return bool(off @ np.linalg.solve(by_headings + covariance, off) < MAX_SQUARED_DEVIATION)
 
 
-def _at(a: Closure, b: Closure, poses: Array) -> Array:
+def _covariance_by_headings(a: Closure, b: Closure, poses: Array) -> Array:
     """Covariance (3, 3) that headings add over the distances in a circle through two closures."""
     reach = max(
         float(np.hypot(*se2.between(poses[i], poses[j])[:2]))

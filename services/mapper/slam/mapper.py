@@ -14,10 +14,10 @@ from services.mapper.slam.back_end import BackEnd
 from services.mapper.slam.drive import Laser
 from services.mapper.slam.front_end import FrontEnd, KeyScans, Place
 from services.mapper.slam.grid import grid_of_scans
-from services.mapper.slam.segments import KEYS
-from services.mapper.slam.trajectory import spread
+from services.mapper.slam.segments import KEY_SCANS_PER_SEGMENT
+from services.mapper.slam.trajectory import poses_of_all_scans
 
-WINDOWS_M = (1.0, 3.0, 10.0, 30.0)  # of loop closing after each segment
+WINDOWS_M = (1.0, 3.0, 10.0, 30.0)  # of the rounds of loop closing after each segment
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,7 @@ class Mapper:
     def add(self, stamp: float, ranges: Array, odom: Array | None = None) -> Place:
         """The place in map of a scan ``ranges`` (B,) m at ``stamp`` s, with or without odometry (3,)."""
         place = self._front_end.add(stamp, ranges, odom)
-        turn = np.eye(3)
-        turn[:2, :2] = se2.rotate(float(self._origin[2]), np.eye(2)).T
+        turn = se2.rotation(float(self._origin[2]))
         pose = se2.compose(self._origin, place.pose)
         matched = place.matched and place.piece in self._pieces
         return replace(place, pose=pose, covariance=turn @ place.covariance @ turn.T, matched=matched)
@@ -65,9 +64,9 @@ class Mapper:
     def update(self, scans: KeyScans) -> GrownMap:
         """The map of the key scans, after loop closing if they complete a segment."""
         back_end = self._back_end
-        complete = len(back_end.poses) // KEYS
+        segments_before = len(back_end.poses) // KEY_SCANS_PER_SEGMENT
         back_end.extend(scans)
-        if len(back_end.poses) // KEYS > complete:
+        if len(back_end.poses) // KEY_SCANS_PER_SEGMENT > segments_before:
             for window in WINDOWS_M:
                 back_end.close_loops(scans, window, growing=True)
             back_end.join_pieces(scans, growing=True)
@@ -92,6 +91,6 @@ class Mapper:
         poses = np.where(known[:, None], se2.compose(self._origin, track.key_scans.poses), np.nan)
         if self.map is not None:
             poses[: len(self.map.poses)] = self.map.poses
-        poses = spread(track, poses)
+        poses = poses_of_all_scans(track, poses)
         placed = np.isfinite(poses[:, 0])
         return np.array(self._front_end.stamps)[placed], poses[placed]

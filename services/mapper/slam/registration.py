@@ -15,14 +15,14 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from services.mapper.slam.elements import Elements
 
-TURN_M = 0.3  # distance that a difference of 1 between two unit normals counts as
+NORMAL_DIFFERENCE_M = 0.3  # distance as which a difference of 1 between two unit normals counts
 PARTNER_RADII_M = (0.6, 0.6, 0.5, 0.4, 0.3, 0.2, 0.2, 0.2)  # largest distance of partners, iteration by iteration
-SCALE_M = 0.03  # standard deviation of the distance between partners, and scale of the Cauchy weights
+RESIDUAL_M = 0.03  # standard deviation of the distance between partners, and scale of the Cauchy weights
 PRIOR_SCALE = 2.0  # standard deviations, of the prior's Cauchy weight: wheels slip
-CAUTION = 2.0  # factor of the deviations of the prior, because those of the elements are stated too large as well
+PRIOR_INFLATION = 2.0  # of the deviations of the prior, because those of the elements are stated too large as well
 MATCHED_M = 0.15  # an element whose partner is nearer than this is matched
 MIN_PARTNERS = 10
-ALIKE = 10.0  # elements that match or fail together, because they belong to one thing
+CORRELATED_ELEMENTS = 10.0  # that match or fail together, because they belong to one thing
 
 
 @dataclass
@@ -36,13 +36,13 @@ class Surface:
         self.elements = self.elements.divided()
         self.tree = cKDTree(_features(self.elements))
 
-    def distances(self, elements: Elements, most: float = MATCHED_M) -> Array:
-        """Distance (K,) in m of each element from its partner, with differences of direction; inf beyond ``most``."""
-        return np.asarray(self.tree.query(_features(elements), distance_upper_bound=most)[0])
+    def partner_distances(self, elements: Elements) -> Array:
+        """Distance (K,) in m of each element from its partner, with differences of direction; inf if not matched."""
+        return np.asarray(self.tree.query(_features(elements), distance_upper_bound=MATCHED_M)[0])
 
 
 @dataclass(frozen=True)
-class Prior:
+class PosePrior:
     """What is known of a pose before its scan is registered; with heavy tails (Cauchy), because wheels slip."""
 
     mean: Array  # (3,)
@@ -55,7 +55,7 @@ class Prior:
         return off, float(off @ self.information @ off)
 
 
-NOTHING_KNOWN = Prior(np.zeros(3), np.zeros((3, 3)))
+NO_PRIOR = PosePrior(np.zeros(3), np.zeros((3, 3)))
 
 
 @dataclass(frozen=True)
@@ -69,11 +69,11 @@ class Registration:
     cost: float  # negative logarithm of the probability of elements and prior, up to a constant
 
 
-def register(surface: Surface, elements: Elements, start: Array, prior: Prior = NOTHING_KNOWN) -> Registration | None:
+def register(surface: Surface, elements: Elements, start: Array, prior: PosePrior = NO_PRIOR) -> Registration | None:
     """Registers elements from ``start`` (3,); None if too few match."""
     pose = np.array(start, float)
     for radius in PARTNER_RADII_M:
-        placed = elements.moved(pose)
+        placed = elements.transformed(pose)
         distance, partner = surface.tree.query(_features(placed), distance_upper_bound=radius)
         paired = np.isfinite(distance)
         if paired.sum() < MIN_PARTNERS:
@@ -83,21 +83,21 @@ def register(surface: Surface, elements: Elements, start: Array, prior: Prior = 
         error = np.einsum("ni,ni->n", normal, placed.points[paired] - surface.elements.points[partner])
         arm = placed.points[paired] - pose[:2]
         J = np.column_stack([normal, normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]])
-        weight = 1 / (1 + (error / SCALE_M) ** 2) / SCALE_M**2
+        weight = 1 / (1 + (error / RESIDUAL_M) ** 2) / RESIDUAL_M**2
         H = (J.T * weight) @ J
         off, squared = prior.off(pose)
-        held = prior.information / CAUTION**2 / (1 + squared / PRIOR_SCALE**2)
+        held = prior.information / PRIOR_INFLATION**2 / (1 + squared / PRIOR_SCALE**2)
         step = np.linalg.solve(H + held + 1e-6 * np.eye(3), held @ off - (J.T * weight) @ error)
         pose = pose + step
         pose[2] = se2.wrap(pose[2])
     matched = distance < MATCHED_M
     missed = np.where(matched, 0.0, MATCHED_M)
     missed[paired & matched] = error[matched[paired]]
-    cost = np.log1p((missed / SCALE_M) ** 2).sum() / 2 / ALIKE
+    cost = np.log1p((missed / RESIDUAL_M) ** 2).sum() / 2 / CORRELATED_ELEMENTS
     cost += PRIOR_SCALE**2 * np.log1p(prior.off(pose)[1] / PRIOR_SCALE**2) / 2
     covariance = np.linalg.inv(H + held + 1e-6 * np.eye(3))
     return Registration(pose, H, covariance, float(matched.mean()), float(cost))
 
 
 def _features(elements: Elements) -> Array:
-    return np.concatenate([elements.points, TURN_M * elements.normals], axis=-1)
+    return np.concatenate([elements.points, NORMAL_DIFFERENCE_M * elements.normals], axis=-1)

@@ -21,7 +21,7 @@ PEAK_DISTANCE_M, PEAK_TURN = 0.5, 0.15  # between them
 def search(target: Elements, moved: Elements, around: Array, window: Array, turn_step: float = TURN_STEP) -> Array:
     """The best poses (K, 3) of ``moved`` in ``target``, within ``window`` (3,) m, m, rad of ``around`` (3,)."""
     window = np.minimum(window, [np.inf, np.inf, np.pi])
-    sample = moved.part(np.linspace(0, len(moved) - 1, min(len(moved), MAX_ELEMENTS)).astype(int))
+    sample = moved.select(np.linspace(0, len(moved) - 1, min(len(moved), MAX_ELEMENTS)).astype(int))
     reach = np.hypot(*sample.points.T).max() + np.hypot(*window[:2])
     low = around[:2] - reach - 2 * CELL_M
     grid = _rasterise(target, low, int(2 * (reach + 2 * CELL_M) / CELL_M) + 2)
@@ -29,7 +29,7 @@ def search(target: Elements, moved: Elements, around: Array, window: Array, turn
     turns = around[2] + turn_step * np.arange(-np.ceil(window[2] / turn_step), np.ceil(window[2] / turn_step) + 1)
     scores = np.zeros((len(turns), 2 * count[1] + 1, 2 * count[0] + 1), np.int32)
     for k, turn in enumerate(turns):
-        placed = sample.moved(np.array([*around[:2], turn]))
+        placed = sample.transformed(np.array([*around[:2], turn]))
         column, row = np.floor((placed.points - low) / CELL_M).astype(np.int64).T
         _count_hits(grid, _sector(placed.normals), row, column, scores[k])
     return _peaks(scores, turns, around, count)

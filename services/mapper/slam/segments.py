@@ -12,27 +12,27 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from common.robot.ranges import is_surface
 from common.robot.scan_geometry import Sweep
-from services.mapper.slam.elements import Elements, joined
+from services.mapper.slam.elements import Elements, concatenate
 from services.mapper.slam.registration import MATCHED_M, Surface
 
-KEYS = 8  # key scans of a segment
-PASSED_M = 0.3  # behind an element, along its normal, from where a beam has passed through it
+KEY_SCANS_PER_SEGMENT = 8
+PASSED_M = 0.3  # behind an element, along its normal, from where a beam counts as having passed through it
 
 
 @dataclass(frozen=True)
-class Views:
-    """What the scanner saw from several places."""
+class PosedScans:
+    """Scans that were taken from known poses."""
 
-    poses: Array  # (V, 3) of the laser
-    ranges: Array  # (V, B) m
+    poses: Array  # (S, 3) of the laser
+    ranges: Array  # (S, B) m
     angles: Array  # (B,) rad
 
     def see_through(self, elements: Elements) -> npt.NDArray[np.bool_]:
-        """Mask (K,) of elements in places that some scan saw to be free."""
+        """Mask (K,) of elements in places through which some scan saw."""
         through = np.zeros(len(elements), np.bool_)
         sweep = Sweep.of_angles(self.angles)
         for pose, ranges in zip(self.poses, self.ranges, strict=True):
-            local = elements.moved(se2.inverse(pose))
+            local = elements.transformed(se2.inverse(pose))
             x, y = local.points.T
             beam, distance = sweep.beams_at(np.arctan2(y, x)), np.hypot(x, y)
             inside = (beam > 0) & (beam < len(ranges) - 1)
@@ -50,7 +50,7 @@ class Segment:
     reference: int  # number of the key scan
     piece: int  # of the drive
     elements: Elements
-    views: Views
+    views: PosedScans  # the same key scans
 
 
 def segments_of(
@@ -70,14 +70,14 @@ def segments_of(
     found, ends = [], np.append(np.flatnonzero(np.diff(pieces)) + 1, len(pieces))
     first = 0
     while first < len(poses):
-        end = min(first + KEYS, int(ends[np.searchsorted(ends, first, side="right")]))
-        if growing and end == len(poses) and end < first + KEYS:
+        end = min(first + KEY_SCANS_PER_SEGMENT, int(ends[np.searchsorted(ends, first, side="right")]))
+        if growing and end == len(poses) and end < first + KEY_SCANS_PER_SEGMENT:
             break
         keys = np.arange(first, end)
         reference = int(keys[len(keys) // 2])
         local = se2.between(poses[reference], poses[keys])
-        placed = joined([elements[key].moved(pose) for key, pose in zip(keys.tolist(), local, strict=True)])
-        views = Views(se2.compose(local, mount), ranges[keys], angles)
+        placed = concatenate([elements[key].transformed(pose) for key, pose in zip(keys.tolist(), local, strict=True)])
+        views = PosedScans(se2.compose(local, mount), ranges[keys], angles)
         found.append(Segment(reference, int(pieces[first]), placed, views))
         first = end
     return found
@@ -88,25 +88,36 @@ def submap(segments: Sequence[Segment], middle: int, poses: Array) -> Segment:
     reference, piece = segments[middle].reference, segments[middle].piece
     around = [each for each in segments[max(0, middle - 1) : middle + 2] if each.piece == piece]
     offsets = [se2.between(poses[reference], poses[each.reference]) for each in around]
-    views = Views(
+    views = PosedScans(
         np.concatenate([se2.compose(off, each.views.poses) for off, each in zip(offsets, around, strict=True)]),
         np.concatenate([each.views.ranges for each in around]),
         around[0].views.angles,
     )
-    placed = [each.elements.moved(off) for off, each in zip(offsets, around, strict=True)]
-    return Segment(reference, piece, joined(placed), views)
+    placed = [each.elements.transformed(off) for off, each in zip(offsets, around, strict=True)]
+    return Segment(reference, piece, concatenate(placed), views)
 
 
-def agreement(target: Segment, surface: Surface, moved: Segment, pose: Array) -> tuple[int, int, int]:
-    """Counts of elements of ``moved`` at ``pose`` (3,) that match, and of both sides' that match, and that contradict.
+@dataclass(frozen=True)
+class Agreement:
+    """How well two segments agree, in numbers of elements. An element of which the other saw nothing does not count."""
 
-    ``surface`` has the target's elements. A contradiction is an element of one side where the other saw through.
-    Elements of which the other side saw nothing do not count.
-    """
-    placed = moved.elements.moved(pose)
-    matched = surface.distances(placed) < MATCHED_M
-    back = target.elements.moved(se2.inverse(pose))
-    against = int(target.views.see_through(placed.part(~matched)).sum())
-    met = Surface(placed).distances(target.elements) < MATCHED_M
-    against += int(moved.views.see_through(back.part(~met)).sum())
-    return int(matched.sum()), int(matched.sum() + met.sum()), against
+    matched: int  # elements of the second segment that match
+    agreeing: int  # elements of both that match
+    contradicting: int  # elements of both in places through which the other one saw
+
+    @property
+    def share(self) -> float:
+        """Share of agreeing elements."""
+        return self.agreeing / max(1, self.agreeing + self.contradicting)
+
+
+def compare(first: Segment, surface: Surface, second: Segment, pose: Array) -> Agreement:
+    """Compares two segments, the second at ``pose`` (3,) in the first; ``surface`` has the elements of the first."""
+    placed = second.elements.transformed(pose)
+    second_matches = surface.partner_distances(placed) < MATCHED_M
+    first_matches = Surface(placed).partner_distances(first.elements) < MATCHED_M
+    first_in_second = first.elements.transformed(se2.inverse(pose))
+    contradicting = first.views.see_through(placed.select(~second_matches)).sum()
+    contradicting += second.views.see_through(first_in_second.select(~first_matches)).sum()
+    matched = int(second_matches.sum())
+    return Agreement(matched, matched + int(first_matches.sum()), int(contradicting))

@@ -12,7 +12,7 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from services.mapper.slam.back_end import BackEnd
 from services.mapper.slam.drive import RawDrive
-from services.mapper.slam.front_end import Track, track
+from services.mapper.slam.front_end import Track, track_drive
 from services.mapper.slam.loop_closure import Closure
 
 WINDOWS_M = (1.0, 1.0, 3.0, 3.0, 10.0, 10.0, 30.0, 30.0, 1.0, 1.0)  # of the rounds of loop closing
@@ -25,30 +25,30 @@ class Trajectory:
     poses: Array  # (N, 3) base_link in map; NaN where it is unknown
     keys: list[int]  # key scans
     closures: list[Closure]
-    lost: int  # scans that did not match the ones before
+    unmatched: int  # scans that did not match the ones before
 
 
 def build_trajectory(drive: RawDrive, report: Callable[[str, float], None] = lambda _t, _d: None) -> Trajectory:
     """The poses from which all scans of a drive agree best."""
-    tracked = track(drive, lambda done: report("tracking", done))
+    tracked = track_drive(drive, lambda done: report("tracking", done))
     back_end = BackEnd(drive.laser)
     back_end.extend(tracked.key_scans)
-    joined = True
-    while joined:
+    searching = True
+    while searching:
         for number, window in enumerate(WINDOWS_M):
 
             def report_round(done: float, before: int = number) -> None:
                 report("closing loops", (before + done) / len(WINDOWS_M))
 
             back_end.close_loops(tracked.key_scans, window, report_round)
-        joined = back_end.join_pieces(tracked.key_scans)
+        searching = back_end.join_pieces(tracked.key_scans)
     in_map = back_end.in_map(tracked.key_scans)
     poses = np.where(in_map[:, None], back_end.poses, np.nan)
     keys = [key for key, known in zip(tracked.keys, in_map, strict=True) if known]
-    return Trajectory(spread(tracked, poses), keys, back_end.closures, tracked.lost)
+    return Trajectory(poses_of_all_scans(tracked, poses), keys, back_end.closures, tracked.unmatched)
 
 
-def spread(tracked: Track, poses: Array) -> Array:
+def poses_of_all_scans(tracked: Track, poses: Array) -> Array:
     """Poses (N, 3) of all scans, from the corrected ``poses`` (K, 3) of the key scans.
 
     The poses of scans that belong to no piece, or to one whose key scans have no pose, are NaN.
@@ -56,10 +56,12 @@ def spread(tracked: Track, poses: Array) -> Array:
     keys, pieces = np.array(tracked.keys), tracked.key_scans.pieces
     before = np.searchsorted(keys, np.arange(len(tracked.poses)), side="right") - 1
     in_piece = tracked.pieces == pieces[np.maximum(before, 0)]
-    return np.where(in_piece[:, None], bend(tracked.poses, keys, poses, pieces), np.nan)
+    return np.where(in_piece[:, None], distribute_corrections(tracked.poses, keys, poses, pieces), np.nan)
 
 
-def bend(poses: Array, keys: npt.NDArray[np.int_], corrected: Array, pieces: npt.NDArray[np.int_]) -> Array:
+def distribute_corrections(
+    poses: Array, keys: npt.NDArray[np.int_], corrected: Array, pieces: npt.NDArray[np.int_]
+) -> Array:
     """Poses (N, 3) of all scans, after those of the key scans, numbers ``keys`` (K,), were ``corrected`` (K, 3).
 
     Between two key scans of one of the ``pieces`` (K,), the correction changes from that of the first to that of the

@@ -12,7 +12,7 @@ from common.geometry import se2
 from common.geometry.world import load_world
 from lab.accuracy.scenes import Scene
 from services.mapper.slam.mapper import Mapper
-from services.mapper.slam.segments import KEYS
+from services.mapper.slam.segments import KEY_SCANS_PER_SEGMENT
 from services.mapper.slam.trajectory import build_trajectory
 from services.simulator.odometry import Drift, Odometer
 from tests.mapper.drives import driven
@@ -34,7 +34,7 @@ def mapped(drive):
     for k, (stamp, ranges) in enumerate(zip(drive.stamps, drive.ranges, strict=True)):
         places.append(mapper.add(stamp, ranges, None if drive.odom is None else drive.odom[k]))
         scans = mapper.key_scans()
-        if mapper.outdated and len(scans.poses) % KEYS == 0:
+        if mapper.outdated and len(scans.poses) % KEY_SCANS_PER_SEGMENT == 0:
             mapper.use(mapper.update(scans))
     mapper.use(mapper.update(mapper.key_scans()))
     return mapper, places
