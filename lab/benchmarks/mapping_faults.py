@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from rich.console import Console
@@ -34,24 +34,33 @@ CELL_M = 0.05
 FALSE_WALL_M = 0.15  # an occupied cell farther than this in front of all surfaces is no surface
 PEOPLE_PER_M2 = 0.08
 
-Carry = Callable[[Scene, Array], Array]  # the pose (3,) to which a robot is carried after poses (N, 3)
+CarryOff = Callable[[Scene, Array], Array]  # returns the pose (3,) to which the robot is carried after a path (N, 3)
 
 
-def to_known(scene: Scene, path: Array) -> Array:
+@dataclass(frozen=True)
+class MappingFault:
+    """What could deceive the mapper in a drive."""
+
+    world: Literal["office", "symmetric", "twins"] = "office"
+    carry_off: CarryOff | None = None  # in the middle of the drive
+    crowd: bool = False
+
+
+def to_mapped_place(scene: Scene, path: Array) -> Array:
     """A pose of the first third of the path, far from its end, turned at random."""
     first = path[: len(path) // 3]
     place = first[np.argmax(np.hypot(*(first - path[-1])[:, :2].T))]
     return np.array([*place[:2], scene.rng.uniform(-np.pi, np.pi)])
 
 
-def to_unknown(scene: Scene, path: Array) -> Array:
+def to_unmapped_place(scene: Scene, path: Array) -> Array:
     """The pose, of 200 random ones, farthest from the path."""
     poses = scene.poses(200)
     distance = np.hypot(*(poses[:, None, :2] - path[None, ::10, :2]).transpose(2, 0, 1)).min(axis=1)
     return np.asarray(poses[np.argmax(distance)])
 
 
-def to_similar(scene: Scene, path: Array) -> Array:
+def to_similar_place(scene: Scene, path: Array) -> Array:
     """Another place that looks like the last one."""
     return KidnappingPlaces(scene, "similar").after(path[-1])
 
@@ -61,47 +70,58 @@ def to_nearby(scene: Scene, path: Array) -> Array:
     return KidnappingPlaces(scene, "nearby").after(path[-1])
 
 
-CASES: dict[str, tuple[str, Carry | None, bool]] = {  # world, how the robot is carried off, crowd
-    "undisturbed": ("office", None, False),
-    "crowd": ("office", None, True),
-    "carried to a mapped place": ("office", to_known, False),
-    "carried to an unmapped place": ("office", to_unknown, False),
-    "carried to a similar place": ("office", to_similar, False),
-    "carried nearby": ("office", to_nearby, False),
-    "carried in a crowd": ("office", to_known, True),
-    "look-alike rooms": ("symmetric", None, False),
-    "carried among look-alike rooms": ("symmetric", to_unknown, False),
-    "twins": ("twins", None, False),
-    "carried between twins": ("twins", to_similar, False),
+CASES = {
+    "undisturbed": MappingFault(),
+    "crowd": MappingFault(crowd=True),
+    "carried to a mapped place": MappingFault(carry_off=to_mapped_place),
+    "carried to an unmapped place": MappingFault(carry_off=to_unmapped_place),
+    "carried to a similar place": MappingFault(carry_off=to_similar_place),
+    "carried nearby": MappingFault(carry_off=to_nearby),
+    "carried in a crowd": MappingFault(carry_off=to_mapped_place, crowd=True),
+    "look-alike rooms": MappingFault("symmetric"),
+    "carried among look-alike rooms": MappingFault("symmetric", to_unmapped_place),
+    "twins": MappingFault("twins"),
+    "carried between twins": MappingFault("twins", to_similar_place),
 }
 
 
 def make_drive(case: str, seed: int, seconds: float) -> tuple[RawDrive, Array, World]:
     """A drive with odometry, its true poses (N, 3), and its world; the robot is carried off in the middle."""
-    kind, carry, people = CASES[case]
-    world = TWINS if kind == "twins" else make_building(seed, "symmetric" if kind == "symmetric" else "office").world
+    fault = CASES[case]
+    world = TWINS if fault.world == "twins" else make_building(seed, fault.world).world
     scene = Scene.of(world, BEAMS, [seed, 30])
-    parts = [scene.path(seconds if carry is None else seconds / 2)]
-    if carry is not None:
-        parts.append(scene.path(seconds / 2, start=carry(scene, parts[0])))
-    scanner, truth, odom = scene.scanner, np.concatenate(parts), []
-    odometer = Odometer(Drift(), scene.rng)
-    for part in parts:
-        odom.append(odometer.pose)  # wheels do not turn while the robot is carried
-        for before, after in pairwise(part):
-            odometer.move(before, after)
-            odom.append(odometer.pose)
-    lasers = se2.compose(truth, np.array(scanner.mount))
-    if people:
-        discs = crowd(world, truth, scanner.rate, round(PEOPLE_PER_M2 * world.free_area), scene.rng)
-        clean = np.concatenate(
-            [cast_rays(world, laser, scanner.angles(), each) for laser, each in zip(lasers, discs, strict=True)]
-        )
+    scanner = scene.scanner
+    if fault.carry_off is None:
+        parts = [scene.path(seconds)]
     else:
-        clean = scene.clean(truth)
+        before = scene.path(seconds / 2)
+        parts = [before, scene.path(seconds / 2, start=fault.carry_off(scene, before))]
+    truth, odom = np.concatenate(parts), _odometry(parts, scene.rng)
+    clean = _ranges_in_crowd(scene, truth) if fault.crowd else scene.clean(truth)
     ranges = np.array([scene.observe(each, 0.0).ranges for each in clean])
     laser = Laser(scanner.angles(), np.array(scanner.mount), scanner.range_max)
-    return RawDrive(np.arange(len(truth)) / scanner.rate, ranges, laser, np.array(odom)), truth, world
+    return RawDrive(np.arange(len(truth)) / scanner.rate, ranges, laser, odom), truth, world
+
+
+def _odometry(parts: list[Array], rng: np.random.Generator) -> Array:
+    """Poses (N, 3) in odom; between the parts of the drive the robot is carried, and its wheels do not turn."""
+    odometer, poses = Odometer(Drift(), rng), []
+    for part in parts:
+        poses.append(odometer.pose)
+        for before, after in pairwise(part):
+            odometer.move(before, after)
+            poses.append(odometer.pose)
+    return np.array(poses)
+
+
+def _ranges_in_crowd(scene: Scene, truth: Array) -> Array:
+    """Noise-free ranges (N, B) m among people that walk around."""
+    world, scanner = scene.world, scene.scanner
+    lasers = se2.compose(truth, np.array(scanner.mount))
+    people = crowd(world, truth, scanner.rate, round(PEOPLE_PER_M2 * world.free_area), scene.rng)
+    return np.concatenate(
+        [cast_rays(world, laser, scanner.angles(), each) for laser, each in zip(lasers, people, strict=True)]
+    )
 
 
 def bench_mapping_faults(worlds: int, seed: int, seconds: float, json_file: Path | None, console: Console) -> int:

@@ -1,4 +1,8 @@
-"""`presage bench visits`: a map that is updated by a drive after every visit to a building that changes."""
+"""`presage bench visits`: how well a map follows a building whose furniture is moved between visits.
+
+At each visit but the first, furniture is moved and doors are closed. Single scans from unknown poses are then localised
+with each of `MODELS`, before and after the map is updated by a drive through the rooms (`presage map --refine`).
+"""
 
 from __future__ import annotations
 
@@ -39,10 +43,11 @@ from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.interface import Observation
 
 SPEED, TURN_RATE, PERIOD_S = 0.6, 0.5, 0.2  # m/s, rad/s and s between scans of a drive
-MARGIN_M = 0.02  # by which the robot is taken to be smaller, because it just fits between some pieces
-VISITED = 0.7  # share of the rooms that a drive enters, after the first one
-SAMPLES = 2000  # scans of the model of the present world
-CLOSED = 0.3  # probability for each door of a room that changes
+PLANNING_MARGIN_M = 0.02  # by which the robot is taken to be smaller, because it just fits between some pieces
+PLACES_PER_ROOM = 2  # to which a drive goes
+ENTERED_SHARE = 0.7  # of the rooms, at each visit but the first
+PRESENT_SCANS = 2000  # from which the model of the present world is learned
+CLOSED_DOOR_PROBABILITY = 0.3  # for each room that changes
 FIRST, BEFORE, AFTER, PRESENT = "first map", "before the update", "after the update", "learned at true poses"
 MODELS = (FIRST, BEFORE, AFTER, PRESENT)
 QUIET = Console(quiet=True)
@@ -77,14 +82,14 @@ def bench_visits(
     make_folder(out, "--out")
     names = ["office", *map(str, range(seed, seed + worlds))]
     jobs = [VisitsJob(name, visits, scans, seed, str(out)) for name in names]
-    results = run_trials("visits", visit, jobs, out, workers, console)
+    results = run_trials("visits", run_visits, jobs, out, workers, console)
     rows = [row for result in results for row in result["rows"]]
     _print(rows, console)
     write_json(json_file, {"rows": rows, "scans": scans, **provenance(seed)})
     return 0
 
 
-def visit(job: VisitsJob) -> dict[str, Any]:
+def run_visits(job: VisitsJob) -> dict[str, Any]:
     """Results of all visits to one building.
 
     In half of the rooms, all furniture is moved before each visit but the first, and each door may be closed.
@@ -93,34 +98,41 @@ def visit(job: VisitsJob) -> dict[str, Any]:
     shutil.rmtree(out, ignore_errors=True)  # of an interrupted run
     out.mkdir()
     rng = np.random.default_rng([job.seed, 40])
-    building = _office() if job.world == "office" else make_building(int(job.world))
+    building = office_building() if job.world == "office" else make_building(int(job.world))
     rooms = [room for room in building.rooms if room.door is not None]
     changing = [rooms[k] for k in rng.permutation(len(rooms))[: (len(rooms) + 1) // 2]]
-    rows, first = [], out / "visit-1.yaml"
+    rows = []
     for number in range(1, job.visits + 1):
-        doors: list[Obstacle] = []
+        closed_doors: list[Obstacle] = []
         if number > 1:
-            building = rearranged(building, changing, rng)
+            building = move_furniture_in(building, changing, rng)
             panels = [room.door_panel() for room in changing]
-            doors = [panel for panel in panels if panel is not None and rng.random() < CLOSED]
-        scene = Scene.of(building.world_with(doors), BEAMS, [job.seed, number, 41])
-        row: dict[str, Any] = {"world": building.name, "visit": number}
-        before, after = out / f"visit-{number - 1}.yaml", out / f"visit-{number}.yaml"
-        poses = scene.poses(job.scans)
-        clean = scene.clean(poses)
-        scans = [scene.observe(ranges, float(k)) for k, ranges in enumerate(clean)]
-        row |= _update(scene, building, before, after)
-        if number > 1:
-            row["in_changed_room"] = np.any([contains(room, poses[:, :2]) for room in changing], axis=0).tolist()
-            for name, file in ((FIRST, first), (BEFORE, before), (AFTER, after)):
-                row[name] = _test(EstimatorOptions(str(file), models=out), scene.scanner, scans, poses)
-            exact = EstimatorOptions(scene.world, generative_model=_present_model(scene))
-            row[PRESENT] = _test(exact, scene.scanner, scans, poses)
-        rows.append(row)
+            closed_doors = [panel for panel in panels if panel is not None and rng.random() < CLOSED_DOOR_PROBABILITY]
+        scene = Scene.of(building.world_with(closed_doors), BEAMS, [job.seed, number, 41])
+        results = _visit(scene, building, changing, number, job.scans, out)
+        rows.append({"world": building.name, "visit": number, **results})
     return {"rows": rows}
 
 
-def rearranged(building: Building, rooms: list[Room], rng: np.random.Generator) -> Building:
+def _visit(
+    scene: Scene, building: Building, changing: list[Room], number: int, count: int, out: Path
+) -> dict[str, Any]:
+    """Updates the map of the visit before, and localises ``count`` single scans with each model."""
+    first, before, after = (out / f"visit-{k}.yaml" for k in (1, number - 1, number))
+    poses = scene.poses(count)
+    scans = [scene.observe(ranges, float(k)) for k, ranges in enumerate(scene.clean(poses))]
+    if number == 1:
+        return _build_first_map(scene, building, after)
+    row = _update_map(scene, building, before, after)
+    row["in_changed_room"] = np.any([contains(room, poses[:, :2]) for room in changing], axis=0).tolist()
+    for name, file in ((FIRST, first), (BEFORE, before), (AFTER, after)):
+        row[name] = _localise(EstimatorOptions(str(file), models=out), scene.scanner, scans, poses)
+    present = EstimatorOptions(scene.world, generative_model=_learn_present_world(scene))
+    row[PRESENT] = _localise(present, scene.scanner, scans, poses)
+    return row
+
+
+def move_furniture_in(building: Building, rooms: list[Room], rng: np.random.Generator) -> Building:
     """The building after all furniture of some rooms was moved to other places of these rooms, if there was room."""
     moves = [any(contains(room, np.array(piece.pose[:2])[None])[0] for room in rooms) for piece in building.furniture]
     floor, part = building.floor(), replace(building, rooms=tuple(rooms))
@@ -140,12 +152,12 @@ def contains(room: Room, places: Array) -> npt.NDArray[np.bool_]:
     return np.asarray((np.abs(places - box.center) < np.array(box.size) / 2).all(axis=1))
 
 
-def tour(scene: Scene, building: Building, share: float) -> Array:
-    """Poses (N, 3), `PERIOD_S` apart, of a drive to two places in each room, or in a ``share`` of them.
+def drive_through_rooms(scene: Scene, building: Building, share: float) -> Array:
+    """Poses (N, 3), `PERIOD_S` apart, of a drive to some places in each room, or in a ``share`` of the rooms.
 
     The robot turns all the time.
     """
-    paths, rng = ShortestPaths(scene.world, ROBOT.radius - MARGIN_M), scene.rng
+    paths, rng = ShortestPaths(scene.world, ROBOT.radius - PLANNING_MARGIN_M), scene.rng
     free = scene.world.sample_free(1000, rng, ROBOT.radius)
     corridors = [room for room in building.rooms if room.door is None]
     places = [next(place for place in free if any(contains(room, place[None])[0] for room in corridors))]
@@ -154,7 +166,7 @@ def tour(scene: Scene, building: Building, share: float) -> Array:
         room = building.rooms[number]
         if room.door is not None and rng.random() > share:
             continue
-        for place in free[contains(room, free)][-2:]:
+        for place in free[contains(room, free)][-PLACES_PER_ROOM:]:
             leg = paths.path(places[-1], place)
             if len(leg):
                 legs += [np.linspace(a, b, 2 + int(np.hypot(*(b - a)) / (SPEED * PERIOD_S))) for a, b in pairwise(leg)]
@@ -163,10 +175,21 @@ def tour(scene: Scene, building: Building, share: float) -> Array:
     return np.column_stack([driven, se2.wrap(TURN_RATE * PERIOD_S * np.arange(len(driven)))])
 
 
-def _update(scene: Scene, building: Building, before: Path, after: Path) -> dict[str, Any]:
-    """Updates the map with a drive; the first map is built at the true poses of a drive through all rooms."""
-    path, scanner = tour(scene, building, VISITED if before.exists() else 1.0), scene.scanner
-    log, models = after.with_suffix(".npz"), after.parent
+def _build_first_map(scene: Scene, building: Building, after: Path) -> dict[str, Any]:
+    """Builds a map at the true poses of a drive through all rooms."""
+    path = drive_through_rooms(scene, building, 1.0)
+    return _map_drive(path, replace(_log_drive(scene, path, after), poses="reference"))
+
+
+def _update_map(scene: Scene, building: Building, before: Path, after: Path) -> dict[str, Any]:
+    """Updates the map ``before`` with a drive through most rooms, without its poses."""
+    path = drive_through_rooms(scene, building, ENTERED_SHARE)
+    return _map_drive(path, replace(_log_drive(scene, path, after), refine=str(before)))
+
+
+def _log_drive(scene: Scene, path: Array, out: Path) -> MapOptions:
+    """Writes a log of a drive with its true poses; returns the options that make the map ``out`` of it."""
+    scanner, log = scene.scanner, out.with_suffix(".npz")
     np.savez(
         log,
         ranges=np.array([scene.observe(clean, 0.0).ranges for clean in scene.clean(path)]),
@@ -175,26 +198,29 @@ def _update(scene: Scene, building: Building, before: Path, after: Path) -> dict
         stamps=PERIOD_S * np.arange(len(path)),
         reference=path,
     )
-    options = MapOptions(log, after, reading=Reading(mount=np.array(scanner.mount)), models=models)
+    return MapOptions(log, out, reading=Reading(mount=np.array(scanner.mount)), models=out.parent)
+
+
+def _map_drive(path: Array, options: MapOptions) -> dict[str, Any]:
+    """Makes a map; returns its size, and the error of the trajectory."""
     begin = time.perf_counter()
-    if before.exists():
-        map_command(replace(options, refine=str(before)), QUIET, QUIET)
-    else:
-        map_command(replace(options, poses="reference"), QUIET, QUIET)
+    map_command(options, QUIET, QUIET)
     taken = time.perf_counter() - begin
-    table = np.loadtxt(after.with_suffix(".tum"))
-    numbers = np.round(table[:, 0] / PERIOD_S).astype(int)  # scans without a place are left out
-    errors = np.hypot(*(table[:, 1:3] - path[numbers, :2]).T)
+    trajectory = np.loadtxt(options.out.with_suffix(".tum"))
+    numbers = np.round(trajectory[:, 0] / PERIOD_S).astype(int)  # scans without a place are left out
+    errors = np.hypot(*(trajectory[:, 1:3] - path[numbers, :2]).T)
     return {
         "drive_s": PERIOD_S * len(path),
         "trajectory_rms_m": float(np.sqrt((errors**2).mean())),
         "update_s": taken,
-        "map_bytes": after.with_suffix(".pgm").stat().st_size,
-        "model_bytes": weights.path_of(models, after.stem).stat().st_size,
+        "map_bytes": options.out.with_suffix(".pgm").stat().st_size,
+        "model_bytes": weights.path_of(options.out.parent, options.out.stem).stat().st_size,
     }
 
 
-def _test(options: EstimatorOptions, scanner: Scanner, scans: list[Observation], poses: Array) -> list[float | None]:
+def _localise(
+    options: EstimatorOptions, scanner: Scanner, scans: list[Observation], poses: Array
+) -> list[float | None]:
     """Errors in m of single scans from unknown poses; None if not found."""
     estimator = prepare(options)(Geometry.of(scanner))
     errors: list[float | None] = []
@@ -205,14 +231,14 @@ def _test(options: EstimatorOptions, scanner: Scanner, scans: list[Observation],
     return errors
 
 
-def _present_model(scene: Scene) -> FieldModel:
+def _learn_present_world(scene: Scene) -> FieldModel:
     """A field learned from scans with noise at true poses in the present world."""
-    poses, mount, angles = scene.poses(SAMPLES), np.array(scene.scanner.mount), scene.scanner.angles()
+    poses, mount, angles = scene.poses(PRESENT_SCANS), np.array(scene.scanner.mount), scene.scanner.angles()
     ranges = np.array([scene.observe(clean, 0.0).ranges for clean in scene.clean(poses)])
     return FieldModel(learn_field(Beams.of(poses, mount, angles, ranges), Recipe(0.05)))
 
 
-def _office() -> Building:
+def office_building() -> Building:
     """The world `office` as walls, furniture that can be moved, and rooms with a door to the corridor."""
     world = load_world("office")
     furniture, walls = [], []
@@ -263,16 +289,19 @@ def _print(rows: list[dict[str, Any]], console: Console) -> None:
         table.add_column(title)
     visits = sorted({row["visit"] for row in rows if PRESENT in row})
     for visit in [*visits, None]:
-        everywhere, still = summary(rows, visit), summary(rows, visit, unchanged=True)
+        in_all_rooms, in_unchanged_rooms = summary(rows, visit), summary(rows, visit, unchanged=True)
         updates = [row for row in rows if visit in (None, row["visit"])]
         table.add_row(
             "all" if visit is None else str(visit),
-            *(
-                f"{share:.0%}; {error * 1e3:.1f}; {still[name][0]:.0%}; {still[name][1] * 1e3:.1f}"
-                for name, (share, error) in everywhere.items()
-            ),
+            *(f"{_found(in_all_rooms[name])}; {_found(in_unchanged_rooms[name])}" for name in MODELS),
             f"{max(row['update_s'] for row in updates):.0f}",
             f"{max(row['trajectory_rms_m'] for row in updates) * 1e3:.1f}",
             f"{max(row['model_bytes'] for row in updates) / 1e3:.0f}",
         )
     console.print(table)
+
+
+def _found(share_and_error: tuple[float, float]) -> str:
+    """Share found, and median error in mm, as text."""
+    share, error = share_and_error
+    return f"{share:.0%}; {error * 1e3:.1f}"
