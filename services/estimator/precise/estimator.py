@@ -1,4 +1,4 @@
-"""The precise estimator: predict, match, associate, fuse, weigh, search, publish."""
+"""The precise estimator: matches each scan with the map, fuses it with the motion, weighs hypotheses, and searches."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from common.geometry import se2
 from services.estimator.precise.gauss_newton import COARSE_SIGMA_M, GaussNewton, Optimiser, Prior, View
 from services.estimator.precise.hypotheses import (
     Mode,
+    UnknownPlace,
     clip_to_map,
     constraining_beams,
     probability_of_being_near,
@@ -23,7 +24,7 @@ from services.estimator.precise.hypotheses import (
     weigh,
 )
 from services.estimator.precise.likelihood import Likelihood
-from services.estimator.precise.local_map import KeyScan, LocalMap
+from services.estimator.precise.local_map import KeyScan, LocalMap, LocalScan
 from services.estimator.precise.motion_model import (
     Candidate,
     fuse,
@@ -56,7 +57,7 @@ if TYPE_CHECKING:
 
 START_COVARIANCE = np.diag([0.25, 0.25, 0.09])  # of a pose given without one
 MAX_SEARCH_INTERVAL = 150  # scans between two searches without success; the interval doubles from 1
-CLUTTER = 0.3  # probability that all that is new in a view is clutter
+CLUTTER = 0.3  # probability that all that is new in a scan is clutter
 UNKNOWN_SIGMA_M = 100.0  # published where the model does not know what to expect
 TARGET_BEAMS = 2000  # a scan with at least twice as many is thinned, because the time of a search grows with the beams
 
@@ -95,26 +96,27 @@ class PreciseEstimator:
 
         A ``pose`` (2,) is a position with an unknown heading.
         """
-        self.modes: list[Mode] = []
-        self._initial: tuple[Array, Array] | None = None
+        self.modes: list[Mode] = []  # the hypotheses, best first
+        self._start: tuple[Array, Array] | None = None  # pose and covariance, until the first search
         if pose is not None:
-            self._initial = start_belief(pose, START_COVARIANCE if covariance is None else covariance)
+            self._start = start_belief(pose, START_COVARIANCE if covariance is None else covariance)
         self._was_tracking = False
-        self._stamp: float | None = None
-        self._odom: Array | None = None
+        self._unknown_place = UnknownPlace()
         self._local_map = LocalMap(self.mount)
         self._precision = Precision(excess=self._map_error**2)
-        # That the robot is at none of the hypotheses: unnormalised, of the key scans and of the present one. Only a
-        # share, unmapped, remains once the whole map is searched.
-        self._log_unknown, self._log_unmapped, self._unknown_present = 0.0, 0.0, 0.0
-        self._unknown_weight = 1.0  # its probability
-        self._local = np.zeros(3)  # pose in the local frame
-        self._seen = np.zeros(0, np.bool_)  # beams of the present scan that end at surfaces seen before
-        self._change = 0.0  # nats, of what has changed since the scan before
-        self._explained = 1.0  # share of the last scan's beams
-        self._since_search, self._search_interval = 0, 1  # scans
-        self._last: tuple[Array, View] | None = None  # pose in the local frame, and scan, before the present one
-        self._scan: tuple[View, Observation] | None = None  # the present one
+        self._scans_since_search, self._search_interval = 0, 1
+
+        # Of the last scan.
+        self._stamp: float | None = None
+        self._odom: Array | None = None
+        self._explained = 1.0  # share of its beams
+        self._last: LocalScan | None = None
+
+        # Of the present scan.
+        self._scan: tuple[View, Observation] | None = None
+        self._local_pose = np.zeros(3)  # in the frame of the local map
+        self._old_beams = np.zeros(0, np.bool_)  # that end at surfaces seen before
+        self._log_change = 0.0  # nats, log probability of what has changed since the scan before
 
     def update(self, observation: Observation) -> Posterior:
         """Returns the posterior after one more scan."""
@@ -136,15 +138,20 @@ class PreciseEstimator:
             self._precision.changed,
         )
         velocity = self._velocity(self.modes[0], observation) if self.modes else None
-        view = self._corrected(view, observation, velocity)
+        view = self._correct_motion(view, observation, velocity)
         if self.modes:
-            view = self._follow(view, observation)
+            view = self._track_hypotheses(view, observation)
         self._scan = view, observation
-        if not self.modes or self._needs_search():
+        if not self.modes:
             return None
-        return self._publish(view, observation)
+        self._scans_since_search += 1
+        if not self._may_be_elsewhere():
+            self._search_interval = 1
+        elif self._is_search_due():
+            return None
+        return self._finish_scan(view, observation)
 
-    def _corrected(self, view: View, observation: Observation, velocity: Array | None) -> View:
+    def _correct_motion(self, view: View, observation: Observation, velocity: Array | None) -> View:
         """The view of the observation, corrected for a motion with ``velocity`` (3,) in base_link, and thinned."""
         corrected = correct_motion(observation, velocity, self.mount)
         return replace(view, angles=corrected.angles, ranges=corrected.ranges).thinned(TARGET_BEAMS)
@@ -157,8 +164,8 @@ class PreciseEstimator:
         if self._scan is None:
             raise RuntimeError("there is no scan to search with: call track first")
         view, observation = self._scan
-        self._relocalise(view)
-        return self._publish(view, observation)
+        self._search_for_hypotheses(view)
+        return self._finish_scan(view, observation)
 
     def predict(self, poses: Array, angles: Array) -> Predicted:
         """Predicts scans (see Estimator); sigma combines the scanner's noise and the model's stated error."""
@@ -185,7 +192,7 @@ class PreciseEstimator:
             self.settings.motion, mode.pose, mode.noise_covariance, period, odom, command, mode.velocity
         )
 
-    def _follow(self, view: View, observation: Observation) -> View:
+    def _track_hypotheses(self, view: View, observation: Observation) -> View:
         """Moves every hypothesis by the motion since the last scan, and fuses it with the scan.
 
         Returns the scan as corrected for that motion.
@@ -196,13 +203,13 @@ class PreciseEstimator:
         if observation.time_increment:
             # Once more, corrected for the motion that the match has shown.
             velocity = limit_velocity(self.settings.motion, -se2.between(poses[0], self.modes[0].pose) / period)
-            view = self._corrected(view, observation, velocity)
+            view = self._correct_motion(view, observation, velocity)
             poses, evidence = view.descend(poses, _prior_of([each[-1] for each in motions]))
         modes = [
             self._fuse(view, k, motions[k], predicted[k][-1], poses[k], evidence, observation)
             for k in range(len(poses))
         ]
-        self._weigh(view, modes, local, period)
+        self._weigh_scan(view, modes, local, period)
         return view
 
     def _match(
@@ -280,121 +287,115 @@ class PreciseEstimator:
             return updated
         return replace(updated, log_evidence=mode.log_evidence - widest.excess(best.mean))
 
-    def _weigh(self, view: View, modes: list[Mode], local: Array | None, period: float) -> None:
+    def _weigh_scan(self, view: View, modes: list[Mode], local: Array | None, period: float) -> None:
         """Weighs hypotheses by how well the map predicts those surfaces of the scan that are new to the robot.
 
         Surfaces that were seen before are no evidence again. ``local`` (3,) is the pose in the local frame, if recent
         scans gave it.
         """
         if local is None:
-            local = self._local_map.local(modes[0].pose)
-        seen, arrived = self._local_map.seen(local, view)
-        old = seen | arrived | view.surfaces.small
-        changes = self._local_map.count_changes(self._last, (local, view), period) if self._last else 0
+            local = self._local_map.to_local(modes[0].pose)
+        seen, appeared = self._local_map.find_old_beams(local, view)
+        old, small = seen | appeared | view.surfaces.small, view.surfaces.small
+        changes = self._local_map.count_changes(self._last, LocalScan(local, view), period) if self._last else 0
         if changes:
             self._search_interval = 1
-        change = changes * float(np.log(min(0.5, self.settings.change_rate * period)))
-        change += float((view.surfaces.density - view.surfaces.ideal)[arrived & ~seen & ~view.surfaces.small].sum())
+        log_change = changes * float(np.log(min(0.5, self.settings.change_rate * period)))
+        log_change += float((view.surfaces.density - view.surfaces.ideal)[appeared & ~seen & ~small].sum())
         poses = np.array([mode.pose for mode in modes])
-        explained, present = view.surface_evidence(poses).explained, _novelty(view, poses, old) + change
+        explained, present = view.surface_evidence(poses).explained, _log_at_poses(view, poses, old) + log_change
         modes = [
             replace(mode, explained=float(explained[k]), present=float(present[k])) for k, mode in enumerate(modes)
         ]
-        self._local, self._seen, self._change = local, old, change
-        carried_off = max(mode.log_evidence for mode in self.modes) + float(np.log(self.settings.unknown))
-        self._log_unmapped = max(self._log_unmapped, carried_off + float(np.log(self.settings.unmapped)))
-        self._log_unknown = max(self._log_unknown, carried_off)
-        self._unknown_present = max(_surprise(view, old) + change, _surprise(view, view.surfaces.small))
-        self._set(modes)
+        self._local_pose, self._old_beams, self._log_change = local, old, log_change
+        kidnapping = max(mode.log_evidence for mode in self.modes) + float(np.log(self.settings.unknown))
+        self._unknown_place.allow_kidnapping(kidnapping, self.settings.unmapped)
+        self._unknown_place.present = max(_log_anywhere(view, old) + log_change, _log_anywhere(view, small))
+        self._set_hypotheses(modes)
 
-    def _set(self, modes: list[Mode]) -> None:
+    def _set_hypotheses(self, modes: list[Mode]) -> None:
         """Sets the hypotheses and their weights."""
-        floor = float(np.log(self.settings.unknown))
-        log_unknown = max(self._log_unknown + self._unknown_present, max(mode.log_weight for mode in modes) + floor)
-        self.modes, self._unknown_weight = weigh(modes, log_unknown, self.settings.max_hypotheses)
+        unknown = self._unknown_place
+        least = max(mode.log_weight for mode in modes) + float(np.log(self.settings.unknown))
+        log_unknown = max(unknown.log_evidence + unknown.present, least)
+        self.modes, unknown.weight = weigh(modes, log_unknown, self.settings.max_hypotheses)
         self._explained = self.modes[0].explained
 
-    def _remember(self, view: View) -> None:
+    def _add_key_scan(self, view: View) -> None:
         """Makes the present scan a key scan: its evidence counts from now on, and its surfaces are known."""
-        best, before = self.modes[0], self._log_unknown
+        best, log_unknown = self.modes[0], self._unknown_place.log_evidence
         if self._probability() >= self.settings.tracking_probability:
             self._precision.learn_changes(view, best.pose)
-        self._log_unknown += self._unknown_present
-        self._log_unmapped += self._unknown_present
-        self._unknown_present = 0.0
-        self._local_map.add(
-            KeyScan(self._local, view, self._seen, self._change, before), best.pose, self._covariance(best)
-        )
+        self._unknown_place.add_key_scan()
+        key = KeyScan(self._local_pose, view, self._old_beams, self._log_change, log_unknown)
+        self._local_map.add(key, best.pose, self._covariance(best))
         self.modes = [replace(mode, log_evidence=mode.log_weight, present=0.0) for mode in self.modes]
 
-    def _needs_search(self) -> bool:
-        """Whether the robot may be elsewhere: its whereabouts are uncertain, or another place could fit much better."""
-        self._since_search += 1
+    def _may_be_elsewhere(self) -> bool:
+        """Whether the whereabouts are uncertain, or another place could fit the scans much better."""
         best = self.modes[0]
+        if self._probability() < self.settings.tracking_probability:
+            return True
         information = best.curvature + np.linalg.inv(self.seeds.spread)
         another_place = np.log(self.seeds.volume) + 0.5 * (np.linalg.slogdet(information)[1] - 3 * np.log(2 * np.pi))
-        doubtful = self._probability() < self.settings.tracking_probability
-        unknown = max(self._log_unknown, *(key.log_unknown for key in self._local_map.scans))
-        if not doubtful and best.log_weight > unknown - another_place:
-            self._search_interval = 1
-            return False
-        if self._local_map.is_new_view(self._local):
-            return doubtful or self._since_search >= self._search_interval
-        return self._since_search >= self._search_interval
+        unknown = max(self._unknown_place.log_evidence, *(key.log_unknown for key in self._local_map.scans))
+        return bool(best.log_weight <= unknown - another_place)
 
-    def _relocalise(self, view: View) -> None:
+    def _is_search_due(self) -> bool:
+        """Whether to search now: at each key scan while not tracking, otherwise ever more rarely."""
+        if self._probability() < self.settings.tracking_probability and self._is_key_scan_due():
+            return True
+        return self._scans_since_search >= self._search_interval
+
+    def _is_key_scan_due(self) -> bool:
+        return self._local_map.is_key_scan_due(self._local_pose)
+
+    def _search_for_hypotheses(self, view: View) -> None:
         """Searches near the initial pose or in the whole map, and adds what is found to the hypotheses."""
-        self._since_search, self._search_interval = 0, min(2 * self._search_interval, MAX_SEARCH_INTERVAL)
-        if self._initial is not None:
-            initial, self._initial = self._initial, None
-            found = search_near(view, *initial, self.seeds, self.settings, self._rng)
-            if not self._begin(view, found, self.settings.unknown, self.settings.all_changed):
-                self._add(self._search_everywhere(view), view)
+        self._scans_since_search, self._search_interval = 0, min(2 * self._search_interval, MAX_SEARCH_INTERVAL)
+        if self._start is not None:
+            start, self._start = self._start, None
+            found = search_near(view, *start, self.seeds, self.settings, self._rng)
+            if not self._begin_with(view, found, self.settings.unknown, self.settings.all_changed):
+                self._add_hypotheses(self._search_everywhere(view), view)
         elif not self.modes:
-            self._begin(view, self._search_everywhere(view), 1.0)
+            self._begin_with(view, self._search_everywhere(view), 1.0)
         else:
             found = self._search_everywhere(view)
             poses = np.array([mode.pose for mode in self.modes])
-            self._add([mode for mode in found if not same_place(poses, mode.pose).any()], view)
+            self._add_hypotheses([mode for mode in found if not same_place(poses, mode.pose).any()], view)
 
     def _search_everywhere(self, view: View) -> list[Mode]:
         """Hypotheses in the whole map that predict the scan clearly better than none does; at least one."""
         found = search_everywhere(view, self.seeds, self.settings)
-        surprise = _ideal(view, view.surfaces.small) + _surprise(view, view.surfaces.small)
-        return [mode for mode in found if mode.present > surprise + 1] or found[:1]
+        log_anywhere = _log_ideal(view, view.surfaces.small) + _log_anywhere(view, view.surfaces.small)
+        return [mode for mode in found if mode.present > log_anywhere + 1] or found[:1]
 
-    def _begin(self, view: View, found: list[Mode], unknown: float, all_changed: float = 0.0) -> bool:
+    def _begin_with(self, view: View, found: list[Mode], unknown: float, all_changed: float = 0.0) -> bool:
         """Starts with the hypotheses ``found``, and the probability ``unknown`` that the robot is at none.
 
         With the probability ``all_changed`` the map shows nothing that is there. Returns whether the map explains
         more of the scan than that.
         """
-        self._forget(view)
-        self._log_unknown = self._log_unmapped = float(np.log(unknown * self.settings.unmapped))
-        known = _ideal(view, self._seen)
-        least = self._unknown_present + float(np.log(all_changed)) if all_changed else -np.inf
-        self._set([replace(mode, present=max(mode.present - known, least)) for mode in found])
-        return found[0].present - known > least
+        self._restart_local_map(view)
+        self._unknown_place.restart(unknown, self.settings.unmapped)
+        ideal = _log_ideal(view, self._old_beams)
+        least = self._unknown_place.present + float(np.log(all_changed)) if all_changed else -np.inf
+        self._set_hypotheses([replace(mode, present=max(mode.present - ideal, least)) for mode in found])
+        return found[0].present - ideal > least
 
-    def _forget(self, view: View) -> None:
+    def _restart_local_map(self, view: View) -> None:
         """Starts another local map at the present scan."""
         self._local_map.clear()
-        self._local, self._seen, self._change = np.zeros(3), view.surfaces.small, 0.0
-        self._unknown_present = _surprise(view, self._seen)
+        self._local_pose, self._old_beams, self._log_change = np.zeros(3), view.surfaces.small, 0.0
+        self._unknown_place.present = _log_anywhere(view, self._old_beams)
 
-    def _add(self, found: list[Mode], view: View) -> None:
+    def _add_hypotheses(self, found: list[Mode], view: View) -> None:
         """Adds hypotheses at which the robot may have been for some time, or to which it was just carried."""
         if not found:
-            self._log_unknown = self._log_unmapped
+            self._unknown_place.exclude_mapped_places()
             return
-        poses = np.array([mode.pose for mode in found])
-        carried = self._log_unknown + np.array([mode.present for mode in found]) - _ideal(view, view.surfaces.small)
-        since = _novelty(view, poses, self._seen) + self._change
-        stayed = np.full(len(found), -np.inf)  # there since one of the key scans
-        for key in reversed(self._local_map.scans):
-            before = se2.compose(poses, se2.between(self._local, key.pose))
-            since += _novelty(key.view, before, key.seen) + key.change
-            stayed = np.maximum(stayed, since + key.log_unknown)
+        stayed, carried = self._log_stayed(found, view), self._log_carried(found, view)
         best = int(np.argmax(np.maximum(stayed, carried) + np.array([mode.log_evidence for mode in found])))
         added = [
             replace(mode, log_evidence=mode.log_evidence + max(stayed[k], carried[k]), present=0.0)
@@ -403,10 +404,26 @@ class PreciseEstimator:
         if added[best].log_weight > self.modes[0].log_weight:
             self._search_interval = 1
             if carried[best] > stayed[best]:
-                self._forget(view)
-        self._log_unknown = self._log_unmapped
-        self._set([*self.modes, *added])
-        self._remember(view)
+                self._restart_local_map(view)
+        self._unknown_place.exclude_mapped_places()
+        self._set_hypotheses([*self.modes, *added])
+        self._add_key_scan(view)
+
+    def _log_carried(self, found: list[Mode], view: View) -> Array:
+        """Evidence (N,) in nats that the robot was carried to each of the hypotheses just now."""
+        present = np.array([mode.present for mode in found])
+        return np.asarray(self._unknown_place.log_evidence + present - _log_ideal(view, view.surfaces.small))
+
+    def _log_stayed(self, found: list[Mode], view: View) -> Array:
+        """Evidence (N,) in nats that the robot has been at each of the hypotheses since one of the key scans."""
+        poses = np.array([mode.pose for mode in found])
+        since = _log_at_poses(view, poses, self._old_beams) + self._log_change
+        stayed = np.full(len(found), -np.inf)
+        for key in reversed(self._local_map.scans):
+            before = se2.compose(poses, se2.between(self._local_pose, key.pose))
+            since += _log_at_poses(key.view, before, key.seen) + key.log_change
+            stayed = np.maximum(stayed, since + key.log_unknown)
+        return stayed
 
     def _went_back(self, stamp: float | None) -> bool:
         return stamp is not None and self._stamp is not None and stamp < self._stamp
@@ -416,7 +433,7 @@ class PreciseEstimator:
             return self.settings.motion.period
         return stamp - self._stamp
 
-    def _publish(self, view: View, observation: Observation) -> Posterior:
+    def _finish_scan(self, view: View, observation: Observation) -> Posterior:
         """Stores what the next scan needs, and returns the posterior."""
         self.modes = clip_to_map(self.modes, self.bounds)
         period = self._period(observation.stamp)
@@ -424,17 +441,21 @@ class PreciseEstimator:
             pose_at_stamp(mode.pose, self._velocity(mode, observation), period, observation) for mode in self.modes
         ]
         self._stamp, self._odom = observation.stamp, observation.odom
-        if self._local_map.is_new_view(self._local):
-            self._remember(view)
-        self._last = self._local, view
-        best = self.modes[0]
-        predicted = self.predict(poses[0][None], observation.angles)
-        probability = self._probability()
+        if self._is_key_scan_due():
+            self._add_key_scan(view)
+        self._last = LocalScan(self._local_pose, view)
+        predicted, probability = self.predict(poses[0][None], observation.angles), self._probability()
         if probability >= self.settings.tracking_probability:
-            self._precision.learn(view, best.pose)
+            self._precision.learn(view, self.modes[0].pose)
+        return self._posterior(poses, predicted, probability)
+
+    def _posterior(self, poses: list[Array], predicted: Predicted, probability: float) -> Posterior:
+        """The posterior with the hypotheses at ``poses``, those at the stamp of the scan."""
+        best = self.modes[0]
         hypotheses = tuple(
             Hypothesis(pose, self._covariance(mode), mode.weight) for pose, mode in zip(poses, self.modes, strict=True)
         )
+        elsewhere = 1 - best.weight * (1 - self._unknown_place.weight)
         return Posterior(
             state=self._state(probability),
             hypotheses=hypotheses,
@@ -445,7 +466,7 @@ class PreciseEstimator:
             predicted=predicted.ranges[0],
             sigma=predicted.sigma[0],
             probability=probability,
-            protection=protection_level(best, self._covariance(best), 1 - best.weight * (1 - self._unknown_weight)),
+            protection=protection_level(best, self._covariance(best), elsewhere),
         )
 
     def _covariance(self, mode: Mode) -> Array:
@@ -457,7 +478,7 @@ class PreciseEstimator:
         best = self.modes[0]
         near = [mode for mode in self.modes if same_place(mode.pose[None], best.pose)[0]]
         return sum(
-            mode.weight * (1 - self._unknown_weight) * probability_of_being_near(self._covariance(mode))
+            mode.weight * (1 - self._unknown_place.weight) * probability_of_being_near(self._covariance(mode))
             for mode in near
         )
 
@@ -465,29 +486,30 @@ class PreciseEstimator:
         if probability >= self.settings.tracking_probability:
             self._was_tracking = True
             return "tracking"
-        known = 1 - self._unknown_weight
+        known = 1 - self._unknown_place.weight
         if len(self.modes) > 1 and self.modes[1].weight * known > self.settings.ambiguous_weight:
             return "ambiguous"
         return "lost" if self._was_tracking else "localising"
 
 
-def _ideal(view: View, skip: npt.NDArray[np.bool_]) -> float:
-    """Log likelihood in nats of the beams that are not in ``skip`` (B,), if all surfaces were known."""
+# Log likelihoods in nats of the beams of a scan that are not in a mask ``skip`` (B,). Those of all other functions are
+# relative to `_log_ideal`, which is the same for every place.
+
+
+def _log_ideal(view: View, skip: npt.NDArray[np.bool_]) -> float:
+    """If all surfaces were known."""
     return float(view.surfaces.ideal[~skip].sum())
 
 
-def _surprise(view: View, skip: npt.NDArray[np.bool_]) -> float:
-    """Log likelihood in nats of the beams that are not in ``skip`` (B,) if no surface was known, minus `_ideal`."""
+def _log_anywhere(view: View, skip: npt.NDArray[np.bool_]) -> float:
+    """At a place of which no surface is known."""
     return float((view.surfaces.density - view.surfaces.ideal)[~skip].sum())
 
 
-def _novelty(view: View, poses: Array, old: npt.NDArray[np.bool_]) -> Array:
-    """Log likelihood (N,) in nats at ``poses`` (N, 3) of the beams that are not in ``old`` (B,), minus `_ideal`.
-
-    It may also be clutter, which says nothing about the pose.
-    """
-    mapped = view.surface_evidence(poses, skip=old).log_likelihood - _ideal(view, old)
-    return np.asarray(np.logaddexp(mapped + np.log1p(-CLUTTER), _surprise(view, old) + np.log(CLUTTER)))
+def _log_at_poses(view: View, poses: Array, skip: npt.NDArray[np.bool_]) -> Array:
+    """At ``poses`` (N, 3) in the map; (N,). The scan may also be clutter, which says nothing about the pose."""
+    mapped = view.surface_evidence(poses, skip=skip).log_likelihood - _log_ideal(view, skip)
+    return np.asarray(np.logaddexp(mapped + np.log1p(-CLUTTER), _log_anywhere(view, skip) + np.log(CLUTTER)))
 
 
 def _prior_of(candidates: list[Candidate]) -> Prior:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from services.estimator.precise.motion_model import Fused
 
 NEAR_POSITION_M, NEAR_HEADING_RAD = 0.2, math.radians(5)  # a pose with a larger error is wrong
-EXCEEDED = 1e-4  # share of the scans whose error may exceed the protection level
+EXCEEDED_SHARE = 1e-4  # of the scans, whose error may exceed the protection level
 SAME_POSITION_M, SAME_HEADING_RAD = 0.1, 0.1  # hypotheses nearer to one another than this are merged
 # A direction counts as unobserved if its information is less than this share of the information across it; a learned
 # field adds a multiple of its squared ripple to the share.
@@ -43,7 +43,7 @@ class Mode:
     xi: Array  # (3,)
     curvature: Array  # (3, 3)
     log_evidence: float = 0.0  # nats, of the key scans and the prior; unnormalised
-    present: float = 0.0  # nats, of the present scan
+    present: float = 0.0  # nats, log likelihood of the present scan
     velocity: Array | None = None  # (3,) in base_link; None while unknown
     weight: float = 1.0
     unobserved_scans: int = 0  # number of consecutive scans without information along some direction
@@ -56,6 +56,35 @@ class Mode:
     def covariance(self, inflation: float) -> Array:
         """Covariance (3, 3) of x, y, yaw in map."""
         return np.asarray(inflation * (self.noise_covariance + self.model_covariance))
+
+
+@dataclass
+class UnknownPlace:
+    """The evidence that the robot is at none of the hypotheses, in nats and unnormalised as for a `Mode`."""
+
+    log_evidence: float = 0.0  # of the key scans
+    log_unmapped: float = 0.0  # part of it that remains when the whole map was searched
+    present: float = 0.0  # log likelihood of the present scan
+    weight: float = 1.0  # probability
+
+    def restart(self, probability: float, unmapped: float) -> None:
+        """The whole map was searched; the robot is at no place of it with a ``probability`` times ``unmapped``."""
+        self.log_evidence = self.log_unmapped = float(np.log(probability * unmapped))
+
+    def allow_kidnapping(self, log_probability: float, unmapped: float) -> None:
+        """The robot may just have been carried off, a share ``unmapped`` of which to no place that a search finds."""
+        self.log_unmapped = max(self.log_unmapped, log_probability + float(np.log(unmapped)))
+        self.log_evidence = max(self.log_evidence, log_probability)
+
+    def add_key_scan(self) -> None:
+        """The present scan becomes a key scan."""
+        self.log_evidence += self.present
+        self.log_unmapped += self.present
+        self.present = 0.0
+
+    def exclude_mapped_places(self) -> None:
+        """The whole map was searched, and what was found are hypotheses now."""
+        self.log_evidence = self.log_unmapped
 
 
 def weakest_direction(curvature: Array) -> tuple[Array, float]:
@@ -100,7 +129,6 @@ def mode_from_search(
     slope = evidence.xi[k] + (prior.information[k] @ difference(prior.mean[k : k + 1], pose[None])[0] if prior else 0)
     pose = pose + limit_steps(inverse @ slope, MAX_STEP)
     pose[2] = se2.wrap(pose[2])
-    accuracy = float(evidence.accuracy[k])
     logdet = float(np.linalg.slogdet(evidence.curvature[k] + information)[1])
     if prior:
         off = difference(pose[None], prior.mean[k : k + 1])[0]
@@ -108,20 +136,26 @@ def mode_from_search(
         complexity -= 0.5 * float(np.linalg.slogdet(information)[1])
     else:
         complexity = float(np.log(volume)) + 0.5 * (logdet - 3 * np.log(2 * np.pi * np.e))
-    # A hypothesis is one place: what is farther away than this belongs to others.
-    place = np.diag([SAME_POSITION_M**-2, SAME_POSITION_M**-2, SAME_HEADING_RAD**-2])
-    log_volume = 1.5 * np.log(2 * np.pi) - 0.5 * float(np.linalg.slogdet(evidence.curvature[k] + place)[1])
     return Mode(
         pose=pose,
         noise_covariance=inverse @ (evidence.xi_noise_covariance[k] + information) @ inverse,
         model_covariance=inverse @ evidence.xi_model_covariance[k] @ inverse,
         explained=float(evidence.inlier_ratio[k]),
-        accuracy=accuracy,
+        accuracy=float(evidence.accuracy[k]),
         complexity=complexity,
         xi=evidence.xi[k],
         curvature=evidence.curvature[k],
-        log_evidence=0.0 if prior else float(log_volume - np.log(volume)),
+        log_evidence=0.0 if prior else float(_log_volume_of_place(evidence.curvature[k]) - np.log(volume)),
     )
+
+
+def _log_volume_of_place(curvature: Array) -> float:
+    """Logarithm of the volume in m² rad of the poses that fit a scan with this ``curvature`` (3, 3) at one place.
+
+    What is farther away than the poses of one place belongs to other hypotheses.
+    """
+    place = np.diag([SAME_POSITION_M**-2, SAME_POSITION_M**-2, SAME_HEADING_RAD**-2])
+    return float(1.5 * np.log(2 * np.pi) - 0.5 * float(np.linalg.slogdet(curvature + place)[1]))
 
 
 def update_mode(mode: Mode, fused: Fused, evidence: Evidence, k: int, period: float, *, unobserved: bool) -> Mode:
@@ -131,19 +165,18 @@ def update_mode(mode: Mode, fused: Fused, evidence: Evidence, k: int, period: fl
     is true if the scan has no information along some direction.
     """
     inverse = np.linalg.inv(fused.information)
-    information = fused.information - evidence.curvature[k]
+    prior_information = fused.information - evidence.curvature[k]
     inverse_of_scan = np.linalg.inv(evidence.curvature[k] + np.eye(3))
-    accuracy = float(evidence.accuracy[k])
     # A velocity that is not observed in every direction is not carried on.
     velocity = None
     if not unobserved and not mode.unobserved_scans:
         velocity = smooth_velocity(mode.velocity, se2.between(mode.pose, fused.mean) / period, period)
     return Mode(
         pose=fused.mean,
-        noise_covariance=inverse @ (evidence.xi_noise_covariance[k] + information) @ inverse,
+        noise_covariance=inverse @ (evidence.xi_noise_covariance[k] + prior_information) @ inverse,
         model_covariance=inverse_of_scan @ evidence.xi_model_covariance[k] @ inverse_of_scan,
         explained=float(evidence.inlier_ratio[k]),
-        accuracy=accuracy,
+        accuracy=float(evidence.accuracy[k]),
         complexity=fused.complexity,
         xi=evidence.xi[k],
         curvature=evidence.curvature[k],
@@ -190,11 +223,9 @@ def weigh(modes: list[Mode], log_unknown: float, count: int) -> tuple[list[Mode]
     weights /= weights.sum()
     total = weights[:-1].sum()
     shares = weights[:-1] / total if total > 0 else np.eye(len(kept))[0]
-    used = shares > MIN_WEIGHT
-    shares = shares / shares[used].sum()
-    return [replace(modes[k], weight=float(w)) for k, w in zip(kept, shares, strict=True) if w > MIN_WEIGHT], float(
-        weights[-1]
-    )
+    shares = shares / shares[shares > MIN_WEIGHT].sum()
+    weighted = [replace(modes[k], weight=float(w)) for k, w in zip(kept, shares, strict=True) if w > MIN_WEIGHT]
+    return weighted, float(weights[-1])
 
 
 def constraining_beams(view: View, pose: Array, direction: Array) -> float:
@@ -215,12 +246,12 @@ def probability_of_being_near(covariance: Array) -> float:
 
 
 def protection_level(mode: Mode, covariance: Array, elsewhere: float) -> Array | None:
-    """Errors (3,) m along and m across base_link, and rad, that are exceeded with probability `EXCEEDED`.
+    """Errors (3,) m along and m across base_link, and rad, that are exceeded with probability `EXCEEDED_SHARE`.
 
     ``elsewhere`` is the probability that the robot is not at this hypothesis. Returns None if that alone is larger.
     """
-    if elsewhere >= EXCEEDED:
+    if elsewhere >= EXCEEDED_SHARE:
         return None
     turn = se2.rotation(-float(mode.pose[2]))
     deviation = np.sqrt(np.diagonal(turn @ covariance @ turn.T))
-    return np.asarray(NormalDist().inv_cdf(1 - (EXCEEDED - elsewhere) / 2) * deviation)
+    return np.asarray(NormalDist().inv_cdf(1 - (EXCEEDED_SHARE - elsewhere) / 2) * deviation)

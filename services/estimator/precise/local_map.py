@@ -1,4 +1,4 @@
-"""The last key scans: what the robot has seen since its belief began, in a frame of its own.
+"""The local map: the last key scans, in a frame of their own.
 
 Scan matching by the distance of points to lines (Censi, ICRA 2008), with the points of several scans instead of one, so
 that the error does not grow with every scan. It gives the motion where the map does not know the surroundings.
@@ -26,14 +26,14 @@ NEIGHBOURS, NEIGHBOUR_RADIUS_M = 10, 0.3  # points from which the normal of a su
 # Largest distance to a point's partner, iteration by iteration.
 PARTNER_RADII_M = (0.6, 0.6, 0.4, 0.4, 0.2, 0.2, 0.1, 0.1, 0.1, 0.1)
 CAUCHY_SCALE_M = 0.02
-MATCHED_RADIUS_M = 0.08  # a point of a matched scan this near a stored one counts as matched
-SEEN_RADIUS_M = 0.15  # the same for a surface that was seen before; beams far away are this far apart
+MATCHED_RADIUS_M = 0.08  # a point this near to one of the local map counts as matched
+SEEN_RADIUS_M = 0.15  # and this near, as on a surface that was seen before; beams far away are this far apart
 MIN_POINTS = 20
 MAX_SQUARED_DISTANCE = 4.0  # squared standard deviations of the result from the prior
-PASSED_M = 0.3  # behind a surface, from where a beam has passed through it
-MIN_CHANGED_M, WALKING_SPEED = 0.2, 1.5  # m and m/s
-MIN_SHARE = 0.5  # of a scan's points, that must match the stored scans
-CLEAR_SHARE = 0.8  # if the share is smaller, matching is repeated from other headings
+PASSED_M = 0.3  # behind a surface, from where a beam counts as having passed through it
+MIN_CHANGED_M, WALKING_SPEED = 0.2, 1.5  # width in m of one thing that may change at once, and m/s
+MIN_SHARE = 0.5  # of a scan's points that must match the local map
+CLEAR_SHARE = 0.8  # with a smaller share, matching is repeated from `EXTRA_HEADINGS_RAD`
 EXTRA_HEADINGS_RAD = np.array([-0.3, -0.15, 0.15, 0.3])
 DRIFT_PER_SCAN = np.array([0.02, 0.02, 0.005])  # m, m, rad: standard deviation that each key scan contributes
 MIN_INFORMATION_RATIO = 0.02  # a direction with less information, as a share of that across it, is unobserved
@@ -41,24 +41,30 @@ MIN_INFORMATION_RATIO = 0.02  # a direction with less information, as a share of
 
 @dataclass(frozen=True)
 class Match:
-    """Pose of a scan relative to the scans before it."""
+    """Pose of a scan in the local map."""
 
-    pose: Array  # (3,) base_link, in the frame of the stored scans
-    covariance: Array  # (3, 3) of x, y, yaw, relative to the stored scans
-    share: float  # of the scan's points that were seen before
+    pose: Array  # (3,) base_link in the local frame
+    covariance: Array  # (3, 3) of x, y, yaw, relative to the key scans
+    share: float  # of the scan's points that match
     score: float  # mean weight of the scan's points, higher for closer matches
     degenerate: bool  # the points have almost no information along some direction
 
 
 @dataclass(frozen=True)
-class KeyScan:
-    """A scan of the local map."""
+class LocalScan:
+    """A scan with its pose in the local frame."""
 
     pose: Array  # (3,) base_link in the local frame
     view: View
-    seen: npt.NDArray[np.bool_]  # (B,) beams that ended at surfaces of earlier scans
-    change: float  # nats, of what had changed since the scan before
-    log_unknown: float  # ln of the unnormalised probability, before this scan, that the robot is somewhere else
+
+
+@dataclass(frozen=True)
+class KeyScan(LocalScan):
+    """A scan of the local map."""
+
+    seen: npt.NDArray[np.bool_]  # (B,) beams that are no new evidence, as they end at surfaces of earlier scans
+    log_change: float  # nats, log probability of what had changed since the scan before
+    log_unknown: float  # nats, evidence before this scan that the robot is at none of the hypotheses
 
 
 @dataclass
@@ -78,11 +84,11 @@ class LocalMap:
         self.scans.clear()
         self._tree = None
 
-    def local(self, pose: Array) -> Array:
+    def to_local(self, pose: Array) -> Array:
         """A pose (3,) in map, in the local frame."""
         return se2.between(self.frame, pose)
 
-    def is_new_view(self, local: Array) -> bool:
+    def is_key_scan_due(self, local: Array) -> bool:
         """Whether ``local`` (3,) is so far from the last key scan that the scan there becomes another one."""
         if not self.scans:
             return True
@@ -96,16 +102,16 @@ class LocalMap:
         self.covariance = covariance + np.diag(DRIFT_PER_SCAN**2)
         self._tree = None
 
-    def seen(self, local: Array, view: View) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-        """Masks (B,) of the beams of a scan at ``local`` (3,) that are no new evidence.
+    def find_old_beams(self, local: Array, view: View) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+        """Masks (B,) of the beams of a scan at ``local`` (3,) that are no new evidence: seen before, and appeared.
 
-        The first: beams that end at surfaces of the stored scans. Beams without return have no end, and count as such
-        once there are stored scans. The second: beams that end where a stored scan saw through. What is there has come
-        since then, wherever the robot may be.
+        Seen before are beams that end at surfaces of the key scans; beams without return have no end, and count as
+        seen once there are key scans. Appeared are surfaces where a key scan saw through: they came since then,
+        wherever the robot may be.
         """
-        seen, arrived = np.zeros(len(view.ranges), np.bool_), np.zeros(len(view.ranges), np.bool_)
+        seen, appeared = np.zeros(len(view.ranges), np.bool_), np.zeros(len(view.ranges), np.bool_)
         if not self.scans or not len(self._tree_of_points().data):
-            return seen, arrived
+            return seen, appeared
         placed = se2.transform(se2.compose(local, self.mount), view.points)
         distance, _ = self._tree_of_points().query(placed, distance_upper_bound=SEEN_RADIUS_M)
         near = np.isfinite(distance)
@@ -113,30 +119,30 @@ class LocalMap:
         seen[view.returned] = near
         free = np.zeros(len(near), np.bool_)
         free[~near] = self._in_free_space(placed[~near])
-        arrived[view.returned] = free
-        return seen, arrived
+        appeared[view.returned] = free
+        return seen, appeared
 
     def _in_free_space(self, points: Array) -> npt.NDArray[np.bool_]:
-        """Mask (K,) of local points (K, 2) in m through which a stored scan saw."""
+        """Mask (K,) of local points (K, 2) in m through which a key scan saw."""
         free = np.zeros(len(points), np.bool_)
         for key in self.scans:
             ranges, beam, inside = _beams_towards(key.view, se2.compose(key.pose, self.mount), points)
             free |= inside & (_nearest_of_neighbours(key.view.ranges, beam) > ranges + SEEN_RADIUS_M)
         return free
 
-    def count_changes(self, last: tuple[Array, View], now: tuple[Array, View], period: float) -> int:
-        """Number of things that vanished or appeared between two scans, each with its local pose (3,).
+    def count_changes(self, last: LocalScan, now: LocalScan, period: float) -> int:
+        """Number of things that vanished or appeared between two scans.
 
         One thing is as wide as somebody walking can have uncovered or covered in ``period`` s.
         """
         width = MIN_CHANGED_M + WALKING_SPEED * period
         return self._count_passed(last, now, width) + self._count_passed(now, last, width)
 
-    def _count_passed(self, seen: tuple[Array, View], by: tuple[Array, View], width: float) -> int:
-        """How many times ``width`` m of surfaces of one scan another scan passes through."""
-        points = se2.transform(se2.compose(seen[0], self.mount), seen[1].points)
-        ranges, beam, inside = _beams_towards(by[1], se2.compose(by[0], self.mount), points)
-        passed = inside & (_nearest_of_neighbours(by[1].ranges, beam) > ranges + PASSED_M)
+    def _count_passed(self, seen: LocalScan, by: LocalScan, width: float) -> int:
+        """How many things of ``width`` m another scan passes through, of those that one scan has ``seen``."""
+        points = se2.transform(se2.compose(seen.pose, self.mount), seen.view.points)
+        ranges, beam, inside = _beams_towards(by.view, se2.compose(by.pose, self.mount), points)
+        passed = inside & (_nearest_of_neighbours(by.view.ranges, beam) > ranges + PASSED_M)
         edges = np.flatnonzero(np.diff(np.concatenate([[0], passed.astype(int), [0]])))
         first, last = edges[::2], edges[1::2] - 1
         many = last - first + 1 >= MIN_BEAMS
@@ -144,7 +150,7 @@ class LocalMap:
         return int((widths[widths > width] / width).sum())
 
     def match(self, starts: Array, points: Array, prior: Candidate) -> Match | None:
-        """Returns the pose at which a scan continues the stored ones; None if it does not.
+        """Returns the pose at which a scan matches the key scans; None if there is none.
 
         ``starts`` (N, 3) and ``prior`` are poses in map, ``points`` (K, 2) m in the laser frame.
         """
@@ -152,12 +158,12 @@ class LocalMap:
             return None
         turn = se2.rotation(-float(self.frame[2]))
         covariance = turn @ prior.covariance @ turn.T
-        local_prior = replace(prior, mean=self.local(prior.mean), covariance=covariance)
-        found = self._best(self.local(starts), points, local_prior)
+        local_prior = replace(prior, mean=self.to_local(prior.mean), covariance=covariance)
+        found = self._best_match(self.to_local(starts), points, local_prior)
         if found is None or found.share < CLEAR_SHARE:
-            turned = np.repeat(self.local(starts[:1]), len(EXTRA_HEADINGS_RAD), axis=0)
+            turned = np.repeat(self.to_local(starts[:1]), len(EXTRA_HEADINGS_RAD), axis=0)
             turned[:, 2] = se2.wrap(turned[:, 2] + EXTRA_HEADINGS_RAD)
-            again = self._best(turned, points, local_prior)
+            again = self._best_match(turned, points, local_prior)
             if again is not None and (found is None or again.score > found.score):
                 found = again
         return None if found is None or found.share < MIN_SHARE or found.degenerate else found
@@ -168,9 +174,9 @@ class LocalMap:
         covariance = self.covariance + turn @ match.covariance @ turn.T
         return Candidate("recent scans", se2.compose(self.frame, match.pose), covariance, 1.0)
 
-    def _best(self, starts: Array, points: Array, prior: Candidate) -> Match | None:
+    def _best_match(self, starts: Array, points: Array, prior: Candidate) -> Match | None:
         information = np.asarray(np.linalg.inv(prior.covariance), float)
-        found = [self._descend(start, points, prior.mean, information) for start in starts]
+        found = [self._register(start, points, prior.mean, information) for start in starts]
         plausible = [
             each for each in found if each is not None and prior.squared_distance(each.pose) < MAX_SQUARED_DISTANCE
         ]
@@ -197,7 +203,8 @@ class LocalMap:
             self._normals = np.asarray(vectors[:, :, 0] * (exists.sum(axis=1) > 2)[:, None])
         return self._normals
 
-    def _descend(self, start: Array, points: Array, mean: Array, information: Array) -> Match | None:
+    def _register(self, start: Array, points: Array, mean: Array, information: Array) -> Match | None:
+        """Registers points (K, 2) m in the laser frame, with a Gaussian prior; None if too few have a partner."""
         tree, normals = self._tree_of_points(), self._normals_of_points()
         pose, H = np.array(start), np.eye(3)
         for radius in PARTNER_RADII_M:

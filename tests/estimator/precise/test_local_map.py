@@ -12,7 +12,7 @@ from common.geometry.world import World
 from lab.accuracy.scenes import Scene
 from services.estimator.precise.gauss_newton import View
 from services.estimator.precise.likelihood import Likelihood
-from services.estimator.precise.local_map import MIN_DISTANCE_M, KeyScan, LocalMap, _beams_towards
+from services.estimator.precise.local_map import MIN_DISTANCE_M, KeyScan, LocalMap, LocalScan, _beams_towards
 from services.estimator.precise.motion_model import Candidate
 from services.estimator.shared.generative_models import RayCaster
 from tests.estimator.models import ROOM
@@ -32,7 +32,7 @@ def local_map(scene, *poses, frame=(0.0, 0.0, 0.0)):
     made = LocalMap(np.array(scene.scanner.mount), frame=np.array(frame))
     for pose in poses:
         scan = view(scene, pose)
-        key = KeyScan(made.local(np.array(pose)), scan, np.zeros(len(scan.ranges), np.bool_), 0.0, 0.0)
+        key = KeyScan(made.to_local(np.array(pose)), scan, np.zeros(len(scan.ranges), np.bool_), 0.0, 0.0)
         made.add(key, np.array(pose), np.diag([1e-4, 1e-4, 1e-5]))
     return made
 
@@ -98,17 +98,17 @@ def changed(scan, beams, factor):
 def test_seen_surfaces():
     scene = Scene.of(ROOM, 361, 1)
     scan = view(scene, HERE)
-    nothing, arrived = LocalMap(np.array(scene.scanner.mount)).seen(HERE, scan)
+    nothing, arrived = LocalMap(np.array(scene.scanner.mount)).find_old_beams(HERE, scan)
     assert not nothing.any()
     assert not arrived.any()
     made = local_map(scene, HERE)
-    here = made.local(HERE)
-    assert made.is_new_view(made.local(HERE + np.array([1.01 * MIN_DISTANCE_M, 0.0, 0.0])))
-    assert not made.is_new_view(here)
-    assert made.seen(here, view(scene, HERE))[0].all()
-    seen, arrived = made.seen(here, changed(scan, slice(100, 150), 0.5))  # a person
+    here = made.to_local(HERE)
+    assert made.is_key_scan_due(made.to_local(HERE + np.array([1.01 * MIN_DISTANCE_M, 0.0, 0.0])))
+    assert not made.is_key_scan_due(here)
+    assert made.find_old_beams(here, view(scene, HERE))[0].all()
+    seen, arrived = made.find_old_beams(here, changed(scan, slice(100, 150), 0.5))  # a person
     assert np.flatnonzero(~seen).tolist() == np.flatnonzero(arrived).tolist() == list(range(100, 150))
-    seen, arrived = made.seen(here, changed(scan, slice(100, 150), 1.5))  # a door was opened
+    seen, arrived = made.find_old_beams(here, changed(scan, slice(100, 150), 1.5))  # a door was opened
     assert np.flatnonzero(~seen).tolist() == list(range(100, 150))
     assert not arrived.any()
 
@@ -116,15 +116,15 @@ def test_seen_surfaces():
 def test_changes_between_scans():
     scene = Scene.of(ROOM, 361, 1)
     made, first, now = LocalMap(np.array(scene.scanner.mount)), view(scene, HERE), view(scene, HERE)
-    assert made.count_changes((HERE, first), (HERE, now), 0.1) == 0
+    assert made.count_changes(LocalScan(HERE, first), LocalScan(HERE, now), 0.1) == 0
     for factor in (0.5, 2.0):
         counts = [
-            made.count_changes((HERE, first), (HERE, changed(now, slice(100, last), factor)), 0.1)
+            made.count_changes(LocalScan(HERE, first), LocalScan(HERE, changed(now, slice(100, last), factor)), 0.1)
             for last in (103, 170, 240)
         ]
         assert counts[0] == 0 < counts[1] < counts[2]
     step = se2.compose(HERE, [0.05, 0.0, 0.1])
-    assert made.count_changes((HERE, first), (step, view(scene, step)), 0.1) == 0
+    assert made.count_changes(LocalScan(HERE, first), LocalScan(step, view(scene, step)), 0.1) == 0
 
 
 def test_beams_of_a_corrected_scan():
