@@ -30,6 +30,7 @@ SETTLED_STEP = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: this near, F is quadra
 COARSE_SIGMA_M, MEDIUM_SIGMA_M = 0.3, 0.1
 FOLLOWING_SCHEDULE_M = (0.05, 0.0, 0.0, 0.0, 0.0)  # the same, from a predicted pose
 CORRELATED_M = 2.0  # along a surface, on which the errors of a map are alike
+MAX_POLISHING_STEPS = 4
 DAMPING = np.diag([1.0, 1.0, 1.0]) * 1e-6  # 1/m², 1/rad²: no step along directions without information
 
 
@@ -239,7 +240,7 @@ def descend(
     return poses, view.evidence(poses, 0.0, view.surface_evidence(poses).weights)
 
 
-def polish(view: View, poses: Array, prior: Prior | None = None, iterations: int = 5) -> tuple[Array, Evidence]:
+def polish(view: View, poses: Array) -> tuple[Array, Evidence]:
     """Finds the minimum to a fraction of a millimetre with full steps, from poses (N, 3) already near it.
 
     Near the minimum F has ripples, because beams jump between surfaces, and a line search would stop there. Each step
@@ -248,8 +249,8 @@ def polish(view: View, poses: Array, prior: Prior | None = None, iterations: int
     """
     poses = np.array(poses, float)
     evidence = view.evidence(poses)
-    for _ in range(iterations - 1):
-        step = _steps(poses, evidence, prior)
+    for _ in range(MAX_POLISHING_STEPS):
+        step = _steps(poses, evidence, None)
         if (np.abs(step) < SETTLED_STEP).all():
             break
         poses = poses + step

@@ -38,6 +38,8 @@ MAX_ERROR_M = 0.1  # a larger error means that the beam ended at another surface
 MIN_FACING = 0.15  # minimum of |n . u| of a beam that shapes the field
 PRIOR_COUNT, PRIOR_SCALE_M = 20, 0.05  # pseudo-count of each class, and its error, for classes that are seldom seen
 MIN_SCALE_M = 1e-3
+SEED_CLEARANCE_M = 0.1  # of the places where a search begins
+RIPPLE_BEAMS = 10  # apart are the normals that are compared, to either side
 
 
 @dataclass(frozen=True)
@@ -81,15 +83,15 @@ def seen_cells(beams: Beams) -> Seen:
 
 def seed_places(field: DistanceField, visited: Array, seen: Seen | None = None) -> Array:
     """Places (K, 2), m in map, where a search for the laser begins: visited ones, and those `reachable` from them."""
-    return thin_places(np.concatenate([visited, reachable(field, visited, seen=seen)]), SEED_SPACING_M)
+    return thin_places(np.concatenate([visited, reachable(field, visited, seen)]), SEED_SPACING_M)
 
 
-def reachable(field: DistanceField, visited: Array, clearance: float = 0.1, seen: Seen | None = None) -> Array:
+def reachable(field: DistanceField, visited: Array, seen: Seen | None = None) -> Array:
     """Places (K, 2), m in map, that are connected with the visited places (N, 2) through free space.
 
-    They are the nodes of the field at least ``clearance`` m from surfaces, and within the cells ``seen`` if given.
+    They are the nodes of the field at least `SEED_CLEARANCE_M` from surfaces, and within the cells ``seen`` if given.
     """
-    free = field.phi > clearance
+    free = field.phi > SEED_CLEARANCE_M
     if seen is not None:
         free &= seen.nodes_of(field)
     region, _ = ndimage.label(free)
@@ -98,16 +100,17 @@ def reachable(field: DistanceField, visited: Array, clearance: float = 0.1, seen
     return np.asarray(np.array(field.origin) + field.resolution * np.column_stack([j, i]))
 
 
-def measure_ripple(field: DistanceField, lasers: Array, angles: Array, apart: int = 10) -> float:
+def measure_ripple(field: DistanceField, lasers: Array, angles: Array) -> float:
     """Standard deviation in rad of the normals of flat surfaces in the field.
 
-    Compares the normal at a beam's end with the mean of the normals ``apart`` beams to its left and right. Differences
+    Compares the normal at a beam's end with the mean of the normals `RIPPLE_BEAMS` to its left and right. Differences
     of more than `CORNER_ANGLE_RAD` are corners and do not count.
     """
     normal = field.trace(lasers, angles).jacobian[..., :2]
     yaw = np.arctan2(normal[..., 1], normal[..., 0])
     left, right = (
-        wrap(yaw[:, shift : yaw.shape[1] - 2 * apart + shift] - yaw[:, apart:-apart]) for shift in (0, 2 * apart)
+        wrap(yaw[:, shift : yaw.shape[1] - 2 * RIPPLE_BEAMS + shift] - yaw[:, RIPPLE_BEAMS:-RIPPLE_BEAMS])
+        for shift in (0, 2 * RIPPLE_BEAMS)
     )
     flat = (np.abs(left) < CORNER_ANGLE_RAD) & (np.abs(right) < CORNER_ANGLE_RAD)
     # A mean of two errors minus a third error has 1.5 times the variance of one error.
