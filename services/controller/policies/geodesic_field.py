@@ -54,8 +54,8 @@ class FreeSpaceGraph:
         self._opposite = np.empty_like(self._from)  # for each edge, the index of the edge in the opposite direction
         self._opposite[np.lexsort((self._to, self._from))] = np.lexsort((self._from, self._to))
         self._near_obstacles = np.zeros(self.grid.cells, bool)  # cells whose cost temporary obstacles may change
-        self.slowness = np.zeros(self.grid.shape)  # cost of a metre in each cell
-        self._metre_cost = UNKNOWN_COST * free.unknown.ravel()  # part of it that does not depend on clearance, above 1
+        self.cost_per_metre = np.zeros(self.grid.shape)
+        self._extra_cost_per_metre = UNKNOWN_COST * free.unknown.ravel()  # the part that does not depend on clearance
         self._update_weights(~self._near_obstacles)
         _, self.component = connected_components(self._graph, directed=False)  # (cells,), without temporary obstacles
         self._centres = self.grid.centres()
@@ -74,19 +74,19 @@ class FreeSpaceGraph:
             self.clearance = clearance.reshape(self.grid.shape)
         self._update_weights(before | self._near_obstacles)
 
-    def set_metre_cost(self, cost: Array) -> None:
+    def set_extra_cost_per_metre(self, cost: Array) -> None:
         """Set an additional cost (cells,) of a metre in each cell."""
-        self._metre_cost = cost
+        self._extra_cost_per_metre = cost
         self._update_weights(np.ones(self.grid.cells, bool))
 
     def _update_weights(self, changed: npt.NDArray[np.bool_]) -> None:
         """Recompute the weights of all edges of the ``changed`` cells (cells,) bool."""
-        clearance, slow = self.clearance.ravel(), self.slowness.ravel()
-        slow[changed] = slowness(clearance[changed], self.min_clearance) + self._metre_cost[changed]
+        clearance, cost = self.clearance.ravel(), self.cost_per_metre.ravel()
+        cost[changed] = cost_near_walls(clearance[changed], self.min_clearance) + self._extra_cost_per_metre[changed]
         outgoing = np.flatnonzero(changed[self._from])
         edges = np.concatenate([outgoing, self._opposite[outgoing]])
-        s = np.where(clearance >= self.min_clearance, slow, np.inf)
-        self._graph.data[edges] = self._length[edges] * (s[self._from[edges]] + s[self._to[edges]]) / 2
+        cost = np.where(clearance >= self.min_clearance, cost, np.inf)
+        self._graph.data[edges] = self._length[edges] * (cost[self._from[edges]] + cost[self._to[edges]]) / 2
 
     def nearest_free(
         self, point: Array, within: float = np.inf, component: int | None = None, *, map_only: bool = False
@@ -133,7 +133,7 @@ class FreeSpaceGraph:
         clearance = self.grid.interpolate(self.clearance, points)
         # The robot may stand closer to a wall than min_clearance. From there every line that leads away is free.
         free = np.all((clearance >= self.min_clearance - 1e-9) | (clearance >= clearance[:1] - 1e-9), axis=0)
-        return free, length * self.grid.interpolate(self.slowness, points).mean(axis=0)
+        return free, length * self.grid.interpolate(self.cost_per_metre, points).mean(axis=0)
 
 
 @dataclass(frozen=True)
@@ -193,7 +193,7 @@ class CostField:
         return int(reachable[near][np.argmin(distance[near] + self.cost.ravel()[reachable[near]] * 1e-3)])
 
 
-def slowness(clearance: Array, min_clearance: float) -> Array:
+def cost_near_walls(clearance: Array, min_clearance: float) -> Array:
     """Cost of a metre at a clearance (N,) m: 1 far from walls, and most at ``min_clearance``."""
     gap = clearance - min_clearance
     closeness, tightness = (np.clip(1 - gap / range_m, 0, 1) for range_m in (WALL_COST_RANGE_M, STOP_RANGE_M))

@@ -40,26 +40,35 @@ def rollouts(current: Array, policies: Array, robot: Robot) -> tuple[Array, Arra
     Returns poses (N, T, 3) in the present base_link, their times (T,) s, and the times (N,) s after which the robot
     stands, apart from a turn on the spot.
     """
+    times = np.arange(0, HOLD_S + max_braking_time(robot), STEP_S) + STEP_S / 2  # middles of the steps
+    velocity = _velocities(current, policies, times, robot)
+    return _integrate(velocity, robot), times + STEP_S / 2, _standing_times(current, policies, robot)
+
+
+def _velocities(current: Array, policies: Array, times: Array, robot: Robot) -> Array:
+    """Velocities (N, T, 3) of policies (N, 5) at ``times`` (T,) s: accelerated, held, then braked."""
     actions, hold, turn_hold = policies[:, :3], policies[:, 3], policies[:, 4]
-    times = np.arange(0, HOLD_S + max_braking_time(robot), STEP_S) + STEP_S / 2
-    accelerating = np.minimum(times, hold[:, None])  # (N, T)
-    change = actions - current
-    linear = np.maximum(np.hypot(change[:, 0], change[:, 1]), 1e-12)[:, None]
-    progress = np.minimum(1.0, robot.acceleration * accelerating / linear)  # share of the change
+    accelerating = np.minimum(times, hold[:, None])  # (N, T) s until then
     turning = np.minimum(times, turn_hold[:, None])
+    change = actions - current
+    progress = np.minimum(1.0, robot.acceleration * accelerating / _linear(change)[:, None])  # share of the change
     max_turn_change = robot.turn_acceleration * turning
     velocity = np.empty((len(actions), len(times), 3))
     velocity[..., :2] = current[:2] + change[:, None, :2] * progress[..., None]
     velocity[..., 2] = current[2] + np.clip(change[:, None, 2], -max_turn_change, max_turn_change)
-    braking_time = times - accelerating
-    speed = np.maximum(np.hypot(velocity[..., 0], velocity[..., 1]), 1e-12)
-    share_left = np.maximum(0.0, 1 - robot.acceleration * braking_time / speed)
+    # From here on, braking.
+    share_left = np.maximum(0.0, 1 - robot.acceleration * (times - accelerating) / _linear(velocity))
     velocity[..., :2] *= share_left[..., None]
-    least_turn = np.abs(velocity[..., 2]) - robot.turn_acceleration * (times - turning)
+    turn_left = np.abs(velocity[..., 2]) - robot.turn_acceleration * (times - turning)
     if robot.drive == "differential":  # it brakes on its arc, if it can brake its turn as fast
         on_arc = np.abs(velocity[..., 2]) * share_left * (turn_hold >= hold)[:, None]
-        least_turn = np.maximum(least_turn, on_arc)
-    velocity[..., 2] = np.sign(velocity[..., 2]) * np.maximum(0.0, least_turn)
+        turn_left = np.maximum(turn_left, on_arc)
+    velocity[..., 2] = np.sign(velocity[..., 2]) * np.maximum(0.0, turn_left)
+    return velocity
+
+
+def _integrate(velocity: Array, robot: Robot) -> Array:
+    """Poses (N, T, 3) after each step with the ``velocity`` (N, T, 3)."""
     yaw = np.cumsum(velocity[..., 2], axis=1) * STEP_S
     linear_velocity = velocity[..., :2]
     if robot.drive == "differential":
@@ -67,10 +76,20 @@ def rollouts(current: Array, policies: Array, robot: Robot) -> tuple[Array, Arra
         cos, sin = np.cos(yaw_at_middle), np.sin(yaw_at_middle)
         vx, vy = velocity[..., 0], velocity[..., 1]
         linear_velocity = np.stack([cos * vx - sin * vy, sin * vx + cos * vy], axis=-1)
-    poses = np.concatenate([np.cumsum(linear_velocity, axis=1) * STEP_S, yaw[..., None]], axis=-1)
-    share = np.minimum(1.0, robot.acceleration * hold[:, None] / linear)
+    return np.concatenate([np.cumsum(linear_velocity, axis=1) * STEP_S, yaw[..., None]], axis=-1)
+
+
+def _standing_times(current: Array, policies: Array, robot: Robot) -> Array:
+    """Times (N,) s after which the robot stands, apart from a turn on the spot."""
+    hold, change = policies[:, 3], policies[:, :3] - current
+    share = np.minimum(1.0, robot.acceleration * hold[:, None] / _linear(change)[:, None])
     top_speed = np.hypot(*(current[:2] + change[:, :2] * share).T)
-    return poses, times + STEP_S / 2, hold + top_speed / robot.acceleration
+    return np.asarray(hold + top_speed / robot.acceleration)
+
+
+def _linear(velocity: Array) -> Array:
+    """Speeds (...,) m/s of velocities (..., 3), at least a tiny one, by which can be divided."""
+    return np.asarray(np.maximum(np.hypot(velocity[..., 0], velocity[..., 1]), 1e-12))
 
 
 def is_moving(velocity: Array) -> bool:
@@ -138,25 +157,31 @@ def candidate_policies(current: Array, attractor: Array, robot: Robot) -> Array:
     """
     bearing, distance = float(np.arctan2(attractor[1], attractor[0])), float(np.hypot(*attractor))
     speeds = np.unique([*(robot.max_speed * np.array([0.08, 0.2, 0.4, 0.7, 1.0])), braking_speed(distance, robot)])
-    if robot.drive == "holonomic":
-        fan = np.deg2rad([0, 8, 17, 28, 42, 60, 85, 115])
-        directions = bearing + np.concatenate([fan, -fan[1:], [np.pi]])
-        v, d = (each.ravel() for each in np.meshgrid(speeds, directions))
-        actions = np.stack([v * np.cos(d), v * np.sin(d), np.zeros_like(v)], axis=-1)
-    else:
-        turns = robot.max_turn * np.array([0, 0.06, 0.14, 0.25, 0.45, 0.7, 1.0])
-        v, w = (each.ravel() for each in np.meshgrid([0.0, *speeds], np.concatenate([turns, -turns[1:]])))
-        # For each speed also the arc through the attractor.
-        arcs = np.clip(2 * speeds * np.sin(bearing) / max(distance, 0.1), -robot.max_turn, robot.max_turn)
-        v, w = np.concatenate([v, speeds]), np.concatenate([w, arcs])
-        actions = np.stack([v, np.zeros_like(v), w], axis=-1)
-    held = np.pad(np.concatenate([np.zeros((1, 3)), current[None], actions]), ((0, 0), (0, 2)), constant_values=HOLD_S)
+    fan = _holonomic_fan(speeds, bearing) if robot.drive == "holonomic" else _arcs(speeds, bearing, distance, robot)
+    held = np.pad(np.concatenate([np.zeros((1, 3)), current[None], fan]), ((0, 0), (0, 2)), constant_values=HOLD_S)
     late = [(stopping_action(current, attractor, robot, hold), hold) for hold in SHORT_HOLDS_S]
     policies = [[*action, hold, hold] for action, hold in late if action is not None]
     if robot.drive == "differential":
         rates = [(turn_rate(bearing, robot, hold), hold) for hold in SHORT_HOLDS_S]
         policies += [[v, 0.0, rate, HOLD_S, hold] for rate, hold in rates for v in [0.0, *speeds]]
     return np.concatenate([held, np.reshape(policies, (-1, 5))])
+
+
+def _holonomic_fan(speeds: Array, bearing: float) -> Array:
+    """Actions (N, 3) of a holonomic base in directions around ``bearing`` rad, and in the opposite one."""
+    fan = np.deg2rad([0, 8, 17, 28, 42, 60, 85, 115])
+    directions = bearing + np.concatenate([fan, -fan[1:], [np.pi]])
+    v, d = (each.ravel() for each in np.meshgrid(speeds, directions))
+    return np.stack([v * np.cos(d), v * np.sin(d), np.zeros_like(v)], axis=-1)
+
+
+def _arcs(speeds: Array, bearing: float, distance: float, robot: Robot) -> Array:
+    """Actions (N, 3) of a differential base: arcs to both sides, and those to a place in base_link."""
+    turns = robot.max_turn * np.array([0, 0.06, 0.14, 0.25, 0.45, 0.7, 1.0])
+    v, w = (each.ravel() for each in np.meshgrid([0.0, *speeds], np.concatenate([turns, -turns[1:]])))
+    to_place = np.clip(2 * speeds * np.sin(bearing) / max(distance, 0.1), -robot.max_turn, robot.max_turn)
+    v, w = np.concatenate([v, speeds]), np.concatenate([w, to_place])
+    return np.stack([v, np.zeros_like(v), w], axis=-1)
 
 
 def refined_policies(policy: Array, robot: Robot) -> Array:

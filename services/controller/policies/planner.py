@@ -136,7 +136,7 @@ class GeodesicPolicy:
             return
         self._information = ScanInformation.of(self.free, self.robot.radius, scan, 1 / (STEP_S * self.robot.max_speed))
         grid, cost = self._information.grid, self._information.metre_cost / efe.NATS_PER_METRE
-        self.graph.set_metre_cost(grid.interpolate(cost, self.free.grid.centres()))
+        self.graph.set_extra_cost_per_metre(grid.interpolate(cost, self.free.grid.centres()))
 
     def observe(self, scan: Scan, belief: Belief) -> None:
         """Update the scanner's field of view, and while tracking the obstacles and the component of the graph."""

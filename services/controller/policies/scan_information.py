@@ -46,14 +46,10 @@ class ScanInformation:
         A cell stands for the place nearest to its centre where a robot with this ``radius`` m has room. Scans a metre
         apart count as independent, so the ambiguity is that of one scan per metre.
         """
-        size = max(CELL_M, free.grid.resolution * float(np.sqrt(free.grid.cells / MAX_CELLS)))
-        rows, columns = (int(np.ceil(n * free.grid.resolution / size)) for n in free.grid.shape)
-        grid = Grid(free.grid.origin, size, (rows, columns))
+        grid = _coarse_grid(free.grid)
+        places = _places_with_room(free, grid, radius)
         angle = np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS
         ray = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        nearest = distance_transform_edt(free.clearance < radius, return_distances=False, return_indices=True)
-        row, column = nearest.reshape(2, -1)[:, free.grid.cell_of(grid.centres())]
-        places = free.grid.centres(row * free.grid.shape[1] + column)
         start = np.broadcast_to(places[:, None], (grid.cells, DIRECTIONS, 2))
         distance = ray_lengths(free, start, np.broadcast_to(ray, start.shape), scan.range_max)
         hit = np.isfinite(distance)
@@ -73,6 +69,20 @@ class ScanInformation:
     def metre_cost(self) -> Array:
         """Nats (rows, columns) that a metre costs in each cell."""
         return self.ambiguity + self.loss
+
+
+def _coarse_grid(grid: Grid) -> Grid:
+    """A grid over the same area, with cells of `CELL_M`, or larger ones in a large map."""
+    size = max(CELL_M, grid.resolution * float(np.sqrt(grid.cells / MAX_CELLS)))
+    rows, columns = (int(np.ceil(n * grid.resolution / size)) for n in grid.shape)
+    return Grid(grid.origin, size, (rows, columns))
+
+
+def _places_with_room(free: FreeSpace, grid: Grid, radius: float) -> Array:
+    """For each cell of a grid, the place (2,) m nearest to its centre where a robot of ``radius`` m has room."""
+    nearest = distance_transform_edt(free.clearance < radius, return_distances=False, return_indices=True)
+    row, column = nearest.reshape(2, -1)[:, free.grid.cell_of(grid.centres())]
+    return free.grid.centres(row * free.grid.shape[1] + column)
 
 
 def ray_lengths(free: FreeSpace, start: Array, ray: Array, range_max: float) -> Array:

@@ -18,7 +18,7 @@ from services.controller.policies.geodesic_field import (
     WALL_COST_RANGE_M,
     WALL_GAP_M,
     FreeSpaceGraph,
-    slowness,
+    cost_near_walls,
 )
 from tests.common.geometry.maps import rooms
 from tests.controller.driving import box, free_space, path_length, room, shipped
@@ -137,8 +137,8 @@ def test_graph_of_present_obstacles(name):
         relevant = exact < graph.min_clearance + WALL_COST_RANGE_M
         np.testing.assert_allclose(clearance[relevant], exact[relevant], rtol=0, atol=1e-12)
         assert (clearance[~relevant] >= graph.min_clearance + WALL_COST_RANGE_M).all()
-        expected = slowness(exact, graph.min_clearance)
-        np.testing.assert_allclose(graph.slowness.ravel(), expected, rtol=0, atol=1e-12)
+        expected = cost_near_walls(exact, graph.min_clearance)
+        np.testing.assert_allclose(graph.cost_per_metre.ravel(), expected, rtol=0, atol=1e-12)
         assert 1 <= expected.min() <= expected.max() <= 1 + 2 * MAX_WALL_COST
         assert (expected[~relevant] == 1).all()
         place = graph.grid.centres([graph.nearest_free(np.array([(x0 + x1) / 2, (y0 + y1) / 2]))])[0]

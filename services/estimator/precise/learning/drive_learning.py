@@ -18,6 +18,7 @@ from services.estimator.precise.learning.calibration import (
 )
 from services.estimator.precise.learning.field_learning import (
     MAX_ERROR_M,
+    SEED_CLEARANCE_M,
     Recipe,
     learn_field,
     learn_scales,
@@ -28,7 +29,6 @@ from services.estimator.precise.learning.field_learning import (
 from services.estimator.precise.learning.surfaces import Beams, SurfaceCells, field_of_surfaces
 from services.estimator.precise.noise import estimate_noise
 
-SEED_CLEARANCE_M = 0.1  # from surfaces, of a place where a search begins
 HELD_OUT_EVERY = 5  # every fifth scan is held out, to measure the precision
 MIN_SCANS = 50
 Report = Callable[[str, float], None]

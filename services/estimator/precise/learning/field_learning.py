@@ -38,7 +38,7 @@ MAX_ERROR_M = 0.1  # a larger error means that the beam ended at another surface
 MIN_FACING = 0.15  # minimum of |n . u| of a beam that shapes the field
 PRIOR_COUNT, PRIOR_SCALE_M = 20, 0.05  # pseudo-count of each class, and its error, for classes that are seldom seen
 MIN_SCALE_M = 1e-3
-SEED_CLEARANCE_M = 0.1  # of the places where a search begins
+SEED_CLEARANCE_M = 0.1  # from surfaces, of a place where a search begins
 RIPPLE_BEAMS = 10  # apart are the normals that are compared, to either side
 
 
