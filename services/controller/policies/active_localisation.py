@@ -1,9 +1,9 @@
 """Chooses where to drive while the pose is ambiguous or unknown.
 
 Policies are drives to a place, and their expected free energy is that of `expected_free_energy`: the way to the place
-and from there to the goal, minus what a scan from there is expected to tell. With several possible places, that is how
-well predicted scans tell them apart; with an unknown pose, any scan is taken to tell it. In both cases a scan from near
-a place where the robot has been since tells less, because scans from one place are not independent.
+and from there to the goal, minus the expected information of a scan from there. With several possible poses, that is
+how well predicted scans distinguish them; with an unknown pose, any scan is assumed to give the pose. In both cases a
+scan near a place where the robot has already been gives less, because scans from one place are not independent.
 """
 
 from __future__ import annotations
@@ -221,7 +221,7 @@ class ActiveLocaliser:
         return self._approach(attractor, surroundings, velocity, Decision(reason=reason, path=path, terms=terms))
 
     def _drive_to_open_space(self, belief: Belief, scan: Scan, surroundings: Surroundings, velocity: Array) -> Decision:
-        """Drive straight to where a scan is expected to tell most, by the room that the present scan shows."""
+        """Drive straight to free space in the present scan from where the next one has most expected information."""
         bearing, room = _open_ranges(scan)
         length = np.minimum(room - self.min_point_distance, MAX_USEFUL_ROOM_M)
         reason = f"the belief is {belief.state}: going where there is room, to see more"

@@ -5,13 +5,13 @@ unknown space, and back to where exploration began. Its expected free energy in 
 
     G(tour) = NATS_PER_METRE * length - information about the map
 
-A frontier cell is free or occupied, which a scan tells: ln 2, times `MISS_PROBABILITY` for each earlier scan that
-should have told it and did not. At `MIN_VIEWPOINT_NATS` a viewpoint is worth a way of 150 m, so the tour has all that
-are worth a stop, by the shortest way (as Kulich, Faigl & Preucil 2011 choose goals). The robot drives only to its first
-viewpoint, as the next map has another frontier.
+A scan shows whether a frontier cell is free or occupied, which is worth ln 2, times `MISS_PROBABILITY` for each earlier
+scan that should have shown it and did not. At `MIN_VIEWPOINT_NATS` a viewpoint is worth a way of 150 m, so the tour has
+all that are worth a stop, by the shortest way (as Kulich, Faigl & Preucil 2011 choose goals). The robot drives only to
+its first viewpoint, as the next map has another frontier.
 
 Approximations: the viewpoints are chosen greedily by their information; what lies beyond the frontier is not predicted;
-and a scan tells nothing about cells so far away that its beams are farther apart than the cells of the map.
+and a scan shows nothing of cells so far away that its beams are farther apart than the cells of the map.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     Mask = npt.NDArray[np.bool_]
     Cells = npt.NDArray[np.intp]
 
-MISS_PROBABILITY = 0.5  # that a scan does not tell whether a cell that it should see is free
+MISS_PROBABILITY = 0.5  # that a scan does not show a cell that it should see
 MIN_CELL_NATS = 0.1  # frontier cells with less information are given up: scans do not reach them
 MIN_VIEWPOINT_NATS = 3.0  # a viewpoint that sees less than half a metre of the frontier is not worth a stop
 VIEWPOINT_SPACING_M = 0.4
@@ -48,8 +48,8 @@ EXTRA_CLEARANCE_M = 0.05  # around the robot, because walls that are seen later 
 MAX_VIEWPOINTS = 12  # of a tour: those with most information
 MIN_SHORTENING_M = 0.5  # by which a tour must be shorter to replace the present target, so that the robot goes on
 UNREACHABLE_RANGE_M = 0.4  # no viewpoint is this close to a place that could not be reached
-ARRIVAL_SCANS = 4  # an arrival at a viewpoint counts as this many scans, because more would tell nothing new
-ARRIVAL_RANGE_M = 0.2  # a viewpoint this close to an arrival tells nothing about what was in sight there
+ARRIVAL_SCANS = 4  # an arrival at a viewpoint counts as this many scans, because more would show nothing new
+ARRIVAL_RANGE_M = 0.2  # a viewpoint this close to an arrival shows nothing new of what was in sight there
 MAX_MOVED_VIEWPOINTS = 3  # length of the parts of a tour that are tried at other places in it
 
 
@@ -83,7 +83,7 @@ class Survey:
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """A place from which a scan tells something about the map."""
+    """A place from which a scan shows something new."""
 
     pose: Array  # (3,) in map, facing the frontier
     nats: float  # expected information of a scan from there
@@ -103,7 +103,7 @@ class Candidates:
     """Places that may become viewpoints."""
 
     places: Array  # (P, 2) m in map
-    sees: Mask  # (P, F) whether a scan from a place would tell something new about a frontier cell
+    sees: Mask  # (P, F) whether a scan from a place would show a frontier cell
     target: int | None  # index of the present target; None if there is none, or it cannot be reached
 
 
@@ -126,7 +126,7 @@ def choose_viewpoint(survey: Survey) -> Viewpoint | None:
 
 
 def find_frontier(survey: Survey) -> Frontier:
-    """The unknown cells beside known free ones about which scans still tell something."""
+    """The unknown cells beside known free ones that are not given up."""
     free = survey.graph.free
     beside = np.zeros_like(free.unknown)
     passable = ~_opaque(free)

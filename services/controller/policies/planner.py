@@ -53,7 +53,7 @@ class GeodesicPolicy:
         ``keep_heading``: a holonomic base does not turn into its direction of motion. ``epistemic``: policies are also
         judged by the information that they gain; otherwise the robot drives on as if the best hypothesis were true.
         """
-        # Where the map is unknown, so is what a scan tells there.
+        # In a growing map, what scans would tell is unknown where the map is.
         self.epistemic = epistemic and world is not None
         self.robot, self.world, self.keep_heading = robot, world, keep_heading
         self.free = NO_MAP if world is None else FreeSpace.of(world)
@@ -61,7 +61,7 @@ class GeodesicPolicy:
         self.obstacles = TemporaryObstacles(self.free)
         self.localiser = ActiveLocaliser(robot, self.graph, robot.radius + OBSTACLE_GAP_M, may_turn=not keep_heading)
         self.field: CostField | None = None  # to the goal, around obstacles unless `closed`
-        self.closed = False  # obstacles leave no path; the field ignores them
+        self.closed = False  # obstacles leave no path, and the field ignores them
         self.field_changed = False  # set with each new field, and cleared by the caller that publishes it
         self._goal: Array | None = None
         self._component: int | None = None  # of the graph, where the robot was when last tracked
@@ -131,7 +131,7 @@ class GeodesicPolicy:
         """Do nothing: `interrupt` discarded nothing that has to be restored."""
 
     def prepare(self, scan: Scan) -> None:
-        """Compute from the first scan where the scanner can tell the robot's pose; metres elsewhere cost more."""
+        """Compute from the first scan how much information a scan gives in each place; metres with little cost more."""
         if not self.epistemic or self._information is not None:
             return
         self._information = ScanInformation.of(self.free, self.robot.radius, scan, 1 / (STEP_S * self.robot.max_speed))
@@ -155,10 +155,8 @@ class GeodesicPolicy:
         # The pose at which the command takes effect; until then the latest command applies.
         ahead = velocity * delay_until_effect(self.robot, self._scan)
         pose, stamp_ns = se2.compose(belief.pose.array(), ahead), belief.stamp_ns
-        if self._goal is not None and self._component != self._vetted_component:
-            if (refusal := self.refusal(self._goal)) is not None:
-                return Decision(reason=refusal, state="blocked", refused=True)
-            self._vetted_component = self._component
+        if (refusal := self._refusal_from_here()) is not None:
+            return Decision(reason=refusal, state="blocked", refused=True)
         points, moving = self.obstacles.points(), self.obstacles.moving(stamp_ns)
         self._plan(pose[:2], points[~moving], stamp_ns)  # without moving obstacles, which will have left
         path = self.field.path(pose[:2]) if self.field is not None else np.zeros((0, 2))
@@ -178,17 +176,20 @@ class GeodesicPolicy:
         )
         # Judged by the command that was sent, not by the action: the limits may have stopped the robot.
         self._watch_progress(stamp_ns, moving=is_moving(velocity))
-        reason = ""
-        if selected.hindered:
-            reason = self._hindrance(pose, surroundings, standing=not selected.action.any())
-        if self.closed:
-            reason = self._no_path(pose, surroundings)
-        if self.robot.drive == "differential" and not bool(surroundings.sees(0.0)):
-            reason = BLIND_AHEAD
-        blocked = bool(reason) and not selected.action.any()
+        standing = not selected.action.any()
+        reason = self._reason(pose, surroundings, hindered=selected.hindered, standing=standing)
+        state: State = "blocked" if reason and standing else "navigating"
         motion = se2.transform(pose, selected.motion[:, :2])
-        state: State = "blocked" if blocked else "navigating"
         return Decision(action, reason, state, path, motion, terms=selected.terms)
+
+    def _refusal_from_here(self) -> str | None:
+        """The reason why the goal cannot be reached from where the robot is; checked again when that changes."""
+        if self._goal is None or self._component == self._vetted_component:
+            return None
+        refusal = self.refusal(self._goal)
+        if refusal is None:
+            self._vetted_component = self._component
+        return refusal
 
     def prediction_request(self, belief: Belief) -> CandidateMotions | None:
         """Motions for which scans must be predicted before `decide_unlocalised`; None if none are needed."""
@@ -324,6 +325,14 @@ class GeodesicPolicy:
         )
         motion = se2.transform(pose, selected.motion[:, :2])
         return Decision(action, "stuck: backing off", path=path, motion=motion, recovering=True)
+
+    def _reason(self, pose: Array, surroundings: Surroundings, *, hindered: bool, standing: bool) -> str:
+        """Status text: why the robot does not drive freely, or nothing."""
+        if self.robot.drive == "differential" and not bool(surroundings.sees(0.0)):
+            return BLIND_AHEAD
+        if self.closed:
+            return self._no_path(pose, surroundings)
+        return self._hindrance(pose, surroundings, standing=standing) if hindered else ""
 
     def _hindrance(self, pose: Array, surroundings: Surroundings, *, standing: bool) -> str:
         """Status text: what hinders the robot, and where."""

@@ -103,7 +103,7 @@ def least_distance(positions: Array, points: Array) -> Array:
 
 @dataclass(frozen=True)
 class PoseBelief:
-    """The belief about the pose, and what scans are expected to tell. By default the pose is known."""
+    """The belief about the pose, and the expected information of scans. By default the pose is known."""
 
     pose: Array = field(default_factory=lambda: np.zeros(3))  # (3,) base_link in map
     covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))  # (3, 3) in map

@@ -1,8 +1,8 @@
-"""What a scan is expected to tell about the pose, over the whole map.
+"""The expected information of a scan about the pose, over the whole map.
 
 A beam along u that hits a surface with normal n measures n·x, because its range changes by -n/(n·u) per metre of x. Its
 precision along n is 1 / ((sigma n·u)² + MAP_ERROR_M²): an error of the map displaces the surface along its normal. The
-information of a scan is the sum over its beams (Censi 2007). Beams without a return are taken to tell nothing.
+information of a scan is the sum over its beams (Censi 2007). Beams without a return count as without information.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ MAX_RAY_STEPS = 60
 
 @dataclass(frozen=True)
 class ScanInformation:
-    """What one scan is expected to tell in each cell of a coarse grid, on average over the headings."""
+    """Expected information of one scan in each cell of a coarse grid, on average over the headings."""
 
     grid: Grid
     matrix: Array  # (cells, 3, 3) information about x, y, yaw in map: 1/m², 1/m, 1/rad²

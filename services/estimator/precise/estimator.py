@@ -507,7 +507,7 @@ def _log_anywhere(view: View, skip: npt.NDArray[np.bool_]) -> float:
 
 
 def _log_at_poses(view: View, poses: Array, skip: npt.NDArray[np.bool_]) -> Array:
-    """At ``poses`` (N, 3) in the map; (N,). The scan may also be clutter, which says nothing about the pose."""
+    """At ``poses`` (N, 3) in the map; (N,). The scan may also be clutter, equally likely at all poses."""
     mapped = view.surface_evidence(poses, skip=skip).log_likelihood - _log_ideal(view, skip)
     return np.asarray(np.logaddexp(mapped + np.log1p(-CLUTTER), _log_anywhere(view, skip) + np.log(CLUTTER)))
 

@@ -71,7 +71,7 @@ class BackEnd:
         return True
 
     def _move_later_part(self, link: Link, component: npt.NDArray[np.int_]) -> None:
-        """Moves the later one of two components to where a link between them says that it is."""
+        """Moves the later one of two components so that a link between them fits."""
         first, second = (component == component[k] for k in (link.first, link.second))
         if np.argmax(first) < np.argmax(second):
             place = se2.compose(self.poses[link.first], link.pose)

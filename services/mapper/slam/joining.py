@@ -1,6 +1,6 @@
 """Finds where a piece of the drive lies in the map, after the robot was carried off: nothing is known of its place.
 
-Segments of the piece are searched for in the whole map. Places that look alike are told apart by the rest of the piece:
+Segments of the piece are searched for in the whole map. The rest of the piece distinguishes places that look alike:
 it is joined only if two of its segments agree on its place, no segment contradicts it, and no other place is as good.
 If a later segment contradicts it, the piece is separated again.
 """
