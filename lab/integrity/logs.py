@@ -13,7 +13,7 @@ from lab.integrity.maps import grid_of
 from lab.real_logs.drive import START_COVARIANCE, drive_at
 from presage.learning.train_drive import TrainDriveOptions, card_of, scanner_of, split
 from services.estimator.precise.learning import weights
-from services.estimator.precise.learning.calibration import Drive
+from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.precise.learning.drive_learning import learn_drive
 from services.estimator.precise.learning.field_learning import Recipe
 from services.estimator.shared.interface import Observation
@@ -40,7 +40,7 @@ class LogCase:
         """Name of the case."""
         return f"{self.drive_name}-{'odometry' if self.odometry else 'laser'}"
 
-    def halves(self) -> tuple[Drive, Drive]:
+    def halves(self) -> tuple[ReferenceDrive, ReferenceDrive]:
         """The half from which the map is made, and the half that is localised."""
         size = len(split(drive_at(self.log, self.mount, False))[1 if self.exchanged else 0].ranges)
         drive = drive_at(self.log, self.mount, self.exchanged)

@@ -7,7 +7,7 @@ import numpy as np
 from common.geometry.shapes import Circle, Obstacle
 from common.geometry.world import World
 from lab.accuracy.scenes import Scene
-from services.estimator.precise.learning.calibration import Drive
+from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.mapper.slam.drive import Laser
 from services.mapper.slam.grid import grid_of_scans
 
@@ -37,11 +37,11 @@ def noisy_grid(scene: Scene) -> World:
     poses, scanner = scene.poses(SCANS), scene.scanner
     ranges = np.array([scene.observe(clean, 0.0).ranges for clean in scene.clean(poses)])
     stamps, mount = np.arange(len(poses)) / scanner.rate, np.array(scanner.mount)
-    drive = Drive(stamps, poses, ranges, scanner.angles(), mount, scanner.range_max)
+    drive = ReferenceDrive(stamps, poses, ranges, scanner.angles(), mount, scanner.range_max)
     return grid_of(f"{scene.world.name}-grid", drive)
 
 
-def grid_of(name: str, drive: Drive) -> World:
+def grid_of(name: str, drive: ReferenceDrive) -> World:
     """The world that an occupancy grid of 5 cm cells shows, built from scans with known poses."""
     laser = Laser(drive.angles, drive.mount, drive.range_max)
     grid = grid_of_scans(drive.poses, drive.ranges, laser, CELL_M)

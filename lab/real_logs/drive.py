@@ -19,7 +19,7 @@ from services.estimator.factory import EstimatorOptions, Factory, Geometry, prep
 from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.particle_filter.sensor import Sensor
 from services.estimator.particle_filter.settings import Settings as ParticleSettings
-from services.estimator.precise.learning.calibration import Drive
+from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.shared.interface import Estimator, Observation
 
 MAX_SEARCH_SCANS = 40
@@ -49,7 +49,7 @@ class StretchJob:
     exchanged: bool = False  # whether the second half of the drive is the training half
 
     @property
-    def drive(self) -> Drive:
+    def drive(self) -> ReferenceDrive:
         """The whole drive, with the training half first."""
         return drive_at(self.log, self.mount, self.exchanged)
 
@@ -61,7 +61,7 @@ class StretchJob:
 
 
 @functools.lru_cache(maxsize=2)
-def drive_at(log: str, mount: tuple[float, float, float] | None, exchanged: bool = False) -> Drive:
+def drive_at(log: str, mount: tuple[float, float, float] | None, exchanged: bool = False) -> ReferenceDrive:
     """The scans of a log that have reference poses; cached per process. ``exchanged`` puts the second half first."""
     from presage.logs.log import Reading
 
@@ -71,7 +71,7 @@ def drive_at(log: str, mount: tuple[float, float, float] | None, exchanged: bool
     return drive_of(read_scans(path, reading=Reading(mount=None if mount is None else np.array(mount))), path)
 
 
-def exchange_halves(drive: Drive) -> Drive:
+def exchange_halves(drive: ReferenceDrive) -> ReferenceDrive:
     """The drive with its halves exchanged; the first half follows the second after a usual scan interval."""
     early, late = split(drive)
     offset = late.stamps[-1] + float(np.median(np.diff(drive.stamps))) - early.stamps[0]

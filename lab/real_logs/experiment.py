@@ -39,7 +39,7 @@ from lab.real_logs.filter_tuning import Settings, TunedSettings, starting_point,
 from presage.learning.train_drive import TrainDriveOptions as Training
 from presage.learning.train_drive import card_of
 from services.estimator.precise.learning import weights
-from services.estimator.precise.learning.calibration import Drive
+from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.precise.learning.drive_learning import learn_drive
 from services.estimator.precise.learning.field_learning import Recipe
 
@@ -131,7 +131,7 @@ def run(job: RealLogJob, out: Path, workers: int, console: Console) -> results.R
     return result
 
 
-def _check_map(world: World, learned: Drive, name: str) -> None:
+def _check_map(world: World, learned: ReferenceDrive, name: str) -> None:
     """Raises UserError if most of the training half's poses are not in the map's free space."""
     free = float((world.clearance(learned.poses[:, :2]) > 0).mean())
     if free < MIN_FREE_SHARE:

@@ -18,10 +18,10 @@ from common.geometry.world import World
 from presage.learning.train_drive import simulated_beams
 from services.estimator.factory import EstimatorOptions, Geometry, prepare
 from services.estimator.precise.field import FieldModel
-from services.estimator.precise.learning.calibration import Drive
+from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.precise.learning.field_learning import Recipe, learn_field
 from services.estimator.shared.interface import Observation
-from services.mapper.slam.pose_graph import Link, optimise
+from services.mapper.slam.pose_graph import PoseLink, optimise
 
 SIMULATED_SCANS = 2000  # in the map
 SAME_M = 0.3  # poses found in the map that differ by less agree
@@ -39,7 +39,7 @@ class Placement:
     deviation: float  # m, median distance between the poses found and those of the placed drive
 
 
-def place(world: World, keys: Drive, model: Path | None = None) -> Placement:
+def place(world: World, keys: ReferenceDrive, model: Path | None = None) -> Placement:
     """Where key scans, with poses in the frame of their drive, are in the map ``world``.
 
     The drive is moved as a whole. If the map has a ``model``, it is exact to some millimetres, and the drive is bent to
@@ -67,13 +67,13 @@ def _bent(placed: Array, found: Array, covariances: Array) -> Array:
     """Poses (N, 3) of key scans by their relative poses and by those ``found`` in the map, some of which are wrong."""
     drift = np.diag(1 / DRIFT**2)
     steps = se2.between(placed[:-1], placed[1:])
-    links = [Link(k + 1, k + 2, step, drift) for k, step in enumerate(steps)]
+    links = [PoseLink(k + 1, k + 2, step, drift) for k, step in enumerate(steps)]
     for k, (pose, covariance) in enumerate(zip(found, covariances, strict=True)):
-        links.append(Link(0, k + 1, pose, np.linalg.inv(covariance + np.diag(MODEL**2)), robust=True))
+        links.append(PoseLink(0, k + 1, pose, np.linalg.inv(covariance + np.diag(MODEL**2)), robust=True))
     return optimise(np.concatenate([np.zeros((1, 3)), placed]), links)[1:]
 
 
-def _localise(world: World, keys: Drive, model: Path | None) -> tuple[Array, Array]:
+def _localise(world: World, keys: ReferenceDrive, model: Path | None) -> tuple[Array, Array]:
     """Poses (N, 3) of key scans in the map with covariances; some are wrong, at first and where much has changed."""
     if model is not None:
         options = EstimatorOptions(world, model=str(model))

@@ -26,7 +26,7 @@ from presage.learning.drive_figure import draw_learned
 from presage.logs.log import Reading
 from presage.logs.scan_files import Scans, read_scans
 from services.estimator.precise.learning import weights
-from services.estimator.precise.learning.calibration import Drive
+from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.precise.learning.drive_learning import MIN_SCANS, Learned, learn_drive
 from services.estimator.precise.learning.field_learning import Recipe
 from services.estimator.precise.learning.surfaces import Beams
@@ -61,7 +61,7 @@ def train_from_drive(options: TrainDriveOptions, console: Console) -> Path:
     return train_on_drive(options, split(drive, options.share)[0], console)
 
 
-def train_on_drive(options: TrainDriveOptions, drive: Drive, console: Console) -> Path:
+def train_on_drive(options: TrainDriveOptions, drive: ReferenceDrive, console: Console) -> Path:
     """Trains a model on posed scans that were read from ``options.log``, as `train_from_drive` does."""
     if len(drive.ranges) < MIN_SCANS:
         raise UserError(
@@ -93,7 +93,7 @@ def train_on_drive(options: TrainDriveOptions, drive: Drive, console: Console) -
     return path
 
 
-def drive_of(scans: Scans, log: Path) -> Drive:
+def drive_of(scans: Scans, log: Path) -> ReferenceDrive:
     """The scans with a reference pose, corrected for motion; raises UserError if there are none, or no stamps."""
     if scans.truth is None or not np.isfinite(scans.truth).all(axis=1).any():
         raise UserError(
@@ -107,7 +107,7 @@ def drive_of(scans: Scans, log: Path) -> Drive:
     if not is_surface(scans.ranges[use]).any():
         raise UserError(f"{log}: no beam of the scans with a reference pose hit a surface")
     odom = None if scans.odom is None or not np.isfinite(scans.odom[use]).all() else scans.odom
-    whole = Drive(
+    whole = ReferenceDrive(
         scans.stamps,
         scans.truth,
         scans.ranges,
@@ -120,7 +120,7 @@ def drive_of(scans: Scans, log: Path) -> Drive:
     return replace(drive, ranges=_corrected_ranges(drive, scans.time_increment)) if scans.time_increment else drive
 
 
-def _corrected_ranges(drive: Drive, time_increment: float) -> Array:
+def _corrected_ranges(drive: ReferenceDrive, time_increment: float) -> Array:
     """Ranges (N, B) m as if all beams of a scan had been measured at its stamp."""
     sweep, times = Sweep.of_angles(drive.angles), beam_times(len(drive.angles), time_increment)[:, None]
     motion, period = se2.between(drive.poses[:-1], drive.poses[1:]), np.diff(drive.stamps)
@@ -134,7 +134,7 @@ def _corrected_ranges(drive: Drive, time_increment: float) -> Array:
     return np.array([evenly_spaced(*each, sweep, -np.inf) for each in corrected])
 
 
-def split(drive: Drive, share: float = 0.5) -> tuple[Drive, Drive]:
+def split(drive: ReferenceDrive, share: float = 0.5) -> tuple[ReferenceDrive, ReferenceDrive]:
     """The first ``share`` of the scans, rounded down, and the rest.
 
     All commands that train on one part of a drive and test on the other use this function, so that their parts agree.
@@ -144,7 +144,7 @@ def split(drive: Drive, share: float = 0.5) -> tuple[Drive, Drive]:
     return drive.part(numbers[first]), drive.part(numbers[~first])
 
 
-def rectangle(drive: Drive, log: Path) -> World:
+def rectangle(drive: ReferenceDrive, log: Path) -> World:
     """A rectangular world around the ends of the beams, named after the log, for a drive without a map."""
     ends = Beams.of(drive.poses, drive.mount, drive.angles, drive.ranges).ends()
     (x0, y0), (x1, y1) = np.quantile(ends, (0.001, 0.999), axis=0) + MARGIN_M * np.array([[-1], [1]])
@@ -153,7 +153,7 @@ def rectangle(drive: Drive, log: Path) -> World:
     return World(name=name, boundary=[(round(float(x), 3), round(float(y), 3)) for x, y in corners])
 
 
-def simulated_beams(world: World, drive: Drive, samples: int, seed: int) -> Beams:
+def simulated_beams(world: World, drive: ReferenceDrive, samples: int, seed: int) -> Beams:
     """Simulated scans of the drive's scanner at random free poses in a map, without noise."""
     rng = np.random.default_rng(seed)
     poses = world.sample_poses(samples, rng, Robot().radius)
@@ -161,7 +161,7 @@ def simulated_beams(world: World, drive: Drive, samples: int, seed: int) -> Beam
     return Beams.of(poses, drive.mount, drive.angles, np.where(ranges > drive.range_max, np.inf, ranges))
 
 
-def replayed_beams(former: Path, drive: Drive, samples: int, seed: int) -> Beams:
+def replayed_beams(former: Path, drive: ReferenceDrive, samples: int, seed: int) -> Beams:
     """Scans of the drive's scanner as a former model predicts them, at random places that it knows."""
     rng = np.random.default_rng(seed)
     model, seeds, _ = weights.load(former)
@@ -171,7 +171,7 @@ def replayed_beams(former: Path, drive: Drive, samples: int, seed: int) -> Beams
     return Beams.of(lasers, np.zeros(3), drive.angles, np.where(known, expected.ranges, -np.inf))
 
 
-def scanner_of(drive: Drive, sigma: float, name: str) -> Scanner:
+def scanner_of(drive: ReferenceDrive, sigma: float, name: str) -> Scanner:
     """The scanner of a drive, for the model card; ``sigma`` is its range noise in m."""
     angles = drive.angles
     fov = float(abs(angles[-1] - angles[0]))
@@ -191,7 +191,7 @@ def scanner_of(drive: Drive, sigma: float, name: str) -> Scanner:
 
 
 def card_of(
-    options: TrainDriveOptions, world: World, drive: Drive, learned: Learned, seconds: float
+    options: TrainDriveOptions, world: World, drive: ReferenceDrive, learned: Learned, seconds: float
 ) -> weights.FieldCard:
     """The model card: the origin of the model and the results of its calibration."""
     calibration, errors = learned.calibration, learned.errors

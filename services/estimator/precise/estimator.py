@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -60,6 +60,16 @@ MAX_SEARCH_INTERVAL = 150  # scans between two searches without success; the int
 CLUTTER = 0.3  # probability that all that is new in a scan is clutter
 UNKNOWN_SIGMA_M = 100.0  # published where the model does not know what to expect
 TARGET_BEAMS = 2000  # a scan with at least twice as many is thinned, because the time of a search grows with the beams
+
+
+@dataclass(frozen=True)
+class ScanMatch:
+    """Where a scan fits the map, near the poses to which the hypotheses have moved."""
+
+    motions: list[list[Candidate]]  # since the last scan, of each hypothesis; the last one is the widest
+    poses: Array  # (N, 3), one per hypothesis
+    evidence: Evidence  # at these poses
+    local_pose: Array | None = None  # (3,) in the local frame, if recent scans gave the motion
 
 
 class PreciseEstimator:
@@ -198,78 +208,63 @@ class PreciseEstimator:
         Returns the scan as corrected for that motion.
         """
         period, odom = self._period(observation.stamp), self._odometry_since_last_scan(observation)
-        predicted = [self._predict(mode, period, odom, observation.command) for mode in self.modes]
-        motions, poses, evidence, local = self._match(view, predicted, period, odom)
+        motions = [self._predict(mode, period, odom, observation.command) for mode in self.modes]
+        match = self._match(view, motions, period, with_odometry=odom is not None)
         if observation.time_increment:
             # Once more, corrected for the motion that the match has shown.
-            velocity = limit_velocity(self.settings.motion, -se2.between(poses[0], self.modes[0].pose) / period)
+            velocity = limit_velocity(self.settings.motion, -se2.between(match.poses[0], self.modes[0].pose) / period)
             view = self._correct_motion(view, observation, velocity)
-            poses, evidence = view.descend(poses, _prior_of([each[-1] for each in motions]))
-        modes = [
-            self._fuse(view, k, motions[k], predicted[k][-1], poses[k], evidence, observation)
-            for k in range(len(poses))
-        ]
-        self._weigh_scan(view, modes, local, period)
+            poses, evidence = view.descend(match.poses, _prior_of([each[-1] for each in match.motions]))
+            match = replace(match, poses=poses, evidence=evidence)
+        modes = [self._fuse(view, k, match, motions[k][-1], observation) for k in range(len(match.poses))]
+        self._weigh_scan(view, modes, match.local_pose, period)
         return view
 
-    def _match(
-        self, view: View, motions: list[list[Candidate]], period: float, odom: Array | None
-    ) -> tuple[list[list[Candidate]], Array, Evidence, Array | None]:
+    def _match(self, view: View, motions: list[list[Candidate]], period: float, *, with_odometry: bool) -> ScanMatch:
         """Matches the scan to the map near the predicted pose of each hypothesis.
 
-        Where the map explains too little, recent scans give the motion. Returns the motions, one pose (N, 3) per
-        hypothesis, the evidence there, and the pose (3,) in the local frame if recent scans gave it.
+        If the map explains much less than before, over a wider area. If it explains too little, recent scans give the
+        motion.
         """
         widest = _prior_of([each[-1] for each in motions])
         poses, evidence = view.descend(np.array([each[-2].mean for each in motions]), widest)
         explained = view.surface_evidence(poses).explained[0]
         if explained < self._explained - self.settings.drop:
             extra_starts = np.zeros((0, 3))
-            if odom is None:
+            if not with_odometry:
                 extra_starts = reachable_poses(self.settings.motion, self.modes[0].pose, period, COARSE_SIGMA_M)
             wider_poses, wider_evidence = search_around(view, poses, widest, extra_starts)
             before, after = view.surface_evidence(np.stack([poses[0], wider_poses[0]])).log_likelihood
             if after > before:
                 poses, evidence = wider_poses, wider_evidence
                 explained = view.surface_evidence(poses).explained[0]
-        if explained >= self.settings.matching_share:
-            return motions, poses, evidence, None
-        starts = np.array([*(each.mean for each in motions[0]), poses[0]])
-        match = self._local_map.match(starts, view.points, motions[0][-1])
-        if match is None:
-            return motions, poses, evidence, None
-        matched = self._local_map.candidate(match)
-        # All hypotheses share the relative motion.
-        step = se2.between(self.modes[0].pose, matched.mean)
-        motions = [[replace(matched, mean=se2.compose(mode.pose, step))] for mode in self.modes]
-        poses, evidence = view.descend(np.array([each[0].mean for each in motions]), _prior_of([m[0] for m in motions]))
-        return motions, poses, evidence, match.pose
+        match = ScanMatch(motions, poses, evidence)
+        return match if explained >= self.settings.matching_share else self._match_recent_scans(view, match)
 
-    def _fuse(
-        self,
-        view: View,
-        k: int,
-        candidates: list[Candidate],
-        widest: Candidate,
-        pose: Array,
-        evidence: Evidence,
-        observation: Observation,
-    ) -> Mode:
-        """Fuses the k-th hypothesis with its evidence, which was found at ``pose`` (3,).
+    def _match_recent_scans(self, view: View, match: ScanMatch) -> ScanMatch:
+        """Matches the scan again, with the motion that recent scans give, if they give one."""
+        candidates = match.motions[0]
+        starts = np.array([*(each.mean for each in candidates), match.poses[0]])
+        found = self._local_map.match(starts, view.points, candidates[-1])
+        if found is None:
+            return match
+        moved = self._local_map.candidate(found)
+        # All hypotheses share the relative motion.
+        step = se2.between(self.modes[0].pose, moved.mean)
+        motions = [replace(moved, mean=se2.compose(mode.pose, step)) for mode in self.modes]
+        poses, evidence = view.descend(np.array([each.mean for each in motions]), _prior_of(motions))
+        return ScanMatch([[each] for each in motions], poses, evidence, found.pose)
+
+    def _fuse(self, view: View, k: int, match: ScanMatch, widest: Candidate, observation: Observation) -> Mode:
+        """Fuses the k-th hypothesis with the scan.
 
         A motion of which the robot is hardly capable, within the ``widest`` candidate, is evidence against the
         hypothesis: the robot may have been carried off instead. If the stamp is earlier than that of the last scan,
         as when a replay starts again, the duration of the motion is unknown, and no motion is such evidence.
         """
         mode, period = self.modes[k], self._period(observation.stamp)
-        unobserved = unobserved_direction(evidence.curvature[k], self.model.ripple)
-        min_beams = self.settings.min_constraining_ratio * len(view.angles)
-        if mode.unobserved_scans:
-            # The pose may be metres off, so a ripple or a beam that happens to fit must not pass for a feature.
-            min_beams *= 3
-            unobserved = weakest_direction(evidence.curvature[k])[0]
-        if unobserved is not None and constraining_beams(view, pose, unobserved) > min_beams:
-            unobserved = None
+        candidates, pose, evidence = match.motions[k], match.poses[k], match.evidence
+        unobserved = self._unobserved_direction(view, mode, pose, evidence.curvature[k])
         project_evidence(evidence, k, unobserved)
         is_unobserved = unobserved is not None and len(candidates) > 1
         if unobserved is not None and is_unobserved and self._odometry_since_last_scan(observation) is None:
@@ -286,6 +281,17 @@ class PreciseEstimator:
         if self._went_back(observation.stamp):
             return updated
         return replace(updated, log_evidence=mode.log_evidence - widest.excess(best.mean))
+
+    def _unobserved_direction(self, view: View, mode: Mode, pose: Array, curvature: Array) -> Array | None:
+        """The direction (2,) that a scan with ``curvature`` (3, 3) at ``pose`` (3,) does not observe, if any."""
+        min_beams = self.settings.min_constraining_ratio * len(view.angles)
+        if mode.unobserved_scans:
+            # The pose may be metres off, so a ripple or a beam that happens to fit must not pass for a feature.
+            direction: Array | None = weakest_direction(curvature)[0]
+            min_beams *= 3
+        else:
+            direction = unobserved_direction(curvature, self.model.ripple)
+        return None if direction is None or constraining_beams(view, pose, direction) > min_beams else direction
 
     def _weigh_scan(self, view: View, modes: list[Mode], local: Array | None, period: float) -> None:
         """Weighs hypotheses by how well the map predicts those surfaces of the scan that are new to the robot.

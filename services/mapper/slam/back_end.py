@@ -12,7 +12,7 @@ from services.mapper.slam.drive import Laser
 from services.mapper.slam.front_end import KeyScans
 from services.mapper.slam.joining import Joining, is_contradicted, largest
 from services.mapper.slam.loop_closure import MAX_SQUARED_DEVIATION, Closure, find_closures
-from services.mapper.slam.pose_graph import Link, LinkTable, Uncertainty, components, optimise
+from services.mapper.slam.pose_graph import LinkTable, PoseLink, Uncertainty, components, optimise
 from services.mapper.slam.segments import Segment, segments_of
 
 
@@ -70,7 +70,7 @@ class BackEnd:
         self._add(found, scans)
         return True
 
-    def _move_later_part(self, link: Link, component: npt.NDArray[np.int_]) -> None:
+    def _move_later_part(self, link: PoseLink, component: npt.NDArray[np.int_]) -> None:
         """Moves the later one of two components so that a link between them fits."""
         first, second = (component == component[k] for k in (link.first, link.second))
         if np.argmax(first) < np.argmax(second):
@@ -108,7 +108,7 @@ class BackEnd:
         laser, ranges = self.laser, np.array(scans.ranges)
         return segments_of(self.poses, scans.pieces, scans.elements, ranges, laser.angles, laser.mount, growing=growing)
 
-    def _links(self, scans: KeyScans) -> list[Link]:
+    def _links(self, scans: KeyScans) -> list[PoseLink]:
         return [*scans.links, *(each.link for each in self.closures)]
 
     def _components(self, scans: KeyScans) -> npt.NDArray[np.int_]:

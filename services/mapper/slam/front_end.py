@@ -19,7 +19,7 @@ from common.robot.motion_distortion import beam_times, correct_beams, evenly_spa
 from common.robot.scan_geometry import Sweep
 from services.mapper.slam.drive import Laser, RawDrive
 from services.mapper.slam.elements import Elements, concatenate, elements_of_scan
-from services.mapper.slam.pose_graph import Link
+from services.mapper.slam.pose_graph import PoseLink
 from services.mapper.slam.registration import (
     MIN_PARTNERS,
     PRIOR_SCALE,
@@ -64,7 +64,7 @@ class KeyScans:
     poses: Array  # (K, 3)
     elements: list[Elements]
     ranges: list[Array]  # (B,) m
-    links: list[Link]  # between successive ones of one piece, by their numbers
+    links: list[PoseLink]  # between successive ones of one piece, by their numbers
     pieces: npt.NDArray[np.int_]  # (K,) piece of the drive to which each belongs
 
 
@@ -113,7 +113,7 @@ class FrontEnd:
         self._key_pieces: list[int] = []
         self._elements: list[Elements] = []
         self._ranges: list[Array] = []
-        self._links: list[Link] = []
+        self._links: list[PoseLink] = []
         # The local map: its surfaces, and the same with what its scans saw through.
         self._surface: Surface
         self._local: Segment
@@ -322,10 +322,10 @@ def _learn_scale(scale: Array, deviation: Array, expected: Array, found: Registr
     return np.asarray(scale * np.sqrt(1 + (np.minimum(squared, MAX_LEARNED_SIGMAS**2) - 1) / LEARNING_SCANS))
 
 
-def _link(number: int, first: Array, second: Array, information: Array, motion: Array) -> Link:
+def _link(number: int, first: Array, second: Array, information: Array, motion: Array) -> PoseLink:
     """The link between two successive key scans; ``information`` and ``motion`` are in the frame of the track."""
     turn = se2.rotation(-float(first[2]))
     noise = np.linalg.inv(turn @ information @ turn.T + 1e-6 * np.eye(3))
     by_registration = np.linalg.inv(noise + np.diag(REGISTRATION_DEVIATION**2))
     by_motion = np.linalg.inv(turn @ motion @ turn.T)
-    return Link(number, number + 1, se2.between(first, second), by_registration + by_motion)
+    return PoseLink(number, number + 1, se2.between(first, second), by_registration + by_motion)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from common.geometry import se2
 from common.geometry.se2 import Array
 from services.mapper.slam.loop_closure import MAX_DISTANCE_M, MIN_MATCHED, RIVAL_SHARE, Closure, match_segments
-from services.mapper.slam.pose_graph import Link
+from services.mapper.slam.pose_graph import PoseLink
 from services.mapper.slam.registration import Surface
 from services.mapper.slam.search import search
 from services.mapper.slam.segments import Segment, compare, submap
@@ -139,7 +139,7 @@ def _best_scores(candidates: Sequence[JoinCandidate]) -> dict[int, float]:
     return best
 
 
-def _place_of_piece(link: Link, poses: Array) -> Array:
+def _place_of_piece(link: PoseLink, poses: Array) -> Array:
     """The frame (3,) of the piece in that of the map, according to a link."""
     return np.asarray(se2.compose(se2.compose(poses[link.first], link.pose), se2.inverse(poses[link.second])))
 

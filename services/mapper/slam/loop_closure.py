@@ -13,7 +13,7 @@ import numpy as np
 
 from common.geometry import se2
 from common.geometry.se2 import Array
-from services.mapper.slam.pose_graph import Link, Uncertainty
+from services.mapper.slam.pose_graph import PoseLink, Uncertainty
 from services.mapper.slam.registration import Surface, register
 from services.mapper.slam.search import search
 from services.mapper.slam.segments import Agreement, Segment, compare, submap
@@ -37,7 +37,7 @@ class Closure:
 
     first: int  # segment
     second: int
-    link: Link
+    link: PoseLink
     wide: bool  # found by a wide search
 
 
@@ -104,7 +104,7 @@ class SegmentMatch:
 
     def closure(self, first: int, second: int, references: tuple[int, int], *, wide: bool) -> Closure:
         """The loop closure between two segments with these ``references``."""
-        link = Link(*references, self.pose, np.asarray(np.linalg.inv(self.covariance), float), robust=True)
+        link = PoseLink(*references, self.pose, np.asarray(np.linalg.inv(self.covariance), float), robust=True)
         return Closure(first, second, link, wide)
 
 

@@ -24,7 +24,7 @@ ROBUST_SCALE = 3.0  # standard deviations, of the Cauchy weights of robust links
 
 
 @dataclass(frozen=True)
-class Link:
+class PoseLink:
     """Measured pose (3,) of pose number ``second`` in the frame of ``first``, with its information (3, 3)."""
 
     first: int
@@ -37,7 +37,7 @@ class Link:
 class LinkTable:
     """Links as arrays."""
 
-    def __init__(self, links: Sequence[Link]) -> None:
+    def __init__(self, links: Sequence[PoseLink]) -> None:
         self.first = np.array([link.first for link in links], int)
         self.second = np.array([link.second for link in links], int)
         self.poses = np.array([link.pose for link in links]).reshape(-1, 3)
@@ -77,7 +77,7 @@ class LinkTable:
         return hessian, gradient.ravel()
 
 
-def optimise(poses: Array, links: Sequence[Link]) -> Array:
+def optimise(poses: Array, links: Sequence[PoseLink]) -> Array:
     """The poses (N, 3) that minimise the squared deviations of the links; the first of each component stays."""
     table, poses = LinkTable(links), poses.copy()
     component = components(len(poses), links)
@@ -97,7 +97,7 @@ class Uncertainty:
     The Hessian is factorised once; the inverse is computed column by column, where it is needed.
     """
 
-    def __init__(self, poses: Array, links: Sequence[Link], chosen: npt.NDArray[np.integer]) -> None:
+    def __init__(self, poses: Array, links: Sequence[PoseLink], chosen: npt.NDArray[np.integer]) -> None:
         component = components(len(poses), links)
         self._factor = anchored(LinkTable(links).normal_equations(poses)[0], component)
         self._poses, self._chosen, self._component = poses, np.asarray(chosen), component[chosen]
@@ -122,7 +122,7 @@ class Uncertainty:
         return self._columns[number]
 
 
-def components(count: int, links: Sequence[Link]) -> npt.NDArray[np.int_]:
+def components(count: int, links: Sequence[PoseLink]) -> npt.NDArray[np.int_]:
     """Labels (N,) of poses; those that links connect have the same one."""
     pairs = np.array([(link.first, link.second) for link in links], int).reshape(-1, 2)
     graph = sparse.coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(count, count))

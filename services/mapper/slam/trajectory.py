@@ -19,7 +19,7 @@ WINDOWS_M = (1.0, 1.0, 3.0, 3.0, 10.0, 10.0, 30.0, 30.0, 1.0, 1.0)  # of the rou
 
 
 @dataclass(frozen=True)
-class Trajectory:
+class DriveTrajectory:
     """Poses of all scans of a drive."""
 
     poses: Array  # (N, 3) base_link in map; NaN where it is unknown
@@ -28,7 +28,7 @@ class Trajectory:
     unmatched: int  # scans that did not match the ones before
 
 
-def build_trajectory(drive: RawDrive, report: Callable[[str, float], None] = lambda _t, _d: None) -> Trajectory:
+def build_trajectory(drive: RawDrive, report: Callable[[str, float], None] = lambda _t, _d: None) -> DriveTrajectory:
     """The poses from which all scans of a drive agree best."""
     tracked = track_drive(drive, lambda done: report("tracking", done))
     back_end = BackEnd(drive.laser)
@@ -45,7 +45,7 @@ def build_trajectory(drive: RawDrive, report: Callable[[str, float], None] = lam
     in_map = back_end.in_map(tracked.key_scans)
     poses = np.where(in_map[:, None], back_end.poses, np.nan)
     keys = [key for key, known in zip(tracked.keys, in_map, strict=True) if known]
-    return Trajectory(poses_of_all_scans(tracked, poses), keys, back_end.closures, tracked.unmatched)
+    return DriveTrajectory(poses_of_all_scans(tracked, poses), keys, back_end.closures, tracked.unmatched)
 
 
 def poses_of_all_scans(tracked: Track, poses: Array) -> Array:

@@ -6,7 +6,7 @@ import numpy as np
 
 from common.geometry import se2
 from common.geometry.world import World
-from services.estimator.precise.learning.calibration import Drive
+from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.shared.generative_models import RayCaster
 
 WALLS = [(0, 0), (9, 0), (9, 3), (6, 3), (6, 6), (0, 6)]
@@ -19,7 +19,7 @@ SIGMA, POSED = 0.01, (0.02, 0.02, 0.004)  # m of a range; m, m, rad of a referen
 SHORT, LONG, NONE = 0.08, 0.03, 0.02  # shares of the beams
 
 
-def drive(count: int, seed: int = 0, period: float = 0.25) -> Drive:
+def drive(count: int, seed: int = 0, period: float = 0.25) -> ReferenceDrive:
     """A drive around the room with drifting odometry; between its halves the box is moved."""
     rng = np.random.default_rng(seed)
     turn = 2 * np.pi * np.arange(count) * 0.45 * period / 10.0
@@ -41,7 +41,7 @@ def drive(count: int, seed: int = 0, period: float = 0.25) -> Drive:
         odom[k] = se2.compose(odom[k - 1], step)
     reference = poses + rng.standard_normal(poses.shape) * POSED
     reference[:, 2] = se2.wrap(reference[:, 2])
-    return Drive(period * np.arange(count), reference, seen, ANGLES, np.zeros(3), RANGE_MAX, odom)
+    return ReferenceDrive(period * np.arange(count), reference, seen, ANGLES, np.zeros(3), RANGE_MAX, odom)
 
 
 def disturbed(ranges: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -51,7 +51,7 @@ def disturbed(ranges: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.select([kind == 1, kind == 2, kind == 3], [early, anywhere, np.inf], ranges)
 
 
-def save(path, made: Drive, *, reference: bool = True) -> None:
+def save(path, made: ReferenceDrive, *, reference: bool = True) -> None:
     """Saves a drive as an .npz file for `presage import` and `presage train --from`."""
     poses = {"reference": made.poses} if reference else {}
     np.savez(

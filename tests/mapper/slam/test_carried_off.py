@@ -14,7 +14,7 @@ from lab.benchmarks.mapping_faults import false_walls
 from services.mapper.slam.back_end import BackEnd
 from services.mapper.slam.front_end import MAX_SUSPECT_SCANS, NO_PIECE, track_drive
 from services.mapper.slam.loop_closure import Closure
-from services.mapper.slam.pose_graph import Link
+from services.mapper.slam.pose_graph import PoseLink
 from services.mapper.slam.trajectory import build_trajectory
 from tests.mapper.drives import driven
 from tests.mapper.slam.test_mapper import mapped
@@ -73,7 +73,7 @@ def test_wrong_closures_are_refused():
     back_end.extend(scans)
     before = back_end.poses.copy()
     last = len(before) - 1
-    wrong = Link(2, last, np.array([1.0, 0.5, 1.0]), np.diag([1e4, 1e4, 1e5]), robust=True)
+    wrong = PoseLink(2, last, np.array([1.0, 0.5, 1.0]), np.diag([1e4, 1e4, 1e5]), robust=True)
     back_end.closures = [Closure(0, 3, wrong, wide=False)]
     back_end.close_loops(scans, 1.0)
     assert all(each.link is not wrong for each in back_end.closures)

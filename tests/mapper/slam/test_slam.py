@@ -13,7 +13,7 @@ from common.geometry.world import load_world
 from lab.accuracy.motion_distortion import observations
 from lab.accuracy.scenes import TWIN_OFFSET, TWINS, Scene
 from services.mapper.slam.drive import Laser, RawDrive
-from services.mapper.slam.pose_graph import ANCHOR, Link, LinkTable, Uncertainty, optimise
+from services.mapper.slam.pose_graph import ANCHOR, LinkTable, PoseLink, Uncertainty, optimise
 from services.mapper.slam.trajectory import build_trajectory
 from tests.mapper.drives import driven
 
@@ -21,7 +21,7 @@ from tests.mapper.drives import driven
 def test_jacobians_of_links():
     rng = np.random.default_rng(0)
     poses = rng.normal(size=(3, 3))
-    table = LinkTable([Link(0, 1, rng.normal(size=3), np.eye(3)), Link(2, 1, rng.normal(size=3), np.eye(3))])
+    table = LinkTable([PoseLink(0, 1, rng.normal(size=3), np.eye(3)), PoseLink(2, 1, rng.normal(size=3), np.eye(3))])
     for sides, jacobian in zip((table.first, table.second), table.jacobians(poses), strict=True):
         for link, pose in enumerate(sides):
             for axis in range(3):
@@ -35,7 +35,7 @@ def test_consistent_graph_is_solved():
     rng = np.random.default_rng(0)
     truth = rng.normal(size=(20, 3))
     pairs = [(i, j) for i in range(20) for j in (i + 1, i + 5) if j < 20]
-    links = [Link(i, j, se2.between(truth[i], truth[j]), np.eye(3)) for i, j in pairs]
+    links = [PoseLink(i, j, se2.between(truth[i], truth[j]), np.eye(3)) for i, j in pairs]
     start = truth + 0.05 * rng.normal(size=truth.shape)
     start[0] = truth[0]
     assert optimise(start, links) == pytest.approx(truth, abs=1e-6)
@@ -47,7 +47,7 @@ def test_uncertainty_is_that_of_the_dense_inverse():
     pairs = [(k, k + 1) for k in range(29) if k != 19] + [(2, 9), (4, 15), (21, 28)]  # two components
     roots = rng.normal(size=(len(pairs), 3, 3))
     links = [
-        Link(i, j, se2.between(poses[i], poses[j]), root @ root.T + np.eye(3))
+        PoseLink(i, j, se2.between(poses[i], poses[j]), root @ root.T + np.eye(3))
         for (i, j), root in zip(pairs, roots, strict=True)
     ]
     chosen = np.array([1, 17, 24, 29])
@@ -59,7 +59,7 @@ def test_uncertainty_is_that_of_the_dense_inverse():
     for first, second in ((0, 1), (2, 3)):
         assert uncertainty.linked(first, second)
         rows = (3 * chosen[[first, second], None] + np.arange(3)).ravel()
-        table = LinkTable([Link(*chosen[[first, second]], np.zeros(3), np.eye(3))])
+        table = LinkTable([PoseLink(*chosen[[first, second]], np.zeros(3), np.eye(3))])
         J = np.concatenate([each[0] for each in table.jacobians(poses)], axis=1)
         expected = J @ covariance[np.ix_(rows, rows)] @ J.T
         assert uncertainty.of_pair(first, second) == pytest.approx(expected, rel=1e-6)

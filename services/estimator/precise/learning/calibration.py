@@ -64,7 +64,7 @@ class Calibration:
 
 
 @dataclass(frozen=True)
-class Drive:
+class ReferenceDrive:
     """Scans with reference poses, in order of time."""
 
     stamps: Array  # (N,) s
@@ -75,7 +75,7 @@ class Drive:
     range_max: float  # m
     odom: Array | None = None  # (N, 3)
 
-    def part(self, which: npt.NDArray[np.integer | np.bool_]) -> Drive:
+    def part(self, which: npt.NDArray[np.integer | np.bool_]) -> ReferenceDrive:
         """Returns some of the scans."""
         return replace(
             self,
@@ -86,7 +86,7 @@ class Drive:
         )
 
 
-def calibrate(model: GenerativeModel, held_out: Drive, motion: MotionNoise, sigma: float) -> Calibration:
+def calibrate(model: GenerativeModel, held_out: ReferenceDrive, motion: MotionNoise, sigma: float) -> Calibration:
     """Calibrates on scans from which ``model`` has not learned; ``sigma`` m is the scanner's noise."""
     lasers = se2.compose(held_out.poses, held_out.mount)
     expected = model.expect(lasers, held_out.angles)

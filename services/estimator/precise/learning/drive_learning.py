@@ -12,7 +12,7 @@ from common.geometry.se2 import Array
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.learning.calibration import (
     Calibration,
-    Drive,
+    ReferenceDrive,
     calibrate,
     learn_motion,
 )
@@ -45,7 +45,7 @@ class Learned:
 
 
 def learn_drive(
-    drive: Drive, recipe: Recipe, simulated: Beams | None, report: Report, *, replayed: bool = False
+    drive: ReferenceDrive, recipe: Recipe, simulated: Beams | None, report: Report, *, replayed: bool = False
 ) -> Learned:
     """Learns the model of a drive, and calibrates it.
 
@@ -88,7 +88,7 @@ def learn_drive(
 
 
 def _learn_model(
-    drive: Drive, recipe: Recipe, simulated: Beams | None, report: Callable[[float], None], *, replayed: bool
+    drive: ReferenceDrive, recipe: Recipe, simulated: Beams | None, report: Callable[[float], None], *, replayed: bool
 ) -> FieldModel:
     measured = Beams.of(drive.poses, drive.mount, drive.angles, drive.ranges)
     beams = measured
