@@ -54,7 +54,7 @@ class MapperService(Service):
         self._belief: Belief | None = None  # of the latest scan
         self._odometry_sync = OdometrySync(MAX_ODOMETRY_SILENCE_NS)
         self._pool = ThreadPoolExecutor(1, "update")
-        self._update: Future[GrownMap] | None = None
+        self._update: Future[GrownMap] | None = None  # that runs now
         self._update_ns = self._published_ns = -UPDATE_PERIOD_NS  # stamps of the last update and of the last map
 
     def open(self) -> None:
@@ -91,11 +91,14 @@ class MapperService(Service):
         self._belief = belief_message(scan, place)
         self.publish(BELIEF, self._belief)
         if self._update is None and mapper.outdated and scan.stamp_ns - self._update_ns >= UPDATE_PERIOD_NS:
-            self._update_ns = scan.stamp_ns
-            self._update = self._pool.submit(mapper.update, mapper.key_scans())
-            self._update.add_done_callback(lambda _: self.loop.inbox.wake())
+            self._start_update(mapper, scan.stamp_ns)
         if scan.stamp_ns - self._published_ns >= REPEAT_PERIOD_NS:
             self._publish_map(mapper)
+
+    def _start_update(self, mapper: Mapper, stamp_ns: int) -> None:
+        self._update_ns = stamp_ns
+        self._update = self._pool.submit(mapper.update, mapper.key_scans())
+        self._update.add_done_callback(lambda _: self.loop.inbox.wake())
 
     def _mapper_for(self, scan: Scan) -> Mapper:
         """The mapper; a new one if time has gone back or the scanner was moved, as then no scan fits the map."""

@@ -31,19 +31,7 @@ def grid_of_scans(
     Cells that no beam observed are those of the grid ``unseen``, if given. Raises UserError if there are too many
     cells.
     """
-    lasers = se2.compose(poses, laser.mount)
-    row, beam = np.nonzero(is_surface(ranges))
-    direction = lasers[row, 2] + laser.angles[beam]
-    ends = lasers[row, :2] + ranges[row, beam][:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=-1)
-    seen = np.concatenate([ends[has_neighbours(ends)], poses[:, :2]])
-    low, high = seen.min(axis=0) - MARGIN_M, seen.max(axis=0) + MARGIN_M
-    if unseen is not None:
-        low, high = (
-            np.minimum(low, np.min(unseen.corners(), axis=0)),
-            np.maximum(high, np.max(unseen.corners(), axis=0)),
-        )
-    corner = np.floor(low / cell) * cell
-    columns, rows = (int(n) for n in np.ceil((high - corner) / cell))
+    corner, rows, columns = _extent(poses, ranges, laser, cell, unseen)
     if columns * rows > MAX_CELLS:
         raise UserError(
             f"{columns} x {rows} cells are more than the maximum of {MAX_CELLS}: use a larger --cell than {cell:g} m"
@@ -51,7 +39,7 @@ def grid_of_scans(
     x, y = corner.round(6).tolist()
     hits, passes = np.zeros((rows, columns), np.int64), np.zeros((rows, columns), np.int64)
     ranges = np.where(is_surface(ranges) & (ranges < laser.range_max), ranges, np.inf)
-    count_scans(lasers - [x, y, 0.0], ranges, laser.angles, cell, hits, passes)
+    count_scans(se2.compose(poses, laser.mount) - [x, y, 0.0], ranges, laser.angles, cell, hits, passes)
     occupied = (hits >= MIN_HITS) & (hits >= MIN_HIT_SHARE * (hits + passes))
     values = np.where(occupied, OCCUPIED, np.where(passes > 0, FREE, UNKNOWN)).astype(np.uint8)
     if unseen is not None:
@@ -59,3 +47,21 @@ def grid_of_scans(
         centres = np.stack([column, row], axis=-1).reshape(-1, 2) * cell + corner
         values = np.where(values == UNKNOWN, unseen.values_at(centres).reshape(rows, columns), values)
     return OccupancyGrid.of(values, cell, (x, y, 0.0))
+
+
+def _extent(
+    poses: Array, ranges: Array, laser: Laser, cell: float, unseen: OccupancyGrid | None
+) -> tuple[Array, int, int]:
+    """Lower left corner (2,) m, rows and columns of a grid over all that the scans saw, and over ``unseen``."""
+    lasers = se2.compose(poses, laser.mount)
+    row, beam = np.nonzero(is_surface(ranges))
+    direction = lasers[row, 2] + laser.angles[beam]
+    ends = lasers[row, :2] + ranges[row, beam][:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=-1)
+    seen = np.concatenate([ends[has_neighbours(ends)], poses[:, :2]])
+    low, high = seen.min(axis=0) - MARGIN_M, seen.max(axis=0) + MARGIN_M
+    if unseen is not None:
+        corners = np.asarray(unseen.corners())
+        low, high = np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))
+    corner = np.floor(low / cell) * cell
+    columns, rows = (int(n) for n in np.ceil((high - corner) / cell))
+    return corner, rows, columns
