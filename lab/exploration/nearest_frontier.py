@@ -44,7 +44,7 @@ def nearest_frontier(survey: Survey) -> Viewpoint | None:
 
 
 def _reachable_places(survey: Survey, field: CostField) -> tuple[Array, Array]:
-    """Places (P, 2) m where the robot has not been yet, and the costs (P,) of the ways to them."""
+    """Places (P, 2) m where the robot has not been yet, and the costs (P,) of the paths to them."""
     reachable = np.flatnonzero(np.isfinite(field.cost))
     places, cost = field.graph.grid.centres(reachable), field.cost.ravel()[reachable]
     done = np.concatenate([survey.unreachable, survey.arrivals[:, :2]])

@@ -3,7 +3,7 @@
 | from | event | to |
 |---|---|---|
 | - | a goal with `explore` | EXPLORING |
-| EXPLORING, RETURNING | a viewpoint is worth the way | EXPLORING |
+| EXPLORING, RETURNING | a viewpoint is worth a visit | EXPLORING |
 | EXPLORING, RETURNING | no viewpoint is | RETURNING |
 | RETURNING | the robot has arrived | FINISHED |
 | RETURNING | the way back stays refused | FAILED |
@@ -99,7 +99,8 @@ class Explorer:
             return self._resume_after_user_goal(state, stamp_ns)
         if self.goal is None:
             return False
-        stalled = self._has_stalled(stamp_ns)
+        self._note_motion(stamp_ns)
+        stalled = stamp_ns - self._last_moved[1] > STALLED_NS
         if self.phase == "returning":
             return self._update_return(state, stalled=stalled)
         return self._update_viewpoint(self.goal, state, stalled=stalled)
@@ -114,13 +115,11 @@ class Explorer:
             self.paused, self._last_moved = False, (self._pose, 0)
         return not self.paused
 
-    def _has_stalled(self, stamp_ns: int) -> bool:
-        """Whether the robot has not moved by `STALLED_M` for `STALLED_NS`; notes when it moves."""
+    def _note_motion(self, stamp_ns: int) -> None:
+        """Notes when the robot has moved by `STALLED_M`."""
         place, since_ns = self._last_moved
         if np.hypot(*(self._pose - place)[:2]) > STALLED_M or not 0 < since_ns <= stamp_ns:
             self._last_moved = self._pose, stamp_ns
-            return False
-        return stamp_ns - since_ns > STALLED_NS
 
     def _update_return(self, state: GoalState, *, stalled: bool) -> bool:
         """Ends the exploration if the robot is back, or cannot get back; returns whether to try once more."""
@@ -130,7 +129,7 @@ class Explorer:
             self.phase = "finished"
         elif stalled:
             self.phase = "failed"
-        return self.active  # the way was refused: from a narrow place, the next attempt may find another one
+        return self.active  # it was refused: from a narrow place, the next attempt may find another path
 
     def _update_viewpoint(self, goal: Goal, state: GoalState, *, stalled: bool) -> bool:
         """Notes whether the viewpoint was reached or cannot be; returns whether either is so."""

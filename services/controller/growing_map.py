@@ -19,7 +19,7 @@ JUMP_M = 0.05  # a key scan that moved farther moved with a loop closure, and ob
 
 @dataclass(frozen=True)
 class PlannedMap:
-    """A map, and the graph of the ways through it."""
+    """A map, and the graph of the paths through it."""
 
     message: Map
     graph: FreeSpaceGraph

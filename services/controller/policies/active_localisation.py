@@ -1,6 +1,6 @@
 """Chooses where to drive while the pose is ambiguous or unknown.
 
-Policies are drives to a place, and their expected free energy is that of `expected_free_energy`: the way to the place
+Policies are drives to a place, and their expected free energy is that of `expected_free_energy`: the path to the place
 and from there to the goal, minus the expected information of a scan from there. With several possible poses, that is
 how well predicted scans distinguish them; with an unknown pose, any scan is assumed to give the pose. In both cases a
 scan near a place where the robot has already been gives less, because scans from one place are not independent.

@@ -6,9 +6,9 @@ unknown space, and back to where exploration began. Its expected free energy in 
     G(tour) = NATS_PER_METRE * length - information about the map
 
 A scan shows whether a frontier cell is free or occupied, which is worth ln 2, times `MISS_PROBABILITY` for each earlier
-scan that should have shown it and did not. At `MIN_VIEWPOINT_NATS` a viewpoint is worth a way of 150 m, so the tour has
-all that are worth a stop, by the shortest way (as Kulich, Faigl & Preucil 2011 choose goals). The robot drives only to
-its first viewpoint, as the next map has another frontier.
+scan that should have shown it and did not. At `MIN_VIEWPOINT_NATS` a viewpoint is worth a detour of 150 m, so the tour
+has all that are worth a stop, by the shortest path (as Kulich, Faigl & Preucil 2011 choose goals). The robot drives
+only to its first viewpoint, as the next map has another frontier.
 
 Approximations: the viewpoints are chosen greedily by their information; what lies beyond the frontier is not predicted;
 and a scan shows nothing of cells so far away that its beams are farther apart than the cells of the map.
@@ -78,7 +78,7 @@ class Survey:
     pose: Array  # (3,) of the robot in map
     home: Array  # (2,) m in map, where the tour ends
     target: Array | None  # (2,) m in map, the viewpoint to which the robot drives now
-    unreachable: Array  # (N, 2) m in map, places to which no way was found
+    unreachable: Array  # (N, 2) m in map, places to which no path was found
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class Candidates:
 
 
 def choose_viewpoint(survey: Survey) -> Viewpoint | None:
-    """The first viewpoint of the tour of least expected free energy; None if no viewpoint is worth the way."""
+    """The first viewpoint of the tour of least expected free energy; None if no viewpoint is worth a visit."""
     frontier, known = find_frontier(survey), known_space(survey.graph)
     candidates = find_candidates(survey, frontier, known)
     selected = select_viewpoints(candidates.sees, frontier.nats, candidates.target)
@@ -236,12 +236,12 @@ def _prefer_target(tour: list[int], cost: Array) -> list[int]:
 
 
 def _length(cost: Array, tour: Sequence[int]) -> float:
-    """Length in m of a tour with its way from the start and to the end."""
+    """Length in m of a tour, from the start to the end."""
     return float(sum(cost[a, b] for a, b in pairwise([0, *(place + 1 for place in tour), len(cost) - 1])))
 
 
 def _travel_costs(graph: FreeSpaceGraph, places: Sequence[Array]) -> Array:
-    """Costs (N, N) m of the ways between places (2,) m; a way that is not known counts as very long."""
+    """Costs (N, N) m of the paths between places (2,) m; an unknown path counts as very long."""
     longest = 10.0 * sum(graph.grid.shape) * graph.grid.resolution
     cells = graph.grid.cell_of(np.array(places))
     rows = []
@@ -262,8 +262,8 @@ def _in_sight(survey: Survey, places: Array, cells: Cells) -> Mask:
     free = survey.graph.free
     size, corner = free.grid.resolution, np.array(free.grid.origin)
     targets = (free.grid.centres(cells) - corner) / size
-    reach, blind = survey.field_of_view.range_m / size, survey.graph.radius / size
-    return np.asarray(visible(_opaque(free), (places - corner) / size, targets, reach, blind))
+    reach, own_radius = survey.field_of_view.range_m / size, survey.graph.radius / size
+    return np.asarray(visible(_opaque(free), (places - corner) / size, targets, reach, own_radius))
 
 
 def _in_sector(survey: Survey, poses: Array, cells: Cells) -> Mask:

@@ -1,4 +1,4 @@
-"""The goal as a preference: the cost of the way there over free space.
+"""The goal as a preference: the cost of the path there over free space.
 
 A quadratic prior on the goal pulls straight at it, through walls. It is replaced by ``-ln p(x) = lambda d(x)``, where d
 is the geodesic distance to the goal and a metre near a wall counts for more. The slope of this prior is lambda
@@ -29,7 +29,7 @@ WALL_GAP_M = 0.03  # minimum distance between footprint and wall, a little more 
 WALL_COST_RANGE_M = 0.35  # range of clearances beyond the minimum within which a metre costs more
 STOP_RANGE_M = 0.05  # and once more within this range, where noise in the scan makes the obstacle stop brake the robot
 MAX_WALL_COST = 1.0  # additional cost of a metre at the minimum clearance, for each of the two ranges
-UNKNOWN_COST = 30.0  # additional cost of a metre where nothing is known: a way through it is the last resort
+UNKNOWN_COST = 30.0  # additional cost of a metre where nothing is known: a path through it is the last resort
 ATTRACTOR_RANGE_M = 3.0  # length of the path within which the attractor is chosen
 MAX_ATTRACTOR_CANDIDATES = 12
 MAX_LINE_COST_RATIO = 1.02  # cost of the straight line to the attractor, relative to the path on the grid

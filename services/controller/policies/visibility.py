@@ -18,15 +18,15 @@ if TYPE_CHECKING:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def visible(
-    opaque: npt.NDArray[np.bool_], places: Array, targets: Array, reach: float, blind: float
+    opaque: npt.NDArray[np.bool_], places: Array, targets: Array, reach: float, clear_range: float
 ) -> npt.NDArray[np.bool_]:
-    """Whether a strip, from each place to each target, passes no opaque cell; (P, T) bool.
+    """Whether a strip from each place to each target passes no opaque cell; (P, T) bool.
 
-    It is two cells wide, because a target at the edge of a shadow is not seen from where the shadow comes from.
+    The strip is two cells wide, so that targets at the edge of a shadow count as hidden.
 
     ``places`` (P, 2) and ``targets`` (T, 2) are x and y in cells from the corner of cell (0, 0) of ``opaque`` (rows,
-    columns). Targets farther than ``reach`` cells are not seen. Cells nearer to the place than ``blind``, and nearer
-    to the target than 2, do not hide it.
+    columns). Targets farther than ``reach`` cells are not seen. Cells nearer to the place than
+    ``clear_range``, and nearer to the target than 2, do not hide it.
     """
     rows, columns = opaque.shape
     seen = np.zeros((len(places), len(targets)), np.bool_)
@@ -36,7 +36,7 @@ def visible(
             distance = np.hypot(dx, dy)
             if distance > reach:
                 continue
-            free, at = True, blind
+            free, at = True, clear_range
             while free and at < distance - 2.0:
                 ux, uy = dx / distance, dy / distance
                 for side in (-1.0, 0.0, 1.0):

@@ -270,8 +270,8 @@ class FrontEnd:
         last_key, pose = self.poses[self.keys[-1]], self.poses[-1]
         off = se2.between(last_key, pose)
         distance = max(KEY_DISTANCE_M, KEY_SHARE * _median_range(scan.elements))
-        way = max(np.hypot(off[0], off[1]) / distance, abs(off[2]) / KEY_TURN_RAD)
-        if way >= (1.0 if familiar else EARLY_KEY_SHARE):
+        share = max(np.hypot(off[0], off[1]) / distance, abs(off[2]) / KEY_TURN_RAD)
+        if share >= (1.0 if familiar else EARLY_KEY_SHARE):
             self._links.append(_link(len(self.keys) - 1, last_key, pose, information, self._since_key))
             self._add_key(scan)
 

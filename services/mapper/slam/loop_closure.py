@@ -172,9 +172,9 @@ def _supports(a: Closure, b: Closure, poses: Array, uncertainty: Uncertainty) ->
     covariance = there + back + np.linalg.inv(a.link.information) + np.linalg.inv(b.link.information)
     if (np.sqrt(np.diag(covariance)) > 2 * NO_SEARCH_WINDOW).any():
         return False
-    way = se2.between(poses[a.link.first], poses[b.link.first])
-    other_way = se2.between(poses[a.link.second], poses[b.link.second])
-    off = se2.between(se2.compose(a.link.pose, other_way), se2.compose(way, b.link.pose))
+    between_first = se2.between(poses[a.link.first], poses[b.link.first])
+    between_second = se2.between(poses[a.link.second], poses[b.link.second])
+    off = se2.between(se2.compose(a.link.pose, between_second), se2.compose(between_first, b.link.pose))
     by_headings = _covariance_by_headings(a, b, poses)
     return bool(off @ np.linalg.solve(by_headings + covariance, off) < MAX_SQUARED_DEVIATION)
 
