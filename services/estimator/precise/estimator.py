@@ -229,7 +229,7 @@ class PreciseEstimator:
         widest = _prior_of([each[-1] for each in motions])
         poses, evidence = view.descend(np.array([each[-2].mean for each in motions]), widest)
         explained = view.surface_evidence(poses).explained[0]
-        if explained < self._explained - self.settings.drop:
+        if explained < self._explained - self.settings.max_explained_drop:
             extra_starts = np.zeros((0, 3))
             if not with_odometry:
                 extra_starts = reachable_poses(self.settings.motion, self.modes[0].pose, period, COARSE_SIGMA_M)
@@ -239,7 +239,7 @@ class PreciseEstimator:
                 poses, evidence = wider_poses, wider_evidence
                 explained = view.surface_evidence(poses).explained[0]
         match = ScanMatch(motions, poses, evidence)
-        return match if explained >= self.settings.matching_share else self._match_recent_scans(view, match)
+        return match if explained >= self.settings.min_explained_share else self._match_recent_scans(view, match)
 
     def _match_recent_scans(self, view: View, match: ScanMatch) -> ScanMatch:
         """Matches the scan again, with the motion that recent scans give, if they give one."""
@@ -284,7 +284,7 @@ class PreciseEstimator:
 
     def _unobserved_direction(self, view: View, mode: Mode, pose: Array, curvature: Array) -> Array | None:
         """The direction (2,) that a scan with ``curvature`` (3, 3) at ``pose`` (3,) does not observe, if any."""
-        min_beams = self.settings.min_constraining_ratio * len(view.angles)
+        min_beams = self.settings.min_constraining_share * len(view.angles)
         if mode.unobserved_scans:
             # The pose may be metres off, so a ripple or a beam that happens to fit must not pass for a feature.
             direction: Array | None = weakest_direction(curvature)[0]
@@ -314,15 +314,15 @@ class PreciseEstimator:
             replace(mode, explained=float(explained[k]), present=float(present[k])) for k, mode in enumerate(modes)
         ]
         self._local_pose, self._old_beams, self._log_change = local, old, log_change
-        kidnapping = max(mode.log_evidence for mode in self.modes) + float(np.log(self.settings.unknown))
-        self._unknown_place.allow_kidnapping(kidnapping, self.settings.unmapped)
+        kidnapping = max(mode.log_evidence for mode in self.modes) + float(np.log(self.settings.unknown_probability))
+        self._unknown_place.allow_kidnapping(kidnapping, self.settings.unmapped_share)
         self._unknown_place.present = max(_log_anywhere(view, old) + log_change, _log_anywhere(view, small))
         self._set_hypotheses(modes)
 
     def _set_hypotheses(self, modes: list[Mode]) -> None:
         """Sets the hypotheses and their weights."""
         unknown = self._unknown_place
-        least = max(mode.log_weight for mode in modes) + float(np.log(self.settings.unknown))
+        least = max(mode.log_weight for mode in modes) + float(np.log(self.settings.unknown_probability))
         log_unknown = max(unknown.log_evidence + unknown.present, least)
         self.modes, unknown.weight = weigh(modes, log_unknown, self.settings.max_hypotheses)
         self._explained = self.modes[0].explained
@@ -362,7 +362,9 @@ class PreciseEstimator:
         if self._start is not None:
             start, self._start = self._start, None
             found = search_near(view, *start, self.seeds, self.settings, self._rng)
-            if not self._begin_with(view, found, self.settings.unknown, self.settings.all_changed):
+            if not self._begin_with(
+                view, found, self.settings.unknown_probability, self.settings.all_changed_probability
+            ):
                 self._add_hypotheses(self._search_everywhere(view), view)
         elif not self.modes:
             self._begin_with(view, self._search_everywhere(view), 1.0)
@@ -384,7 +386,7 @@ class PreciseEstimator:
         more of the scan than that.
         """
         self._restart_local_map(view)
-        self._unknown_place.restart(unknown, self.settings.unmapped)
+        self._unknown_place.restart(unknown, self.settings.unmapped_share)
         ideal = _log_ideal(view, self._old_beams)
         least = self._unknown_place.present + float(np.log(all_changed)) if all_changed else -np.inf
         self._set_hypotheses([replace(mode, present=max(mode.present - ideal, least)) for mode in found])

@@ -17,14 +17,14 @@ class Settings:
     max_hypotheses: int = 8
 
     # Following
-    matching_share: float = 0.75  # with a smaller share of explained beams, the scan is matched to recent scans too
-    drop: float = 0.1  # fall of the share of explained beams from one scan to the next that widens the descent
-    min_constraining_ratio: float = 0.004  # share of beams needed to fix the position along a corridor
+    min_explained_share: float = 0.75  # if the map explains fewer beams, recent scans give the motion
+    max_explained_drop: float = 0.1  # if the share falls by more from scan to scan, a wider area is searched
+    min_constraining_share: float = 0.004  # of the beams, to fix the position along a corridor
 
     # Belief
-    unknown: float = 1e-5  # probability that the robot is at none of the hypotheses: never less than this
-    all_changed: float = 1e-2  # probability that nothing around the start is as the map shows it
-    unmapped: float = 1e-3  # of that, the probability that the robot is at no place that a search of the map finds
+    unknown_probability: float = 1e-5  # that the robot is at none of the hypotheses: never less than this
+    unmapped_share: float = 1e-3  # of that: the robot is at no place that a search of the map finds
+    all_changed_probability: float = 1e-2  # that nothing around the start is as the map shows it
     change_rate: float = 0.015  # 1/s, at which a surface in view is taken away or put there
     tracking_probability: float = 0.999  # of the pose being within 0.2 m and 5 degrees of the truth
     ambiguous_weight: float = 0.05  # weight of the second hypothesis above which the belief is ambiguous

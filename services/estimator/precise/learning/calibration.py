@@ -54,8 +54,8 @@ class Calibration:
         """Parameters of the estimator, with shares of explained beams relative to the usual one in this place."""
         default = Settings()
         return Settings(
-            matching_share=0.77 * self.usual,
-            drop=max(default.drop, self.usual - self.unusual),
+            min_explained_share=0.77 * self.usual,
+            max_explained_drop=max(default.max_explained_drop, self.usual - self.unusual),
             inflation=self.inflation,
             floor_position=self.floor_position,
             floor_heading=self.floor_heading,
