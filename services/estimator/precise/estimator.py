@@ -10,6 +10,7 @@ import numpy as np
 from common.geometry import se2
 from services.estimator.precise.gauss_newton import COARSE_SIGMA_M, GaussNewton, Optimiser, Prior, View
 from services.estimator.precise.hypotheses import (
+    CLUTTER,
     Mode,
     UnknownPlace,
     clip_to_map,
@@ -57,7 +58,8 @@ if TYPE_CHECKING:
 
 START_COVARIANCE = np.diag([0.25, 0.25, 0.09])  # of a pose given without one
 MAX_SEARCH_INTERVAL = 150  # scans between two searches without success; the interval doubles from 1
-CLUTTER = 0.3  # probability that all that is new in a scan is clutter
+STILL_CLUTTER = 0.9  # probability that a key scan is clutter if the one before was: a whole room may be unlike its map
+WRONG_MATCH = 0.05  # probability that matching a scan with recent ones gives a wrong motion
 UNKNOWN_SIGMA_M = 100.0  # published where the model does not know what to expect
 TARGET_BEAMS = 2000  # a scan with at least twice as many is thinned, because the time of a search grows with the beams
 
@@ -253,7 +255,12 @@ class PreciseEstimator:
         step = se2.between(self.modes[0].pose, moved.mean)
         motions = [replace(moved, mean=se2.compose(mode.pose, step)) for mode in self.modes]
         poses, evidence = view.descend(np.array([each.mean for each in motions]), _prior_of(motions))
-        return ScanMatch([[each] for each in motions], poses, evidence, found.pose)
+        by_recent_scans = ScanMatch([[each] for each in motions], poses, evidence, found.pose)
+        # Recent scans mislead where people move all around the robot, the map where much has changed.
+        clutter = self.modes[0].clutter
+        wrong = _log_joint(view, match, clutter) + np.log(WRONG_MATCH)
+        right = _log_joint(view, by_recent_scans, clutter) + np.log1p(-WRONG_MATCH)
+        return match if wrong > right else by_recent_scans
 
     def _fuse(self, view: View, k: int, match: ScanMatch, widest: Candidate, observation: Observation) -> Mode:
         """Fuses the k-th hypothesis with the scan.
@@ -309,9 +316,11 @@ class PreciseEstimator:
         log_change = changes * float(np.log(min(0.5, self.settings.change_rate * period)))
         log_change += float((view.surfaces.density - view.surfaces.ideal)[appeared & ~seen & ~small].sum())
         poses = np.array([mode.pose for mode in modes])
-        explained, present = view.surface_evidence(poses).explained, _log_at_poses(view, poses, old) + log_change
+        explained = view.surface_evidence(poses).explained
+        present, clutter = _log_at_poses(view, poses, old, np.array([mode.clutter for mode in modes]))
         modes = [
-            replace(mode, explained=float(explained[k]), present=float(present[k])) for k, mode in enumerate(modes)
+            replace(mode, explained=explained[k], present=present[k] + log_change, present_clutter=clutter[k])
+            for k, mode in enumerate(modes)
         ]
         self._local_pose, self._old_beams, self._log_change = local, old, log_change
         kidnapping = max(mode.log_evidence for mode in self.modes) + float(np.log(self.settings.unknown_probability))
@@ -334,8 +343,11 @@ class PreciseEstimator:
             self._precision.learn_changes(view, best.pose)
         self._unknown_place.add_key_scan()
         key = KeyScan(self._local_pose, view, self._old_beams, self._log_change, log_unknown)
-        self._local_map.add(key, best.pose, self._covariance(best))
-        self.modes = [replace(mode, log_evidence=mode.log_weight, present=0.0) for mode in self.modes]
+        self._local_map.add(key, best.pose, best.noise_covariance)
+        self.modes = [
+            replace(mode, log_evidence=mode.log_weight, present=0.0, clutter=mode.present_clutter)
+            for mode in self.modes
+        ]
 
     def _may_be_elsewhere(self) -> bool:
         """Whether the whereabouts are uncertain, or another place could fit the scans much better."""
@@ -403,10 +415,12 @@ class PreciseEstimator:
         if not found:
             self._unknown_place.exclude_mapped_places()
             return
-        stayed, carried = self._log_stayed(found, view), self._log_carried(found, view)
+        (stayed, clutter), carried = self._log_stayed(found, view), self._log_carried(found, view)
         best = int(np.argmax(np.maximum(stayed, carried) + np.array([mode.log_evidence for mode in found])))
         added = [
-            replace(mode, log_evidence=mode.log_evidence + max(stayed[k], carried[k]), present=0.0)
+            replace(mode, log_evidence=mode.log_evidence + stayed[k], present=0.0, present_clutter=clutter[k])
+            if stayed[k] > carried[k]
+            else replace(mode, log_evidence=mode.log_evidence + carried[k], present=0.0)
             for k, mode in enumerate(found)
         ]
         if added[best].log_weight > self.modes[0].log_weight:
@@ -422,16 +436,24 @@ class PreciseEstimator:
         present = np.array([mode.present for mode in found])
         return np.asarray(self._unknown_place.log_evidence + present - _log_ideal(view, view.surfaces.small))
 
-    def _log_stayed(self, found: list[Mode], view: View) -> Array:
-        """Evidence (N,) in nats that the robot has been at each of the hypotheses since one of the key scans."""
+    def _log_stayed(self, found: list[Mode], view: View) -> tuple[Array, Array]:
+        """Evidence (N,) in nats that the robot has been at each of the hypotheses since the best of the key scans.
+
+        Also the probability (N,) of clutter in the present scan then.
+        """
         poses = np.array([mode.pose for mode in found])
-        since = _log_at_poses(view, poses, self._old_beams) + self._log_change
-        stayed = np.full(len(found), -np.inf)
-        for key in reversed(self._local_map.scans):
-            before = se2.compose(poses, se2.between(self._local_pose, key.pose))
-            since += _log_at_poses(key.view, before, key.seen) + key.log_change
-            stayed = np.maximum(stayed, since + key.log_unknown)
-        return stayed
+        stayed = np.zeros((0, len(found)))  # since each of the key scans so far
+        clutter = np.zeros_like(stayed)
+        for key in self._local_map.scans:
+            stayed = np.vstack([stayed, np.full(len(found), key.log_unknown)])
+            clutter = np.vstack([clutter, np.full(len(found), CLUTTER)])
+            at_key = se2.compose(poses, se2.between(self._local_pose, key.pose))
+            gain, clutter = _log_at_poses(key.view, at_key, key.seen, clutter)
+            stayed += gain + key.log_change
+        gain, clutter = _log_at_poses(view, poses, self._old_beams, clutter)
+        stayed += gain + self._log_change
+        best, each = stayed.argmax(axis=0), np.arange(len(found))
+        return stayed[best, each], clutter[best, each]
 
     def _went_back(self, stamp: float | None) -> bool:
         return stamp is not None and self._stamp is not None and stamp < self._stamp
@@ -514,10 +536,24 @@ def _log_anywhere(view: View, skip: npt.NDArray[np.bool_]) -> float:
     return float((view.surfaces.density - view.surfaces.ideal)[~skip].sum())
 
 
-def _log_at_poses(view: View, poses: Array, skip: npt.NDArray[np.bool_]) -> Array:
-    """At ``poses`` (N, 3) in the map; (N,). The scan may also be clutter, equally likely at all poses."""
+def _log_at_poses(view: View, poses: Array, skip: npt.NDArray[np.bool_], clutter: Array) -> tuple[Array, Array]:
+    """At ``poses`` (N, 3) in the map; (..., N). The scan may also be clutter, equally likely at all poses.
+
+    ``clutter`` (..., N) is the probability that the key scan before was clutter. Also returns that of this scan.
+    """
     mapped = view.surface_evidence(poses, skip=skip).log_likelihood - _log_ideal(view, skip)
-    return np.asarray(np.logaddexp(mapped + np.log1p(-CLUTTER), _log_anywhere(view, skip) + np.log(CLUTTER)))
+    begins = CLUTTER * (1 - STILL_CLUTTER) / (1 - CLUTTER)  # so that `CLUTTER` is the share of all key scans
+    prior = STILL_CLUTTER * clutter + begins * (1 - clutter)
+    of_clutter = np.log(prior) + _log_anywhere(view, skip)
+    total = np.logaddexp(np.log1p(-prior) + mapped, of_clutter)
+    return total, np.exp(of_clutter - total)
+
+
+def _log_joint(view: View, match: ScanMatch, clutter: float) -> float:
+    """Log density of the scan at the first hypothesis and of its motion, within the widest candidate."""
+    pose, prior = match.poses[:1], _prior_of([match.motions[0][-1]])
+    log_motion = 0.5 * float(np.linalg.slogdet(prior.information[0])[1]) - float(prior.energy(pose)[0])
+    return float(_log_at_poses(view, pose, view.surfaces.small, np.array([clutter]))[0][0]) + log_motion
 
 
 def _prior_of(candidates: list[Candidate]) -> Prior:

@@ -28,6 +28,7 @@ SAME_POSITION_M, SAME_HEADING_RAD = 0.1, 0.1  # hypotheses nearer to one another
 # field adds a multiple of its squared ripple to the share.
 MIN_INFORMATION_RATIO, RIPPLE_FACTOR = 1e-4, 7.0
 MIN_WEIGHT = 1e-9  # hypotheses with less weight are dropped
+CLUTTER = 0.3  # probability that all that is new in a key scan is clutter
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class Mode:
 
     pose: Array  # (3,) base_link in map
     noise_covariance: Array  # (3, 3) caused by scanner noise and motion: fusion of scans reduces it
-    model_covariance: Array  # (3, 3) caused by the model's error, for independent beams: fusion does not reduce it
+    model_covariance: Array  # (3, 3) caused by the model's error: fusion does not reduce it
     explained: float  # share of the last scan's beams that end at surfaces of the map
     accuracy: float  # nats, of the last scan
     complexity: float  # nats
@@ -44,6 +45,8 @@ class Mode:
     curvature: Array  # (3, 3)
     log_evidence: float = 0.0  # nats, of the key scans and the prior; unnormalised
     present: float = 0.0  # nats, log likelihood of the present scan
+    clutter: float = CLUTTER  # probability that all that was new in the last key scan was clutter
+    present_clutter: float = CLUTTER  # the same of the present scan
     velocity: Array | None = None  # (3,) in base_link; None while unknown
     weight: float = 1.0
     unobserved_scans: int = 0  # number of consecutive scans without information along some direction
@@ -161,12 +164,16 @@ def _log_volume_of_place(curvature: Array) -> float:
 def update_mode(mode: Mode, fused: Fused, evidence: Evidence, k: int, period: float, *, unobserved: bool) -> Mode:
     """The hypothesis after a scan, from its fused prior and the k-th evidence.
 
-    The scan's information reduces the noise covariance; the model covariance is that of this scan alone. ``unobserved``
-    is true if the scan has no information along some direction.
+    The scan's information reduces the noise covariance. The model's errors are alike from scan to scan, so instead of
+    their variances their deviations add, each with its share in the pose. ``unobserved`` is true if the scan has no
+    information along some direction.
     """
     inverse = np.linalg.inv(fused.information)
     prior_information = fused.information - evidence.curvature[k]
     inverse_of_scan = np.linalg.inv(evidence.curvature[k] + np.eye(3))
+    before = _root(mode.model_covariance)
+    of_scan = _root(inverse_of_scan @ evidence.xi_model_covariance[k] @ inverse_of_scan)
+    model_deviation = before + inverse @ evidence.curvature[k] @ (of_scan - before)
     # A velocity that is not observed in every direction is not carried on.
     velocity = None
     if not unobserved and not mode.unobserved_scans:
@@ -174,16 +181,23 @@ def update_mode(mode: Mode, fused: Fused, evidence: Evidence, k: int, period: fl
     return Mode(
         pose=fused.mean,
         noise_covariance=inverse @ (evidence.xi_noise_covariance[k] + prior_information) @ inverse,
-        model_covariance=inverse_of_scan @ evidence.xi_model_covariance[k] @ inverse_of_scan,
+        model_covariance=model_deviation @ model_deviation.T,
         explained=float(evidence.inlier_ratio[k]),
         accuracy=float(evidence.accuracy[k]),
         complexity=fused.complexity,
         xi=evidence.xi[k],
         curvature=evidence.curvature[k],
         log_evidence=mode.log_evidence,
+        clutter=mode.clutter,
         velocity=velocity,
         unobserved_scans=mode.unobserved_scans + 1 if unobserved else 0,
     )
+
+
+def _root(covariance: Array) -> Array:
+    """Symmetric square root of a covariance (3, 3)."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
 
 
 def clip_to_map(modes: list[Mode], bounds: tuple[float, float, float, float]) -> list[Mode]:
