@@ -217,8 +217,8 @@ class FrontEnd:
     def _contradicts_local_map(self, scan: _Scan, pose: Array) -> bool:
         """Whether a scan at a pose (3,) contradicts the local map more than moving things would make it."""
         mount = self.laser.mount
-        views = PosedScans(mount[None], self._evenly_spaced(scan)[None], self.laser.angles)
-        found = compare(self._local, self._surface, Segment(0, 0, scan.elements, views), pose)
+        scans = PosedScans(mount[None], self._evenly_spaced(scan)[None], self.laser.angles)
+        found = compare(self._local, self._surface, Segment(0, 0, scan.elements, scans), pose)
         agreeing = found.agreeing + PRIOR_AGREEMENT
         return agreeing < MIN_AGREEMENT * (agreeing + found.contradicting)
 
@@ -286,10 +286,10 @@ class FrontEnd:
         recent = [k for k in range(-min(LOCAL_SCANS, len(self.keys)), 0) if self._key_pieces[k] == piece]
         poses = np.array([self.poses[self.keys[k]] for k in recent])
         local = concatenate([self._elements[k].transformed(pose) for k, pose in zip(recent, poses, strict=True)])
-        views = PosedScans(
+        scans = PosedScans(
             se2.compose(poses, self.laser.mount), np.array([self._ranges[k] for k in recent]), self.laser.angles
         )
-        self._surface, self._local = Surface(local), Segment(0, 0, local, views)
+        self._surface, self._local = Surface(local), Segment(0, 0, local, scans)
 
     def _evenly_spaced(self, scan: _Scan) -> Array:
         """The ranges (B,) of a scan at the laser's own angles."""

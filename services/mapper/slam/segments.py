@@ -50,7 +50,7 @@ class Segment:
     reference: int  # number of the key scan
     piece: int  # of the drive
     elements: Elements
-    views: PosedScans  # the same key scans
+    scans: PosedScans  # the same key scans
 
 
 def segments_of(
@@ -77,8 +77,8 @@ def segments_of(
         reference = int(keys[len(keys) // 2])
         local = se2.between(poses[reference], poses[keys])
         placed = concatenate([elements[key].transformed(pose) for key, pose in zip(keys.tolist(), local, strict=True)])
-        views = PosedScans(se2.compose(local, mount), ranges[keys], angles)
-        found.append(Segment(reference, int(pieces[first]), placed, views))
+        scans = PosedScans(se2.compose(local, mount), ranges[keys], angles)
+        found.append(Segment(reference, int(pieces[first]), placed, scans))
         first = end
     return found
 
@@ -88,13 +88,13 @@ def submap(segments: Sequence[Segment], middle: int, poses: Array) -> Segment:
     reference, piece = segments[middle].reference, segments[middle].piece
     around = [each for each in segments[max(0, middle - 1) : middle + 2] if each.piece == piece]
     offsets = [se2.between(poses[reference], poses[each.reference]) for each in around]
-    views = PosedScans(
-        np.concatenate([se2.compose(off, each.views.poses) for off, each in zip(offsets, around, strict=True)]),
-        np.concatenate([each.views.ranges for each in around]),
-        around[0].views.angles,
+    scans = PosedScans(
+        np.concatenate([se2.compose(off, each.scans.poses) for off, each in zip(offsets, around, strict=True)]),
+        np.concatenate([each.scans.ranges for each in around]),
+        around[0].scans.angles,
     )
     placed = [each.elements.transformed(off) for off, each in zip(offsets, around, strict=True)]
-    return Segment(reference, piece, concatenate(placed), views)
+    return Segment(reference, piece, concatenate(placed), scans)
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def compare(first: Segment, surface: Surface, second: Segment, pose: Array) -> A
     second_matches = surface.partner_distances(placed) < MATCHED_M
     first_matches = Surface(placed).partner_distances(first.elements) < MATCHED_M
     first_in_second = first.elements.transformed(se2.inverse(pose))
-    contradicting = first.views.see_through(placed.select(~second_matches)).sum()
-    contradicting += second.views.see_through(first_in_second.select(~first_matches)).sum()
+    contradicting = first.scans.see_through(placed.select(~second_matches)).sum()
+    contradicting += second.scans.see_through(first_in_second.select(~first_matches)).sum()
     matched = int(second_matches.sum())
     return Agreement(matched, matched + int(first_matches.sum()), int(contradicting))

@@ -21,6 +21,6 @@ def test_partners_between_beams(moved):
 
 @pytest.mark.parametrize(("seen", "free"), [(19.0, False), (24.0, False), (40.0, True)])
 def test_grazing_beams(seen, free):
-    views = PosedScans(np.zeros((1, 3)), np.full((1, len(ANGLES)), seen), ANGLES)
+    scans = PosedScans(np.zeros((1, 3)), np.full((1, len(ANGLES)), seen), ANGLES)
     wall = Elements(np.array([[20.0, 1.0]]), np.array([[0.0, -1.0]]), np.array([0.1]))
-    assert views.see_through(wall).tolist() == [free]
+    assert scans.see_through(wall).tolist() == [free]
