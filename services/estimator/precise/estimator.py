@@ -59,7 +59,7 @@ if TYPE_CHECKING:
 START_COVARIANCE = np.diag([0.25, 0.25, 0.09])  # of a pose given without one
 MAX_SEARCH_INTERVAL = 150  # scans between two searches without success; the interval doubles from 1
 STILL_CLUTTER = 0.9  # probability that a key scan is clutter if the one before was: a whole room may be unlike its map
-WRONG_MATCH = 0.05  # probability that matching a scan with recent ones gives a wrong motion
+WRONG_MATCH = 1e-6  # probability that a match with recent scans is wrong, and the right motion one of many that fit the map
 UNKNOWN_SIGMA_M = 100.0  # published where the model does not know what to expect
 TARGET_BEAMS = 2000  # a scan with at least twice as many is thinned, because the time of a search grows with the beams
 
@@ -257,10 +257,9 @@ class PreciseEstimator:
         poses, evidence = view.descend(np.array([each.mean for each in motions]), _prior_of(motions))
         by_recent_scans = ScanMatch([[each] for each in motions], poses, evidence, found.pose)
         # Recent scans mislead where people move all around the robot, the map where much has changed.
-        clutter = self.modes[0].clutter
-        wrong = _log_joint(view, match, clutter) + np.log(WRONG_MATCH)
-        right = _log_joint(view, by_recent_scans, clutter) + np.log1p(-WRONG_MATCH)
-        return match if wrong > right else by_recent_scans
+        both = np.stack([match.poses[0], poses[0]])
+        by_map, by_scans = _log_at_poses(view, both, view.surfaces.small, np.full(2, self.modes[0].clutter))[0]
+        return match if by_map + np.log(WRONG_MATCH) > by_scans else by_recent_scans
 
     def _fuse(self, view: View, k: int, match: ScanMatch, widest: Candidate, observation: Observation) -> Mode:
         """Fuses the k-th hypothesis with the scan.
@@ -547,13 +546,6 @@ def _log_at_poses(view: View, poses: Array, skip: npt.NDArray[np.bool_], clutter
     of_clutter = np.log(prior) + _log_anywhere(view, skip)
     total = np.logaddexp(np.log1p(-prior) + mapped, of_clutter)
     return total, np.exp(of_clutter - total)
-
-
-def _log_joint(view: View, match: ScanMatch, clutter: float) -> float:
-    """Log density of the scan at the first hypothesis and of its motion, within the widest candidate."""
-    pose, prior = match.poses[:1], _prior_of([match.motions[0][-1]])
-    log_motion = 0.5 * float(np.linalg.slogdet(prior.information[0])[1]) - float(prior.energy(pose)[0])
-    return float(_log_at_poses(view, pose, view.surfaces.small, np.array([clutter]))[0][0]) + log_motion
 
 
 def _prior_of(candidates: list[Candidate]) -> Prior:
