@@ -441,8 +441,8 @@ class PreciseEstimator:
         Also the probability (N,) of clutter in the present scan then.
         """
         poses = np.array([mode.pose for mode in found])
-        stayed = np.zeros((0, len(found)))  # since each of the key scans so far
-        clutter = np.zeros_like(stayed)
+        stayed = np.full((1, len(found)), -np.inf)  # since each of the key scans so far; first, since none
+        clutter = np.full_like(stayed, CLUTTER)
         for key in self._local_map.scans:
             stayed = np.vstack([stayed, np.full(len(found), key.log_unknown)])
             clutter = np.vstack([clutter, np.full(len(found), CLUTTER)])

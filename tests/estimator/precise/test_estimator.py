@@ -150,6 +150,15 @@ def test_initial_pose(start):
     assert np.abs(off(posterior, pose)).max() < 0.02
 
 
+def test_wrong_initial_pose():
+    """A pose at which the map explains nothing of the scan: the robot is found elsewhere."""
+    made, scene = estimator(load_world("maze"))
+    wrong, pose = scene.poses(2)
+    made.restart(wrong, np.diag([1e-4, 1e-4, 1e-4]))
+    posterior = feed(made, scene, pose, 1)[0]
+    assert np.abs(off(posterior, pose)).max() < 0.02
+
+
 def test_unexplained_scans():
     made, scene = estimator(ROOM)
     rng, angles = np.random.default_rng(0), scene.scanner.angles()
