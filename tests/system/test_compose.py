@@ -26,6 +26,7 @@ HOLDS = {
     "router": set(), "none": set(), "recorder": {"mcap"}, "replay": {"mcap"}, "controller": {"scipy"},
     "bridge_ros2": {"rosbags"}, "simulator": {"pybullet", "scipy"}, "estimator-precise": {"numba", "scipy"},
     "estimator-paper": {"torch", "numba", "scipy"},
+    "mapper": {"numba", "scipy"},
     "viewer": {"mcap", "starlette", "typer"}, "cli": {"mcap", "typer", "matplotlib"},
 }  # fmt: skip
 
@@ -42,6 +43,7 @@ def image(tmp_path_factory):
         for scanner in ("replay", "none", "bridge_ros2"):
             builder.do("build", "simulator", timeout=300, PRESAGE_SCANNER=scanner)
         builder.do("build", "estimator", timeout=900, PRESAGE_ESTIMATOR="paper")
+        builder.do("build", "mapper", timeout=300)
         yield tag
     finally:
         docker("image", "rm", "--force", *(f"{tag}-{target}" for target in (*HOLDS, "estimator-particle-filter")))
@@ -210,3 +212,15 @@ def test_replaced_services(compose):
     assert not any(each.contact for each in truths)
     reasons = [m.reason for _, m, _ in recording.messages(STATUS) if before < m.stamp_ns * 1e-9 + 1 < after + 1]
     assert any("no belief for" in reason for reason in reasons)
+
+
+def test_mapping(compose):
+    """A building that only the simulator knows is mapped, and the robot reaches a goal in the map so far."""
+    project = compose(PRESAGE_HIDE_WORLD="1", PRESAGE_CONTROLLER_ARGS="--world=")
+    project.do("up", "--detach", "router", "simulator", "controller", "mapper")
+    for service in ("simulator", "controller", "mapper"):
+        project.becomes(service, "healthy")
+    project.do("run", "--rm", "--no-deps", "goal", "presage", "goal", "1.2", "0", "--wait")
+    project.do("run", "--rm", "--no-deps", "goal", "presage", "save-map", "floor")
+    assert (project.folder / "floor.yaml").exists()
+    project.down()
