@@ -10,7 +10,8 @@ import numpy as np
 from common.geometry import se2
 from services.estimator.precise.gauss_newton import COARSE_SIGMA_M, GaussNewton, Optimiser, Prior, View
 from services.estimator.precise.hypotheses import (
-    CLUTTER,
+    CLUTTER_PERSISTENCE,
+    CLUTTER_PROBABILITY,
     Mode,
     UnknownPlace,
     clip_to_map,
@@ -58,8 +59,9 @@ if TYPE_CHECKING:
 
 START_COVARIANCE = np.diag([0.25, 0.25, 0.09])  # of a pose given without one
 MAX_SEARCH_INTERVAL = 150  # scans between two searches without success; the interval doubles from 1
-STILL_CLUTTER = 0.9  # probability that a key scan is clutter if the one before was: a whole room may be unlike its map
-WRONG_MATCH = 1e-6  # probability that a match with recent scans is wrong, and the right motion one of many that fit the map
+WRONG_MATCH = (
+    1e-6  # probability that a match with recent scans is wrong, and the right motion one of many that fit the map
+)
 UNKNOWN_SIGMA_M = 100.0  # published where the model does not know what to expect
 TARGET_BEAMS = 2000  # a scan with at least twice as many is thinned, because the time of a search grows with the beams
 
@@ -136,7 +138,7 @@ class PreciseEstimator:
         return self.search() if posterior is None else posterior
 
     def track(self, observation: Observation) -> Posterior | None:
-        """Returns the posterior after one more scan, or None if the scan cannot be explained without a `search`."""
+        """Returns the posterior after one more scan, or None if `search` must be called for it."""
         likelihood = self._precision.likelihood(self.likelihood, observation.ranges, observation.angles)
         view = View(
             self.model,
@@ -272,6 +274,7 @@ class PreciseEstimator:
         candidates, pose, evidence = match.motions[k], match.poses[k], match.evidence
         unobserved = self._unobserved_direction(view, mode, pose, evidence.curvature[k])
         project_evidence(evidence, k, unobserved)
+        # A match with recent scans, the only candidate then, gives the motion in the unobserved direction, too.
         is_unobserved = unobserved is not None and len(candidates) > 1
         if unobserved is not None and is_unobserved and self._odometry_since_last_scan(observation) is None:
             *candidates, widest = (
@@ -324,6 +327,7 @@ class PreciseEstimator:
         self._local_pose, self._old_beams, self._log_change = local, old, log_change
         kidnapping = max(mode.log_evidence for mode in self.modes) + float(np.log(self.settings.unknown_probability))
         self._unknown_place.allow_kidnapping(kidnapping, self.settings.unmapped_share)
+        # Either the surroundings have changed, or the robot was carried off and all surfaces are new.
         self._unknown_place.present = max(_log_anywhere(view, old) + log_change, _log_anywhere(view, small))
         self._set_hypotheses(modes)
 
@@ -353,10 +357,11 @@ class PreciseEstimator:
         best = self.modes[0]
         if self._probability() < self.settings.tracking_probability:
             return True
+        # What another place must overcome: the volume of all poses, in volumes of the poses at one place.
         information = best.curvature + np.linalg.inv(self.seeds.spread)
-        another_place = np.log(self.seeds.volume) + 0.5 * (np.linalg.slogdet(information)[1] - 3 * np.log(2 * np.pi))
+        log_places = np.log(self.seeds.volume) + 0.5 * (np.linalg.slogdet(information)[1] - 3 * np.log(2 * np.pi))
         unknown = max(self._unknown_place.log_evidence, *(key.log_unknown for key in self._local_map.scans))
-        return bool(best.log_weight <= unknown - another_place)
+        return bool(best.log_weight <= unknown - log_places)
 
     def _is_search_due(self) -> bool:
         """Whether to search now: at each key scan while not tracking, otherwise ever more rarely."""
@@ -393,8 +398,8 @@ class PreciseEstimator:
     def _begin_with(self, view: View, found: list[Mode], unknown: float, all_changed: float = 0.0) -> bool:
         """Starts with the hypotheses ``found``, and the probability ``unknown`` that the robot is at none.
 
-        With the probability ``all_changed`` the map shows nothing that is there. Returns whether the map explains
-        more of the scan than that.
+        With the probability ``all_changed`` the map shows nothing that is there. Returns whether the best hypothesis
+        is more probable than that.
         """
         self._restart_local_map(view)
         self._unknown_place.restart(unknown, self.settings.unmapped_share)
@@ -442,10 +447,10 @@ class PreciseEstimator:
         """
         poses = np.array([mode.pose for mode in found])
         stayed = np.full((1, len(found)), -np.inf)  # since each of the key scans so far; first, since none
-        clutter = np.full_like(stayed, CLUTTER)
+        clutter = np.full_like(stayed, CLUTTER_PROBABILITY)
         for key in self._local_map.scans:
             stayed = np.vstack([stayed, np.full(len(found), key.log_unknown)])
-            clutter = np.vstack([clutter, np.full(len(found), CLUTTER)])
+            clutter = np.vstack([clutter, np.full(len(found), CLUTTER_PROBABILITY)])
             at_key = se2.compose(poses, se2.between(self._local_pose, key.pose))
             gain, clutter = _log_at_poses(key.view, at_key, key.seen, clutter)
             stayed += gain + key.log_change
@@ -521,28 +526,25 @@ class PreciseEstimator:
         return "lost" if self._was_tracking else "localising"
 
 
-# Log likelihoods in nats of the beams of a scan that are not in a mask ``skip`` (B,). Those of all other functions are
-# relative to `_log_ideal`, which is the same for every place.
-
-
 def _log_ideal(view: View, skip: npt.NDArray[np.bool_]) -> float:
-    """If all surfaces were known."""
+    """Log likelihood of the beams that are not in ``skip`` (B,), in nats, if all surfaces were known."""
     return float(view.surfaces.ideal[~skip].sum())
 
 
 def _log_anywhere(view: View, skip: npt.NDArray[np.bool_]) -> float:
-    """At a place of which no surface is known."""
+    """The same at a place of which no surface is known, minus `_log_ideal`."""
     return float((view.surfaces.density - view.surfaces.ideal)[~skip].sum())
 
 
 def _log_at_poses(view: View, poses: Array, skip: npt.NDArray[np.bool_], clutter: Array) -> tuple[Array, Array]:
-    """At ``poses`` (N, 3) in the map; (..., N). The scan may also be clutter, equally likely at all poses.
+    """The same (..., N) at ``poses`` (N, 3) in the map, or if the scan is clutter, which is as likely at all poses.
 
     ``clutter`` (..., N) is the probability that the key scan before was clutter. Also returns that of this scan.
     """
     mapped = view.surface_evidence(poses, skip=skip).log_likelihood - _log_ideal(view, skip)
-    begins = CLUTTER * (1 - STILL_CLUTTER) / (1 - CLUTTER)  # so that `CLUTTER` is the share of all key scans
-    prior = STILL_CLUTTER * clutter + begins * (1 - clutter)
+    # Clutter begins so often that `CLUTTER_PROBABILITY` is its share of all key scans.
+    begins = CLUTTER_PROBABILITY * (1 - CLUTTER_PERSISTENCE) / (1 - CLUTTER_PROBABILITY)
+    prior = CLUTTER_PERSISTENCE * clutter + begins * (1 - clutter)
     of_clutter = np.log(prior) + _log_anywhere(view, skip)
     total = np.logaddexp(np.log1p(-prior) + mapped, of_clutter)
     return total, np.exp(of_clutter - total)

@@ -27,8 +27,10 @@ SAME_POSITION_M, SAME_HEADING_RAD = 0.1, 0.1  # hypotheses nearer to one another
 # A direction counts as unobserved if its information is less than this share of the information across it; a learned
 # field adds a multiple of its squared ripple to the share.
 MIN_INFORMATION_RATIO, RIPPLE_FACTOR = 1e-4, 7.0
+WEAK_PRIOR = np.eye(3)  # 1/m², 1/rad²: keeps the covariance finite along unobserved directions
 MIN_WEIGHT = 1e-9  # hypotheses with less weight are dropped
-CLUTTER = 0.3  # probability that all that is new in a key scan is clutter
+CLUTTER_PROBABILITY = 0.3  # that all that is new in a key scan is clutter
+CLUTTER_PERSISTENCE = 0.9  # the same if the key scan before was clutter: a whole room may be unlike its map
 
 
 @dataclass(frozen=True)
@@ -39,14 +41,14 @@ class Mode:
     noise_covariance: Array  # (3, 3) caused by scanner noise and motion: fusion of scans reduces it
     model_covariance: Array  # (3, 3) caused by the model's error: fusion does not reduce it
     explained: float  # share of the last scan's beams that end at surfaces of the map
-    accuracy: float  # nats, of the last scan
+    accuracy: float  # nats, -ln p of the last scan
     complexity: float  # nats
     xi: Array  # (3,)
     curvature: Array  # (3, 3)
     log_evidence: float = 0.0  # nats, of the key scans and the prior; unnormalised
     present: float = 0.0  # nats, log likelihood of the present scan
-    clutter: float = CLUTTER  # probability that all that was new in the last key scan was clutter
-    present_clutter: float = CLUTTER  # the same of the present scan
+    clutter: float = CLUTTER_PROBABILITY  # probability that all that was new in the last key scan was clutter
+    present_clutter: float = CLUTTER_PROBABILITY  # the same of the present scan
     velocity: Array | None = None  # (3,) in base_link; None while unknown
     weight: float = 1.0
     unobserved_scans: int = 0  # number of consecutive scans without information along some direction
@@ -71,7 +73,7 @@ class UnknownPlace:
     weight: float = 1.0  # probability
 
     def restart(self, probability: float, unmapped: float) -> None:
-        """The whole map was searched; the robot is at no place of it with a ``probability`` times ``unmapped``."""
+        """The robot is at none of the hypotheses with a ``probability``, a share ``unmapped`` of it outside the map."""
         self.log_evidence = self.log_unmapped = float(np.log(probability * unmapped))
 
     def allow_kidnapping(self, log_probability: float, unmapped: float) -> None:
@@ -170,7 +172,7 @@ def update_mode(mode: Mode, fused: Fused, evidence: Evidence, k: int, period: fl
     """
     inverse = np.linalg.inv(fused.information)
     prior_information = fused.information - evidence.curvature[k]
-    inverse_of_scan = np.linalg.inv(evidence.curvature[k] + np.eye(3))
+    inverse_of_scan = np.linalg.inv(evidence.curvature[k] + WEAK_PRIOR)
     before = _root(mode.model_covariance)
     of_scan = _root(inverse_of_scan @ evidence.xi_model_covariance[k] @ inverse_of_scan)
     model_deviation = before + inverse @ evidence.curvature[k] @ (of_scan - before)
@@ -225,7 +227,7 @@ def select_distinct(poses: Array, energy: Array, count: int) -> list[int]:
 
 
 def weigh(modes: list[Mode], log_unknown: float, count: int) -> tuple[list[Mode], float]:
-    """Merges hypotheses, weighs them by evidence, sorts them best first, and drops those of negligible weight.
+    """Weighs the best hypothesis at each place by evidence, sorts them, and drops those of negligible weight.
 
     Returns up to ``count`` hypotheses, and the probability that the robot is at none of them; ``log_unknown`` is its
     unnormalised logarithm. The weights sum to 1.

@@ -25,7 +25,7 @@ MIN_CHANGED, MAX_CHANGED = 0.02, 0.5
 MAX_NOISE_FACTOR = 4.0  # the noise is never taken for more than this times the stated one, or less than its inverse
 MAX_MAP_ERROR_M = 0.1  # larger errors are not the map's, but changes of the surroundings
 NORMAL_MAD = 1.4826  # standard deviation of a Gaussian, in median absolute deviations
-MIN_BEAMS = 30
+MIN_LEARNING_BEAMS = 30
 
 
 @dataclass
@@ -43,7 +43,7 @@ class Precision:
 
     def likelihood(self, stated: Likelihood, ranges: Array, angles: Array) -> Likelihood:
         """The likelihood with the noise learned from the scans so far and from this one, (B,) m along (B,) rad."""
-        if not stated.relative and len(ranges) >= MIN_BEAMS:
+        if not stated.relative and len(ranges) >= MIN_LEARNING_BEAMS:
             factor = estimate_noise(ranges[None], angles) / stated.sigma
             factor = float(np.clip(factor, 1 / MAX_NOISE_FACTOR, MAX_NOISE_FACTOR))
             self.noise_factor += UPDATE_SHARE * (factor - self.noise_factor)
@@ -62,7 +62,7 @@ class Precision:
         with np.errstate(invalid="ignore"):
             errors = np.abs(view.ranges - surface)
             used = (errors < MAX_MAP_ERROR_M) & np.isfinite(scale)
-        if used.sum() < max(MIN_BEAMS, 0.3 * len(view.ranges)):
+        if used.sum() < max(MIN_LEARNING_BEAMS, 0.3 * len(view.ranges)):
             return
         variance = (NORMAL_MAD * float(np.median(errors[used]))) ** 2
         excess = variance - view.likelihood.sigma**2 - float(np.median(scale[used])) ** 2

@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 
 MAX_SIGMAS = 4.0  # a range farther from its prediction begins another surface
 CORNER_SIGMAS = 2.5  # a range farther from its prediction may lie behind a corner, where the direction is unknown again
-CORNER = 0.1  # probability of this
+CORNER_PROBABILITY = 0.1  # of this
 MAX_SLOPE = 2.0  # standard deviation of dr / (r d angle) where a surface begins
 CURVATURE = 0.2  # standard deviation of the change of slope per radian of the scan, as a share of 1 / r
-CORNER_M = 0.2  # typical jump of the range from one surface to the next, for half of the jumps
+JUMP_M = 0.2  # typical jump of the range from one surface to the next, for half of the jumps
 FAR_M = 10.0  # typical distance over which the other half is spread
 NO_RETURN = 0.05  # probability that a surface begins from which no beam returns
-CHANGES = 1.0  # of what is seen per radian of the scan, without the start of another surface
+CHANGES_PER_RAD = 1.0  # how often another thing is seen along a scan, although no other surface seems to begin
 MIN_BEAMS = 3
 OUTLIER = 0.01  # share of single beams with arbitrary ranges
 EDGE_M = 0.02  # an edge of the map may be misplaced by this, and by one beam more
@@ -57,7 +57,7 @@ class ScanSurfaces:
         small = np.bincount(surface)[surface] < MIN_BEAMS if count else starts
         edges = np.zeros(count, np.int64)
         _mark_edges(ranges, starts, increment, edges)
-        return cls(density, starts, ideal, small, edges, min(0.5, CHANGES * increment))
+        return cls(density, starts, ideal, small, edges, min(0.5, CHANGES_PER_RAD * increment))
 
 
 @jit
@@ -94,7 +94,7 @@ def _split(
 ) -> None:
     """Fills the fields of `ScanSurfaces`.
 
-    A Kalman filter follows u = 1 / r and its derivative u' by the angle. Along a straight wall u'' = -u exactly.
+    A Kalman filter follows u = 1 / r and its derivative u' by the angle; p is their covariance, a the predicted one. Along a straight wall u'' = -u exactly.
     """
     u, du, p00, p01, p11 = 0.0, 0.0, 0.0, 0.0, 0.0
     last, returned = -1, False
@@ -113,11 +113,11 @@ def _split(
         starts[b] = True
         if returned:
             turn = angles[b] - angles[last]
-            c, n = math.cos(turn), math.sin(turn)
-            u, du = c * u + n * du, c * du - n * u
-            a00 = c * c * p00 + 2 * c * n * p01 + n * n * p11
-            a01 = (c * c - n * n) * p01 + c * n * (p11 - p00)
-            a11 = n * n * p00 - 2 * c * n * p01 + c * c * p11 + (CURVATURE * u) ** 2 * abs(turn)
+            cos, sin = math.cos(turn), math.sin(turn)
+            u, du = cos * u + sin * du, cos * du - sin * u
+            a00 = cos * cos * p00 + 2 * cos * sin * p01 + sin * sin * p11
+            a01 = (cos * cos - sin * sin) * p01 + cos * sin * (p11 - p00)
+            a11 = sin * sin * p00 - 2 * cos * sin * p01 + cos * cos * p11 + (CURVATURE * u) ** 2 * abs(turn)
             variance, error = a00 + m * m, 1 / r - u
             square = error * error / variance
             if u > 1e-3 and square < MAX_SIGMAS**2:
@@ -129,7 +129,7 @@ def _split(
                 p00, p01, p11 = (1 - k0) * a00, (1 - k0) * a01, a11 - k1 * a01
                 if square > CORNER_SIGMAS**2:
                     p11 += (MAX_SLOPE * u) ** 2
-                    density[b] += math.log(CORNER)
+                    density[b] += math.log(CORNER_PROBABILITY)
                 starts[b] = False
             elif b + 1 < ranges.shape[0] and _continues(ranges[b + 1], angles[b + 1] - angles[b], u, du, variance):
                 # A single beam that met something else, such as dust, is no surface.
@@ -137,7 +137,7 @@ def _split(
                 starts[b] = False
                 p00, p01, p11 = a00, a01, a11
             else:
-                wide = CORNER_M * CORNER_M + s * s
+                wide = JUMP_M * JUMP_M + s * s
                 jump = r - 1 / u if u > 1e-3 else np.inf
                 near = math.exp(-0.5 * jump * jump / wide) / math.sqrt(2 * math.pi * wide)
                 density[b] = math.log(0.5 * near + 0.5 / FAR_M)

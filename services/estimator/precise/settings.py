@@ -9,7 +9,7 @@ from services.estimator.precise.motion_model import MotionNoise
 
 @dataclass(frozen=True)
 class Settings:
-    """Parameters of the precise estimator; the defaults hold for every shipped world."""
+    """Parameters of the precise estimator; the defaults are used for every shipped world."""
 
     # Search
     search_seeds: int = 48  # poses from which a search descends
