@@ -94,7 +94,8 @@ def _split(
 ) -> None:
     """Fills the fields of `ScanSurfaces`.
 
-    A Kalman filter follows u = 1 / r and its derivative u' by the angle; p is their covariance, a the predicted one. Along a straight wall u'' = -u exactly.
+    A Kalman filter follows u = 1 / r and its derivative u' by the angle; p is their covariance, a the predicted one.
+    Along a straight wall u'' = -u exactly.
     """
     u, du, p00, p01, p11 = 0.0, 0.0, 0.0, 0.0, 0.0
     last, returned = -1, False
