@@ -7,6 +7,7 @@ from typing import Any
 
 from lab.accuracy.report import cell
 from lab.experiments.results import markdown, number, read
+from lab.real_logs.experiment import claims_of
 
 PRESETS = {"precise": "presage", "particle-filter": "particle filter, tuned", "amcl-defaults": "AMCL-like defaults"}
 # Labels in README, and the tasks of `presage bench accuracy`
@@ -26,13 +27,13 @@ def real_logs(folder: Path) -> str:
         [summary[f"{task}, {name}"] for name in PRESETS]
         for task in ("a: tracking with odometry", "b: tracking without", "c: from nothing")
     )
-    wrong = [f"{100 * row['wrong_claims_share']:.1f} %; {row['wrong_claim_longest_s']:.1f} s" for row in odometry]
+    claims = [f"{claims_of(row)}; {row['wrong_claim_longest_s']:.1f} s" for row in odometry]
     return markdown(
         ["", *PRESETS.values()],
         [
-            ["tracked, with odometry", *(f"{100 * row['tracked_share']:.1f} %" for row in odometry)],
-            ["tracked, laser alone", *(f"{100 * row['tracked_share']:.1f} %" for row in laser)],
-            ["wrong poses reported as `tracking`; longest (odometry)", *wrong],
+            ["pose correct, with odometry", *(f"{100 * row['tracked_share']:.1f} %" for row in odometry)],
+            ["pose correct, laser alone", *(f"{100 * row['tracked_share']:.1f} %" for row in laser)],
+            ["state `tracking`, wrong of these; longest (odometry)", *claims],
             ["unknown start found within 40 scans", *(f"{row['found']} of {row['trials']}" for row in unknown)],
         ],
     )

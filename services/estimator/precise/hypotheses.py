@@ -30,7 +30,7 @@ MIN_INFORMATION_RATIO, RIPPLE_FACTOR = 1e-4, 7.0
 WEAK_PRIOR = np.eye(3)  # 1/m², 1/rad²: keeps the covariance finite along unobserved directions
 MIN_WEIGHT = 1e-9  # hypotheses with less weight are dropped
 CLUTTER_PROBABILITY = 0.3  # that all that is new in a key scan is clutter
-CLUTTER_PERSISTENCE = 0.9  # the same if the key scan before was clutter: a whole room may be unlike its map
+CLUTTER_PERSISTENCE = 0.5  # the same if the key scan before was clutter: a whole room may be unlike its map
 
 
 @dataclass(frozen=True)
