@@ -11,6 +11,8 @@
 A view that is refused, or that the robot gets no nearer to for `STALLED_NS`, is given up.
 
 A goal of a user pauses it until `PAUSE_NS` after that goal was reached, refused or cancelled.
+
+While the robot does not know where it is in the map, it keeps its goal, and the controller looks for the place instead.
 """
 
 from __future__ import annotations
@@ -47,7 +49,7 @@ class Explorer:
         self.goal: Goal | None = None  # its own goal
         self.paused = False  # the goal of a user takes precedence
         self.path_m = 0.0
-        self._pose = pose
+        self._pose, self._located = pose, True
         # Relative to the last key scan, so that it moves with the map when a loop closes.
         self._home_key = len(planned.message.poses) - 1
         self._home = se2.between(planned.message.poses[self._home_key], pose)
@@ -76,10 +78,11 @@ class Explorer:
         """A user has set a goal, or cancelled it."""
         self.goal, self.paused, self._over_since_ns = None, True, None
 
-    def move(self, pose: Array) -> None:
-        """The robot is at a pose (3,)."""
-        self.path_m += float(np.hypot(*(pose - self._pose)[:2]))
-        self._pose = pose
+    def move(self, pose: Array, *, located: bool) -> None:
+        """The robot is at a pose (3,), in the map if it is ``located``, else in a frame of its own."""
+        if located == self._located:
+            self.path_m += float(np.hypot(*(pose - self._pose)[:2]))
+        self._pose, self._located = pose, located
 
     def survey(self, view: ScannerView) -> Survey:
         """What the choice of the next view depends on."""
@@ -94,6 +97,9 @@ class Explorer:
     def needs_goal(self, state: GoalState, stamp_ns: int) -> bool:
         """Whether the present goal has just ended, so that a view must be chosen; notes how it ended."""
         if not self.active or not (self.paused or self.goal is not None):
+            return False
+        if state.phase is Phase.UNLOCALISED:
+            self._progress = self._pose, 0  # it gets on in another way
             return False
         if self.paused:
             return self._resumes(state, stamp_ns)
@@ -152,7 +158,9 @@ class Explorer:
         """The controller's status, with the progress of the exploration."""
         progress = Exploration(phase=self.phase, seq=self.seq, area=self.map.free_area_m2, path=self.path_m)
         status = status.model_copy(update={"exploration": progress})
-        if not self.drives or status.state in {"lost", "manual"} or (status.state == "blocked" and not status.refused):
+        if not self.drives or not self._located or status.state in {"lost", "manual"}:
+            return status
+        if status.state == "blocked" and not status.refused:
             return status
         reason = "returning to the start" if self.phase == "returning" else "going where a scan tells most"
         return status.model_copy(update={"state": "exploring", "reason": reason, "refused": False})
