@@ -29,8 +29,9 @@ SERVICES = {
 GOAL = (16.5, 6.5)  # m in map
 LARGE, SMALL = {"width": 1440, "height": 900}, {"width": 960, "height": 540}  # px of the page, still and filmed
 # Only the map is filmed: while mapping, there is neither a free energy nor a true pose to draw.
-FILM_STYLE = """.panels, .dock, .zoom, .legend { display: none !important; }
+FILM_STYLE = """.panels { display: none; }
 main { grid-template: 1fr / 1fr !important; }
+.dock, .zoom, .legend { visibility: hidden; }
 .notices { position: absolute; inset: auto 10px 10px; }"""
 PERIOD, SPEED_UP = 1.0, 8.0  # s of the robot's time between the pictures of the animation; how much faster it plays
 END_MS = 2500  # for which the last picture is shown
@@ -71,6 +72,7 @@ def film(seen: Visit) -> list[tuple[float, Image.Image]]:
     seen.wait("store.map && store.frame?.status?.exploration", 120)
     seen.page.locator("#speed").select_option("0.5")  # pictures take their time
     seen.page.add_style_tag(content=FILM_STYLE)
+    seen.see("document.getElementById('legend').open = false")
     pictures = []
     while seen.see("store.frame.status.exploration.phase") != "finished":
         now = seen.see("store.frame.t")
