@@ -35,7 +35,7 @@ from presage.session.stack import Stack
 from presage.terminal.options import arguments
 from presage.terminal.output import check_file, make_folder, write_json
 
-UNKNOWN_WORLD = "office"
+DEFAULT_WORLD = "office"  # unless the options, the environment or the settings file name another
 # In the map when the robot is carried off. The map is the larger part of the drive, so it must be larger than what the
 # robot sees until it has found itself, which takes about 20.
 CARRIED_AT_KEY_SCANS = 40
@@ -256,7 +256,9 @@ def run_unknown_demo(demo: DemoOptions, stack: Stack, console: Console) -> tuple
     Returns the recording, what was measured, and why a step failed, or an empty text. Raises UserError if an option is
     wrong or a service fails.
     """
-    plan = plan_session(demo.config, demo.world or UNKNOWN_WORLD, "", arguments(seed=demo.seed), mapping=True)
+    plan = plan_session(demo.config, demo.world, "", arguments(seed=demo.seed), mapping=True)
+    if "world" not in plan.simulator_settings.model_fields_set:
+        plan = plan_session(demo.config, DEFAULT_WORLD, "", arguments(seed=demo.seed), mapping=True)
     make_folder(demo.out, "--out")
     recording, failure = new_recording(demo.out, stack.robot), ""
     stack.start_router()

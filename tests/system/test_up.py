@@ -66,11 +66,12 @@ def test_demo_reaches_its_goal(process, tmp_path):
 
 def test_demo_in_an_unknown_building(process, tmp_path):
     file, config = tmp_path / "demo.json", tmp_path / "lockstep.yaml"
-    config.write_text("simulator: {pace: lockstep, beams: 207}")
-    args = ("--config", str(config), "--world", "maze", "--out", str(tmp_path / "out"), "--json", str(file), "--quiet")
+    config.write_text("world: maze\nsimulator: {pace: lockstep, beams: 207}")
+    args = ("--config", str(config), "--out", str(tmp_path / "out"), "--json", str(file), "--quiet")
     running = process("presage.__main__", "demo", "--unknown", *args)
     assert running.wait(170) == 0, running.output
     numbers = json.loads(file.read_text())
+    assert numbers["world"] == "maze"
     for step, words in zip(numbers["steps"], ("explored a", "carried off", "a goal", "returned"), strict=True):
         assert words in step["what"]
         assert step["error_m"] < 0.1, numbers
