@@ -5,7 +5,7 @@
 | - | a goal with `explore` | EXPLORING |
 | EXPLORING, RETURNING | a view is worth the way | EXPLORING |
 | EXPLORING, RETURNING | no view is | RETURNING |
-| RETURNING | the robot has arrived | FINISHED |
+| RETURNING | the robot has arrived and stands | FINISHED |
 | RETURNING | the way back stays refused | FAILED |
 
 A view that is refused, or that the robot gets no nearer to for `STALLED_NS`, is given up.
@@ -36,6 +36,7 @@ STALLED_NS = 8_000_000_000  # without a motion of STALLED_M after which a place 
 STALLED_M = 0.2
 VIEW_TOLERANCE_M = 0.1
 HOME_TOLERANCE_M = 0.005
+RETURNED_M = 0.02  # a robot that stopped late and stands farther away tries again
 SAME_PLACE_M = 0.1  # a view this close to the present goal is the same
 
 
@@ -94,8 +95,11 @@ class Explorer:
         poses, home = self.map.message.poses, self.home[:2]
         return Survey(self.map.graph, poses, self._arrivals, view, self._pose, home, target, self._unreachable)
 
-    def needs_goal(self, state: GoalState, stamp_ns: int) -> bool:
-        """Whether the present goal has just ended, so that a view must be chosen; notes how it ended."""
+    def needs_goal(self, state: GoalState, stamp_ns: int, *, moving: bool) -> bool:
+        """Whether the present goal has just ended, so that a view must be chosen; notes how it ended.
+
+        ``moving`` is what the command says: a robot may stop late, beyond the goal that it has reached.
+        """
         if not self.active or not (self.paused or self.goal is not None):
             return False
         if state.phase is Phase.UNLOCALISED:
@@ -104,19 +108,26 @@ class Explorer:
         if self.paused:
             return self._resumes(state, stamp_ns)
         assert self.goal is not None  # noqa: S101 - as it is not paused
-        stalled, reached = self._stalled(stamp_ns), state.phase is Phase.REACHED
+        stalled = self._stalled(stamp_ns)
         if self.phase == "returning":
-            if not state.active and (reached or stalled):
-                self.phase = "finished" if reached else "failed"
-            return self.active and not state.active  # if refused: from a narrow place, the next choice may be another
+            return self._needs_way_back(state, stalled=stalled, moving=moving)
         if state.active and not stalled:
             return False
-        if reached:
+        if state.phase is Phase.REACHED:
             self._arrivals = np.concatenate([self._arrivals, self._pose[None]])
         else:
             self._unreachable = np.concatenate([self._unreachable, self.goal.pose.array()[None, :2]])
         self.goal, self._progress = None, (self._pose, 0)
         return True
+
+    def _needs_way_back(self, state: GoalState, *, stalled: bool, moving: bool) -> bool:
+        """Whether the robot stands elsewhere than where it began; if not, the exploration is over."""
+        reached = state.phase is Phase.REACHED
+        if state.active or (reached and moving):
+            return False
+        if stalled or (reached and np.hypot(*(self._pose - self.home)[:2]) <= RETURNED_M):
+            self.phase = "finished" if reached else "failed"
+        return self.active  # if refused: from a narrow place, the next choice may be another
 
     def _resumes(self, state: GoalState, stamp_ns: int) -> bool:
         """Whether the goal of a user has been over for long enough."""

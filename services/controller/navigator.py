@@ -162,7 +162,7 @@ class Navigator:
         command, limited_by_scan = self._command.limit(belief.stamp_ns, desired, self._scan_points)
         moving = is_moving(self._command.velocity)
         self.goal_state.update_progress(belief.stamp_ns, self.decision, moving=moving, limited_by_scan=limited_by_scan)
-        if self.explorer is not None and self.explorer.needs_goal(self.goal_state, belief.stamp_ns):
+        if self.explorer is not None and self.explorer.needs_goal(self.goal_state, belief.stamp_ns, moving=moving):
             self._view_due = True
         status = self._explained(self.goal_state.status(belief.stamp_ns, distance))
         if (terms := self.decision.terms) is not None:

@@ -7,6 +7,7 @@ import numpy as np
 from common.geometry.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from common.messages.definitions import Drive, Map, Twist
 from common.robot.base import Robot
+from services.controller.goal_state import Phase
 from services.controller.growing_map import PlannedMap
 from services.controller.navigator import Navigator
 from services.controller.policies.exploration import View
@@ -133,6 +134,20 @@ def test_views_then_the_way_back():
     assert 5.9 < status.exploration.path < 7.5
     assert status.state == "reached"
     assert drive.navigator.take_survey() is None
+
+
+def test_a_robot_that_stops_late_returns_again():
+    drive = begin()
+    drive.explore((4.0, 2.5))
+    drive.until(lambda _: drive.navigator._view_due)
+    drive.explore(None)
+    drive.until(lambda _: drive.navigator.goal_state.phase is Phase.REACHED)
+    drive.pose = drive.pose - [0.06, 0.0, 0.0]
+    drive.until(lambda _: drive.navigator._view_due)
+    drive.explore(None)
+    assert drive.step().exploration.phase == "returning"
+    drive.until(lambda status: status.exploration.phase == "finished")
+    assert np.hypot(*(drive.pose - START)[:2]) < 0.01
 
 
 def test_a_goal_of_a_user_takes_precedence():
