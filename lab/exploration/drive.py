@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from common.geometry import se2
-from common.geometry.occupancy_grid import FREE
+from common.geometry.coverage import MIN_PASSAGE_M, mapped_share, points_in, reachable_area
 from common.geometry.se2 import Array
 from common.geometry.world import World
 from common.messages.definitions import Belief, Goal, Map, Odom, Pose, Scan, Twist
@@ -31,7 +30,6 @@ from services.simulator.simulation import Setup, Simulation
 ChooseViewpoint = Callable[[Survey], Viewpoint | None]
 CELL_M = 0.05  # of the map
 MAP_PERIOD_NS = 1_000_000_000  # between two versions of the map, as in the mapper's service
-MIN_PASSAGE_M = 0.7  # a narrower door may be refused (docs/navigation.md, limits)
 LAST_SCANS = 15  # while the robot comes to a stand
 
 
@@ -131,35 +129,19 @@ def explore(
     return run
 
 
-def reachable_area(world: World, radius: float, start: Array) -> shapely.Geometry:
-    """The area that a disc of ``radius`` m can cover, coming from ``start`` (3,)."""
-    room = shapely.buffer(world.free_space, -radius)
-    parts = [part for part in shapely.get_parts(room) if shapely.distance(part, shapely.Point(start[:2])) < 0.01]
-    return shapely.buffer(shapely.union_all(parts), radius)
-
-
-def mapped_share(run: ExplorationRun, area: shapely.Geometry) -> float:
-    """Share of an area that is free in the map, by points 5 cm apart."""
-    x0, y0, x1, y1 = shapely.bounds(area)
-    x, y = np.meshgrid(np.arange(x0 + 0.025, x1, 0.05), np.arange(y0 + 0.025, y1, 0.05))
-    points = np.stack([x.ravel(), y.ravel()], axis=-1)
-    points = points[shapely.contains_xy(area, *points.T)]
-    if run.map is None:
-        return 0.0
-    # The map's origin is where the robot began.
-    return float(np.mean(run.map.grid.values_at(se2.transform(se2.inverse(run.truths[0]), points)) == FREE))
-
-
 def measure(run: ExplorationRun, world: World, robot: Robot) -> dict[str, Any]:
     """The numbers of one exploration."""
     truths, beliefs = np.array(run.truths), np.array(run.beliefs)
     area, tight = (reachable_area(world, radius, truths[0]) for radius in (MIN_PASSAGE_M / 2, robot.radius))
+    grid = None if run.map is None else run.map.grid
+    # The map's origin is where the robot began.
+    share, share_tight = (0.0 if grid is None else mapped_share(grid, points_in(a), truths[0]) for a in (area, tight))
     errors, _ = trajectory_errors(beliefs, truths)
     return {
         "phase": run.phase,
         "reason": run.reason,
-        "mapped_share": mapped_share(run, area),
-        "mapped_share_tight": mapped_share(run, tight),
+        "mapped_share": share,
+        "mapped_share_tight": share_tight,
         "reachable_m2": float(shapely.area(area)),
         "path_m": float(np.hypot(*np.diff(truths[:, :2], axis=0).T).sum()),
         "return_error_m": float(np.hypot(*(truths[-1] - truths[0])[:2])),

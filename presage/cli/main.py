@@ -135,6 +135,10 @@ def up(
 
 @app.command(rich_help_panel="Run", short_help="The whole loop once: localise, drive, record, draw, summarise.")
 def demo(
+    unknown: Annotated[
+        bool,
+        typer.Option("--unknown", help="In an unknown building: explore, be carried off, drive to a goal, return."),
+    ] = False,
     world: WorldName = "",
     goal: Annotated[
         tuple[float, float] | None, typer.Option(help="Goal as X Y in m. Defaults to a free place far from the start.")
@@ -153,14 +157,20 @@ def demo(
 ) -> None:
     """Run the whole loop once: localise without a start pose, drive to a goal, record, draw and summarise.
 
-    The live page shows it while it runs. Exits with status 1 if the goal is not reached.
+    With --unknown, the robot maps a building that it has never seen, by default `office`: it explores, is carried off,
+    finds itself in its map, drives to a goal given meanwhile, explores the rest and returns. This takes two and a half
+    minutes.
 
-    Examples: `presage demo`; `presage demo --goal 12 2 --seed 3 --json run.json`; `presage demo --world office`.
+    The live page shows it while it runs. Exits with status 1 if the goal is not reached, or a step fails.
+
+    Examples: `presage demo`; `presage demo --goal 12 2 --seed 3 --json run.json`; `presage demo --world office`;
+    `presage demo --unknown --open`.
     """
     from presage.session.demo import DemoOptions, demo_command
+    from presage.session.unknown_demo import unknown_demo_command
 
     chosen = DemoOptions(config, world, goal, out, seed or 0, estimator, quiet, open_page)
-    raise typer.Exit(demo_command(chosen, json_file))
+    raise typer.Exit((unknown_demo_command if unknown else demo_command)(chosen, json_file))
 
 
 # The groups of the help appear in this order.

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.world import World
 from common.messages.definitions import Belief, Goal, Health, Prediction, Scan, Stamped, Status, Truth
@@ -41,6 +42,15 @@ class StampedRows:
         self._logged.append(logged_ns)
         self._rows.extend(row)
         return True
+
+    def moved(self, frame: Array) -> StampedRows:
+        """The same poses seen from another frame: ``frame`` (3,) is that of the poses in the new one."""
+        result = StampedRows(self.width)
+        result._stamps, result._logged = self._stamps, self._logged
+        rows = self.rows
+        rows[:, :3] = se2.compose(frame, rows[:, :3])
+        result._rows = array("d", rows.ravel())
+        return result
 
     @property
     def stamps_ns(self) -> Stamps:
@@ -134,6 +144,13 @@ def gather_session(recording: Recording) -> RecordedSession:
     for _, message, raw in entries(recording, robot):
         gatherer.add(message, raw.logged_ns)
     session.true_poses = _truth_at_beliefs(session.belief, session.truth)
+    known = np.flatnonzero(np.isfinite(session.true_poses[:, 0]))
+    if session.estimator == "mapper" and len(known):
+        # The mapper's map has a frame of its own. In it, the first belief is true by definition.
+        first = known[0]
+        frame = se2.compose(session.true_poses[first], se2.inverse(session.belief.poses[first]))
+        session.truth = session.truth.moved(se2.inverse(frame))
+        session.true_poses = np.asarray(se2.between(frame, session.true_poses))
     session.warning = recording.warning  # damage is only found while reading
     session.undecodable = sum(recording.undecodable.values())
     return session

@@ -61,12 +61,10 @@ def run_demo(demo: DemoOptions, stack: Stack, console: Console) -> tuple[Path, b
     plan = plan_session(demo.config, demo.world, "", arguments(seed=demo.seed), arguments(estimator=demo.estimator))
     goal = _choose_goal(demo, load_world(plan.estimator_settings.world))
     make_folder(demo.out, "--out")
-    start_time = datetime.now(timezone.utc).strftime("%Y%m%d-%H%M%S")
+    recording = new_recording(demo.out, stack.robot)
     simulator = list(plan.simulator)
     if plan.simulator_settings.beams is None:
         simulator += arguments(beams=DEMO_BEAMS)
-    # The random part keeps names unique if several demos record into the same folder in the same second.
-    recording = demo.out / f"presage-{stack.robot}-{start_time}-{secrets.token_hex(3)}.mcap"
     stack.start_router()
     with open_bus(stack.link()) as bus:
         watch = Watch(bus, TRUTH, BELIEF, STATUS, HEALTH)
@@ -87,13 +85,23 @@ def run_demo(demo: DemoOptions, stack: Stack, console: Console) -> tuple[Path, b
         stack.check()
         for name in ("controller", "estimator", "simulator"):
             stack.stop(name)
-        status = stack.stop("recorder")
+        check_recorded(recording, stack.stop("recorder"))
+    return recording, reached
+
+
+def new_recording(folder: Path, robot: str) -> Path:
+    """Path of a new recording, unique also among demos that begin in the same second."""
+    start_time = datetime.now(timezone.utc).strftime("%Y%m%d-%H%M%S")
+    return folder / f"presage-{robot}-{start_time}-{secrets.token_hex(3)}.mcap"
+
+
+def check_recorded(recording: Path, status: int) -> None:
+    """Raises UserError if the recorder, which ended with ``status``, left no complete recording."""
     if status != 0 or not recording.exists():
         raise UserError(
             f"the recorder ended with status {status}; the unfinished recording is {recording}.active "
             "(`presage recover` completes it)"
         )
-    return recording, reached
 
 
 def _choose_goal(demo: DemoOptions, world: World) -> tuple[float, float]:

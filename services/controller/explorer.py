@@ -5,12 +5,14 @@
 | - | a goal with `explore` | EXPLORING |
 | EXPLORING, RETURNING | a viewpoint is worth a visit | EXPLORING |
 | EXPLORING, RETURNING | no viewpoint is | RETURNING |
-| RETURNING | the robot has arrived | FINISHED |
+| RETURNING | the robot has arrived and stands | FINISHED |
 | RETURNING | the way back stays refused | FAILED |
 
 A viewpoint is given up if it is refused, or if the robot does not move towards it for `STALLED_NS`.
 
 A goal of a user pauses the exploration until `PAUSE_NS` after that goal was reached, refused or cancelled.
+
+While the robot does not know where it is in the map, it keeps its goal, and the controller looks for the place instead.
 """
 
 from __future__ import annotations
@@ -34,6 +36,7 @@ STALLED_NS = 8_000_000_000  # without a motion of `STALLED_M`, after which the g
 STALLED_M = 0.2
 VIEWPOINT_TOLERANCE_M = 0.1
 HOME_TOLERANCE_M = 0.005
+RETURNED_M = 0.02  # a robot that stopped late and stands farther away tries again
 SAME_PLACE_M = 0.1  # a viewpoint this close to the present goal is the same
 
 
@@ -47,7 +50,7 @@ class Explorer:
         self.goal: Goal | None = None  # of the exploration, not of a user
         self.paused = False  # the goal of a user takes precedence
         self.path_m = 0.0
-        self._pose = pose
+        self._pose, self._located = pose, True
         # Relative to the last key scan, so that it moves with the map when a loop closes.
         self._home_key = len(planned.message.poses) - 1
         self._home = se2.between(planned.message.poses[self._home_key], pose)
@@ -76,10 +79,11 @@ class Explorer:
         """A user has set a goal, or cancelled it."""
         self.goal, self.paused, self._user_goal_over_since_ns = None, True, None
 
-    def move(self, pose: Array) -> None:
-        """The robot is at a pose (3,)."""
-        self.path_m += float(np.hypot(*(pose - self._pose)[:2]))
-        self._pose = pose
+    def move(self, pose: Array, *, located: bool) -> None:
+        """The robot is at a pose (3,), in the map if it is ``located``, else in a frame of its own."""
+        if located == self._located:
+            self.path_m += float(np.hypot(*(pose - self._pose)[:2]))
+        self._pose, self._located = pose, located
 
     def survey(self, field_of_view: FieldOfView) -> Survey:
         """What the choice of the next viewpoint depends on."""
@@ -91,9 +95,15 @@ class Explorer:
         poses, home = self.map.message.poses, self.home[:2]
         return Survey(self.map.graph, poses, self._arrivals, field_of_view, self._pose, home, target, self._unreachable)
 
-    def update(self, state: GoalState, stamp_ns: int) -> bool:
-        """Takes the state of the robot's goal after a scan. Returns whether a viewpoint must be chosen now."""
-        if not self.active:
+    def update(self, state: GoalState, stamp_ns: int, *, moving: bool) -> bool:
+        """Takes the state of the robot's goal after a scan. Returns whether a viewpoint must be chosen now.
+
+        ``moving`` is what the command says: a robot may stop late, beyond the goal that it has reached.
+        """
+        if not self.active or not (self.paused or self.goal is not None):
+            return False
+        if state.phase is Phase.UNLOCALISED:
+            self._last_moved = self._pose, 0  # it gets on in another way
             return False
         if self.paused:
             return self._resume_after_user_goal(state, stamp_ns)
@@ -102,7 +112,7 @@ class Explorer:
         self._note_motion(stamp_ns)
         stalled = stamp_ns - self._last_moved[1] > STALLED_NS
         if self.phase == "returning":
-            return self._update_return(state, stalled=stalled)
+            return self._update_return(state, stalled=stalled, moving=moving)
         return self._update_viewpoint(self.goal, state, stalled=stalled)
 
     def _resume_after_user_goal(self, state: GoalState, stamp_ns: int) -> bool:
@@ -121,14 +131,15 @@ class Explorer:
         if np.hypot(*(self._pose - place)[:2]) > STALLED_M or not 0 < since_ns <= stamp_ns:
             self._last_moved = self._pose, stamp_ns
 
-    def _update_return(self, state: GoalState, *, stalled: bool) -> bool:
+    def _update_return(self, state: GoalState, *, stalled: bool, moving: bool) -> bool:
         """Ends the exploration if the robot is back, or cannot get back; returns whether to try once more."""
-        if state.active:
+        reached = state.phase is Phase.REACHED
+        if state.active or (reached and moving):
             return False
-        if state.phase is Phase.REACHED:
+        if reached and np.hypot(*(self._pose - self.home)[:2]) <= RETURNED_M:
             self.phase = "finished"
         elif stalled:
-            self.phase = "failed"
+            self.phase = "finished" if reached else "failed"
         return self.active  # it was refused: from a narrow place, the next attempt may find another path
 
     def _update_viewpoint(self, goal: Goal, state: GoalState, *, stalled: bool) -> bool:
@@ -164,7 +175,9 @@ class Explorer:
         """The controller's status, with the progress of the exploration."""
         progress = Exploration(phase=self.phase, seq=self.seq, area=self.map.free_area_m2, path=self.path_m)
         status = status.model_copy(update={"exploration": progress})
-        if not self.drives or status.state in {"lost", "manual"} or (status.state == "blocked" and not status.refused):
+        if not self.drives or not self._located or status.state in {"lost", "manual"}:
+            return status
+        if status.state == "blocked" and not status.refused:
             return status
         reason = "returning to the start" if self.phase == "returning" else "going where a scan tells most"
         return status.model_copy(update={"state": "exploring", "reason": reason, "refused": False})

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common.geometry import se2
-from common.messages.definitions import Belief, CmdVel, Drive, Goal, PolicyEnergy, Scan, Status
+from common.messages.definitions import Belief, CmdVel, Drive, Exploration, Goal, PolicyEnergy, Scan, Status
 from common.robot.base import Robot
 from common.robot.motion_distortion import correct_scan
 from common.runtime import safety
 from services.controller.docking import STANDING_TIME_S, Docking
 from services.controller.explorer import Explorer
-from services.controller.goal_state import GoalState
+from services.controller.goal_state import GoalState, Phase
 from services.controller.manual_drive import ManualDrive
 from services.controller.policies.decision import Decision, Policy
 from services.controller.policies.motion_model import delay_until_effect, is_moving, turn_rate
@@ -48,6 +48,7 @@ class Navigator:
         self._map: PlannedMap | None = None  # the mapper's, if there is one
         self._pose: Array | None = None  # (3,) base_link in map, of the latest belief that tracks
         self.explorer: Explorer | None = None  # the last exploration, unless it was cancelled
+        self._requested: Goal | None = None  # to explore, which waits for the first map and a pose in it
         self._viewpoint_due = False  # the exploration is to choose a viewpoint
         self._scan: Scan | None = None
         self._scan_points = np.zeros((0, 2))  # m in base_link
@@ -64,6 +65,7 @@ class Navigator:
 
     def on_goal(self, goal: Goal) -> None:
         """Replace the goal, cancel it, or refuse it if it is known that it cannot be reached. Or begin to explore."""
+        self._requested = None
         if goal.cancel or goal.explore or self.explorer is None or not self.explorer.active:
             self.explorer = None
         else:
@@ -75,14 +77,18 @@ class Navigator:
 
     def _explore(self, request: Goal) -> None:
         self.policy.set_goal(None)
-        if self._map is None or self._pose is None:
-            self.goal_state.start(
-                request,
-                "cannot explore: no map from a mapper. Start with `presage up --mapping` and wait for the first scan",
-            )
+        if self.preset is None or self.world is not None:
+            reason = "cannot explore in a known world: start with `presage up --mapping`"
+            self.goal_state.start(request, reason)
             return
         self.goal_state.cancel()
-        self.explorer, self._viewpoint_due = Explorer(request.seq, self._pose, self._map), True
+        self._requested = request
+        self._begin_exploration()
+
+    def _begin_exploration(self) -> None:
+        if self._requested is not None and self._map is not None and self._pose is not None:
+            self.explorer = Explorer(self._requested.seq, self._pose, self._map)
+            self._requested, self._viewpoint_due = None, True
 
     def on_map(self, planned: PlannedMap) -> None:
         """Explore in a new version of the mapper's map; the policy gets it from the caller."""
@@ -93,6 +99,8 @@ class Navigator:
 
     def take_survey(self) -> Survey | None:
         """What the choice of a viewpoint depends on, if one is due. The answer is to be passed to `use_viewpoint`."""
+        if self.goal_state.phase is Phase.UNLOCALISED:
+            return None  # the present goal makes the robot look for its place
         due, self._viewpoint_due = self._viewpoint_due, False
         if not due or self.explorer is None or self._map is None or self._scan is None or not self.explorer.drives:
             return None
@@ -138,8 +146,9 @@ class Navigator:
         self.decision = Decision()
         if belief.state == "tracking":
             self._pose = pose
+        self._begin_exploration()
         if self.explorer is not None:
-            self.explorer.move(pose)
+            self.explorer.move(pose, located=belief.state == "tracking")
         if self._scan is not None and self._scan.stamp_ns == belief.stamp_ns:
             self.policy.observe(self._scan, belief)
         if manual_twist is not None:
@@ -155,7 +164,7 @@ class Navigator:
         command, limited_by_scan = self._command.limit(belief.stamp_ns, desired, self._scan_points)
         moving = is_moving(self._command.velocity)
         self.goal_state.update_progress(belief.stamp_ns, self.decision, moving=moving, limited_by_scan=limited_by_scan)
-        if self.explorer is not None and self.explorer.update(self.goal_state, belief.stamp_ns):
+        if self.explorer is not None and self.explorer.update(self.goal_state, belief.stamp_ns, moving=moving):
             self._viewpoint_due = True
         status = self._explained(self.goal_state.status(belief.stamp_ns, distance))
         if (terms := self.decision.terms) is not None:
@@ -211,6 +220,10 @@ class Navigator:
         return self._explained(self.goal_state.status(stamp_ns, None))
 
     def _explained(self, status: Status) -> Status:
+        if self._requested is not None:
+            progress = Exploration(phase="exploring", seq=self._requested.seq, area=0.0, path=0.0)
+            reason = "waiting for the mapper's first map"
+            return status.model_copy(update={"exploration": progress, "state": "exploring", "reason": reason})
         return status if self.explorer is None else self.explorer.explain(status)
 
     def _goal_velocity(self, belief: Belief, pose: Array, goal: Goal, distance: float) -> Array:

@@ -16,7 +16,7 @@ from functools import partial
 from typing import ClassVar
 
 from common.bus.inbox import Sample
-from common.messages.definitions import Health, Map, Status
+from common.messages.definitions import Health, Status
 from common.messages.topics import SCAN, TOPICS, Topic
 from common.messages.wire import DecodeError
 from common.runtime.liveness import RobotLiveness, start_command
@@ -33,6 +33,7 @@ from services.viewer.state.roster import Roster
 from services.viewer.visitors import Hub, Visitor
 
 TICK_PERIOD_S = 1.0
+NO_MAP = json.dumps({"type": "map", "world": None})
 UNWATCHED_TIMEOUT_S = 600.0  # a robot is unsubscribed after this time without a visitor, except the configured one
 
 
@@ -63,6 +64,7 @@ class ViewerService(Service):
         self.robots: dict[str, FollowedRobot] = {}
         self._reopened: set[str] = set()  # robots of replays that now show another recording
         self._changed: deque[str] = deque()  # robots whose services started or ended
+        self._ended_mappers: deque[str] = deque()  # robots whose mapper ended
         self._connect = settings.link().connect_option
         self._tick_at = 0.0
         self._web: WebServer | None = None
@@ -131,8 +133,12 @@ class ViewerService(Service):
             return
         view = followed.view
         self._show(robot, view, view.add(sample.topic, message, now, sample.published_ns))
-        if isinstance(message, Map) and view.map is not None:
-            self._tell(robot, "map", view.map)
+        self._tell_changes(robot, view)
+
+    def _tell_changes(self, robot: str, view: RobotView) -> None:
+        if view.map_changed:
+            view.map_changed = False
+            self._tell(robot, "map", view.map or NO_MAP)
         if view.time_restarted:
             view.time_restarted = False
             self._tell(robot, "history", _history(view))
@@ -153,6 +159,8 @@ class ViewerService(Service):
 
     def _on_liveliness(self, robot: str, service: str, alive: bool) -> None:  # noqa: FBT001 - zenoh's thread
         self.roster.change(robot, service, alive)
+        if service == "mapper" and not alive:
+            self._ended_mappers.append(robot)
         self._changed.append(robot)
         self._wake()
 
@@ -174,6 +182,10 @@ class ViewerService(Service):
                 followed.view, followed.unread = RobotView(robot, live=False), {}
         if changed := {self._changed.popleft() for _ in range(len(self._changed))}:
             self.hub.call_soon(partial(self.request_handler.robots_changed, frozenset(changed)))
+        while self._ended_mappers:
+            if (followed := self.robots.get(robot := self._ended_mappers.popleft())) is not None and followed.view.live:
+                followed.view.end_mapping()
+                self._tell_changes(robot, followed.view)
         while self.hub.newcomers:
             self._welcome(*self.hub.newcomers.popleft())
         for robot, followed in self.robots.items():
@@ -194,7 +206,7 @@ class ViewerService(Service):
             "services": self._services(robot, followed),
             "journal": _journal(view),
             "field": view.fields.shown,
-            "map": view.map,
+            "map": view.map or NO_MAP,  # the page may still show that of an earlier session
         }
 
         def send() -> None:

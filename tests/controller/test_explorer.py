@@ -7,6 +7,7 @@ import numpy as np
 from common.geometry.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from common.messages.definitions import Drive, Map, Twist
 from common.robot.base import Robot
+from services.controller.goal_state import Phase
 from services.controller.growing_map import PlannedMap
 from services.controller.navigator import Navigator
 from services.controller.policies.exploration import Viewpoint
@@ -25,24 +26,25 @@ def map_with(*poses) -> PlannedMap:
 class PerfectRobot:
     """A perfect robot, whose viewpoints are chosen by the test."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, mapped: bool = True) -> None:
         self.policy = GeodesicPolicy(Robot(), None)
         self.navigator = Navigator(Robot(), preset=self.policy)
         self.pose, self.scans = np.array(START), 0
-        self.use_map(map_with(START))
+        if mapped:
+            self.use_map(map_with(START))
         self.step()
 
     def use_map(self, planned: PlannedMap) -> None:
         self.policy.use_map(planned.graph, jumped=False)
         self.navigator.on_map(planned)
 
-    def step(self, *, moves: bool = True):
+    def step(self, *, moves: bool = True, state: str = "tracking"):
         from common.geometry import se2
 
         stamp = self.scans * PERIOD_NS
         self.scans += 1
         self.navigator.on_scan(scan(stamp, self.pose, HALL))
-        command, status = self.navigator.step(belief(stamp, self.pose))
+        command, status = self.navigator.step(belief(stamp, self.pose, state=state))
         if moves:
             self.pose = se2.compose(self.pose, command.twist.array() * PERIOD_NS * 1e-9)
         return status
@@ -68,12 +70,48 @@ def begin() -> PerfectRobot:
     return drive
 
 
-def test_no_exploration_without_a_map():
-    navigator = Navigator(Robot(), preset=GeodesicPolicy(Robot(), None))
+def test_no_exploration_in_a_known_world():
+    navigator = Navigator(Robot(), world=HALL, preset=GeodesicPolicy(Robot(), HALL))
     navigator.on_goal(goal(0, 0, explore=True, seq=5))
     status = navigator.goal_state.status(0, None)
     assert status.refused
-    assert "no map from a mapper" in status.reason
+    assert "presage up --mapping" in status.reason
+
+
+def test_exploration_waits_for_the_first_map():
+    drive = PerfectRobot(mapped=False)
+    drive.navigator.on_goal(goal(0, 0, explore=True, seq=5))
+    status = drive.step()
+    assert (status.state, status.exploration.seq, status.reason) == (
+        "exploring",
+        5,
+        "waiting for the mapper's first map",
+    )
+    assert drive.navigator.take_survey() is None
+    drive.use_map(map_with(START))
+    drive.step()
+    drive.explore((5.0, 2.5))
+    assert drive.step().goal.x == 5
+    drive.navigator.on_goal(goal(0, 0, cancel=True))
+    assert drive.step().exploration is None
+
+
+def test_carried_off():
+    drive = begin()
+    drive.explore((8.0, 2.5))
+    drive.until(lambda _: drive.pose[0] > 3.0)
+    driven = drive.step().exploration.path
+    drive.pose = np.array([4.0, 1.0, 0.0])
+    statuses = [drive.step(state="lost") for _ in range(10 * SCANS_PER_S)]  # longer than at a place without progress
+    assert all(status.reason.startswith("the belief is lost") for status in statuses)
+    drive.use_map(map_with(START))
+    assert drive.navigator.take_survey() is None  # where it would begin is not known
+    path, place = statuses[-1].exploration.path, drive.pose
+    drive.pose = place - [3.0, 0.0, 0.0]
+    status = drive.step()
+    assert (status.goal.x, status.reason) == (8.0, "going where a scan tells most")
+    assert status.exploration.path == path > driven + 0.5
+    assert len(drive.navigator.take_survey().unreachable) == 0
 
 
 def test_viewpoints_then_the_way_back():
@@ -96,6 +134,20 @@ def test_viewpoints_then_the_way_back():
     assert 5.9 < status.exploration.path < 7.5
     assert status.state == "reached"
     assert drive.navigator.take_survey() is None
+
+
+def test_a_robot_that_stops_late_returns_again():
+    drive = begin()
+    drive.explore((4.0, 2.5))
+    drive.until(lambda _: drive.navigator._viewpoint_due)
+    drive.explore(None)
+    drive.until(lambda _: drive.navigator.goal_state.phase is Phase.REACHED)
+    drive.pose = drive.pose - [0.06, 0.0, 0.0]
+    drive.until(lambda _: drive.navigator._viewpoint_due)
+    drive.explore(None)
+    assert drive.step().exploration.phase == "returning"
+    drive.until(lambda status: status.exploration.phase == "finished")
+    assert np.hypot(*(drive.pose - START)[:2]) < 0.01
 
 
 def test_a_goal_of_a_user_takes_precedence():

@@ -27,6 +27,7 @@ NO_SESSION = ("--connect", "tcp/127.0.0.1:9")  # the discard port, on which noth
         (("demo", "--world", "{tmp}/bad.yaml"), "bad.yaml: not valid YAML"),
         (("demo", "--goal", "6.8", "3.95"), "goal (6.80, 3.95) is inside a wall or outside 'corridor'"),
         (("demo", "--goal", "nan", "1"), "two finite numbers"),
+        (("demo", "--unknown", "--goal", "1", "1"), "leave out --goal and --estimator"),
         (("demo", "--out", "/dev/null/x"), "/dev/null/x: cannot be written to"),
         (("demo", "--json", "{tmp}/no/x.json"), "x.json: cannot be written to"),
         (("demo", "--seed", "99999999999999999999"), "--seed"),

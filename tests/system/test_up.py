@@ -64,6 +64,22 @@ def test_demo_reaches_its_goal(process, tmp_path):
         assert word in running.output
 
 
+def test_demo_in_an_unknown_building(process, tmp_path):
+    file, config = tmp_path / "demo.json", tmp_path / "lockstep.yaml"
+    config.write_text("world: maze\nsimulator: {pace: lockstep, beams: 207}")
+    args = ("--config", str(config), "--out", str(tmp_path / "out"), "--json", str(file), "--quiet")
+    running = process("presage.__main__", "demo", "--unknown", *args)
+    assert running.wait(170) == 0, running.output
+    numbers = json.loads(file.read_text())
+    assert numbers["world"] == "maze"
+    for step, words in zip(numbers["steps"], ("explored a", "carried off", "a goal", "returned"), strict=True):
+        assert words in step["what"]
+        assert step["error_m"] < 0.1, numbers
+    assert numbers["steps"][-1]["mapped_share"] > 0.9
+    assert numbers["contacts"] == 0
+    assert len(list((tmp_path / "out").glob("*.mcap"))) == 1
+
+
 def test_demo_without_a_belief():
     note = "the scan does not fit the weights; presage train --beams 100"
     health = Health(stamp_ns=0, service="estimator", uptime=1.0, counters={"unfit_scans": 1}, note=note)

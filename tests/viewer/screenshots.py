@@ -1,22 +1,24 @@
-"""`make screenshots`: docs/page.png and docs/page.webp, of a real session in a real browser.
+"""`make screenshots`: docs/page.png and docs/page.webp, of real sessions in a real browser.
 
-A robot drives through an office with people, is carried away, localises itself, and continues to its goal.
+The still shows a robot in an office with people, and the moving picture shows `presage demo --unknown`.
 """
 
 from __future__ import annotations
 
 import argparse
 import io
-import re
 import sys
 import tempfile
+from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 from PIL import Image
 
 from tests.conftest import ROOT, Processes
 from tests.viewer.browser import Visit, find_browser, open_browser, visit
+from tests.viewer.client import page_of
 
 WORLD = ("--world", "office")
 SERVICES = {
@@ -24,13 +26,15 @@ SERVICES = {
     "estimator": WORLD,
     "controller": (*WORLD, "--belief-timeout", "5"),  # pictures are taken on the same machine
 }
-GOAL, FACING = (16.5, 6.5), (16.5, 5.6)  # m in map, where the pointer is put down and let go
-ELSEWHERE = (11.8, 1.2)  # m, where the robot is carried
-BACK = (3.6, 6.4)  # m, the next goal
-LARGE, SMALL = {"width": 1440, "height": 900}, {"width": 1100, "height": 740}  # px of the page, still and filmed
-FILM = (960, 646)  # px of the animation
-PERIOD = 0.15  # s of the robot's time between its pictures, at least
-LONGEST = 25.0  # s of the robot's time, of one scene
+GOAL = (16.5, 6.5)  # m in map
+LARGE, SMALL = {"width": 1440, "height": 900}, {"width": 960, "height": 540}  # px of the page, still and filmed
+# Only the map is filmed: while mapping, there is neither a free energy nor a true pose to draw.
+FILM_STYLE = """.panels { display: none; }
+main { grid-template: 1fr / 1fr !important; }
+.dock, .zoom, .legend { visibility: hidden; }
+.notices { position: absolute; inset: auto 10px 10px; }"""
+PERIOD, SPEED_UP = 1.0, 8.0  # s of the robot's time between the pictures of the animation; how much faster it plays
+END_MS = 2500  # for which the last picture is shown
 
 
 def start(processes: Processes) -> str:
@@ -40,11 +44,7 @@ def start(processes: Processes) -> str:
     for name, arguments in SERVICES.items():
         processes.start(name, *arguments, env=environment)
     processes.start("recorder", "--idle", "--directory", str(processes.folder), env=environment)
-    viewer = processes.start("viewer", "--port", "0", env=environment)
-    viewer.wait_for("page: ")
-    match = re.search(r"page: (\S+)", viewer.output)
-    assert match is not None
-    return match[1]
+    return page_of(processes.start("viewer", "--port", "0", env=environment))
 
 
 def picture(seen: Visit) -> Image.Image:
@@ -52,72 +52,76 @@ def picture(seen: Visit) -> Image.Image:
     return Image.open(io.BytesIO(seen.page.screenshot())).convert("RGB")
 
 
-def film(seen: Visit, ends: str) -> list[tuple[float, Image.Image]]:
-    """Small pictures of the page until an expression is true, each with the robot's time."""
-    began = now = seen.see("store.frame.t")
-    pictures = []
-    while now < began + LONGEST and not seen.see(ends):
-        pictures.append((now, picture(seen).resize(FILM, Image.Resampling.LANCZOS)))
-        seen.wait("store.frame.t > arg", argument=now + PERIOD)
-        now = seen.see("store.frame.t")
-    return pictures
-
-
 def quiet(seen: Visit) -> None:
     """Hides answers and the ring around the focused element."""
     seen.page.evaluate("document.getElementById('toasts').replaceChildren(); document.activeElement.blur()")
 
 
-def play(seen: Visit) -> tuple[Image.Image, list[tuple[float, Image.Image]]]:
-    """Drives and carries the robot. Returns a still picture and the frames of the animation."""
+def still(seen: Visit) -> Image.Image:
+    """A picture of the robot on its way."""
     tracked = "store.frame?.belief?.state === 'tracking' && Math.abs(store.frame.belief.x - store.frame.truth.x) < 0.1"
     seen.wait(f"{tracked} && store.history.t.length > 60", 90)
-    seen.page.set_viewport_size(SMALL)
+    seen.click(*GOAL)
+    seen.wait(f"{tracked} && store.frame.truth.x > 8 && store.frame.speed > 0.7", 60)
+    quiet(seen)
+    return picture(seen)
+
+
+def film(seen: Visit) -> list[tuple[float, Image.Image]]:
+    """Small pictures of the page until the robot is back, each with the robot's time."""
+    seen.wait("store.map && store.frame?.status?.exploration", 120)
     seen.page.locator("#speed").select_option("0.5")  # pictures take their time
-    seen.drag(GOAL, FACING)
-    seen.wait("store.frame.speed > 0.1 && store.prior", 60)
-    quiet(seen)
-    pictures = film(seen, "store.frame.truth.x > 4.5")
-    seen.page.keyboard.down("Shift")
-    seen.click(*ELSEWHERE)
-    seen.page.keyboard.up("Shift")
-    pictures += film(seen, "store.frame.status?.state === 'reached'")
-    seen.page.set_viewport_size(LARGE)
-    seen.page.locator("#speed").select_option("1")
-    seen.click(*BACK)
-    seen.wait(f"{tracked} && store.frame.truth.x < 11.5 && store.frame.speed > 0.7 && store.frame.path.length", 60)
-    quiet(seen)
-    return picture(seen), pictures
+    seen.page.add_style_tag(content=FILM_STYLE)
+    seen.see("document.getElementById('legend').open = false")
+    pictures = []
+    while seen.see("store.frame.status.exploration.phase") != "finished":
+        now = seen.see("store.frame.t")
+        quiet(seen)
+        pictures.append((now, picture(seen)))
+        seen.wait("store.frame.t > arg || store.frame.status.exploration.phase === 'finished'", argument=now + PERIOD)
+    return pictures
+
+
+def record_still(chromium: str, file: Path, **options: Any) -> None:
+    """Writes the still picture."""
+    with tempfile.TemporaryDirectory() as folder, closing(Processes(Path(folder))) as processes:
+        address = start(processes)
+        with open_browser(chromium) as browser:
+            still(visit(browser, address, **LARGE, device_scale_factor=1.25, **options)).save(file, optimize=True)
+
+
+def record_film(chromium: str, file: Path, **options: Any) -> None:
+    """Writes the moving picture."""
+    with tempfile.TemporaryDirectory() as folder, closing(Processes(Path(folder))) as processes:
+        demo = processes.start("presage.__main__", "demo", "--unknown", env={"PRESAGE_VIEWER_PORT": "0"})
+        demo.wait_for("\npage: ", 120)  # the demo's own line, after that of the viewer
+        address = page_of(demo)
+        with open_browser(chromium) as browser:
+            pictures = film(visit(browser, address, **SMALL, bypass_csp=True, **options))
+        demo.wait(60)
+        print(demo.output)
+    durations = [int(1000 * (after - t) / SPEED_UP) for (t, _), (after, _) in pairwise(pictures)] + [END_MS]
+    first, *rest = [image for _, image in pictures]
+    first.save(file, save_all=True, append_images=rest, duration=durations, loop=0, quality=60, method=4)
+
+
+RECORDERS = {"page.png": record_still, "page.webp": record_film}
 
 
 def main() -> None:
-    """Writes both pictures."""
+    """Writes the pictures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=ROOT / "docs", help="folder of page.png and page.webp")
+    parser.add_argument("names", nargs="*", default=list(RECORDERS), help="page.png or page.webp; defaults to both")
+    parser.add_argument("--out", type=Path, default=ROOT / "docs", help="folder of the pictures")
     parser.add_argument("--dark", action="store_true", help="the page's dark colours")
     args = parser.parse_args()
-    path = find_browser()
-    if path is None:
+    chromium = find_browser()
+    if chromium is None:
         sys.exit("screenshots: no Chromium; on Debian and Ubuntu: apt-get install chromium")
-    with tempfile.TemporaryDirectory() as folder:
-        processes = Processes(Path(folder))
-        try:
-            address = start(processes)
-            with open_browser(path) as browser:
-                colours = "dark" if args.dark else "light"
-                seen = visit(browser, address, **LARGE, device_scale_factor=1.25, color_scheme=colours)
-                still, pictures = play(seen)
-        finally:
-            processes.close()
-    still.save(args.out / "page.png", optimize=True)
-    times = [t for t, _ in pictures]
-    durations = [int(1000 * min(0.5, max(0.05, after - t))) for t, after in pairwise(times)] + [1500]
-    first, *rest = [image for _, image in pictures]
-    first.save(
-        args.out / "page.webp", save_all=True, append_images=rest, duration=durations, loop=0, quality=60, method=4
-    )
-    for name in ("page.png", "page.webp"):
-        print(f"{args.out / name}: {(args.out / name).stat().st_size / 1e3:.0f} kB")
+    for name in args.names:
+        file = args.out / name
+        RECORDERS[name](chromium, file, color_scheme="dark" if args.dark else "light")
+        print(f"{file}: {file.stat().st_size / 1e3:.0f} kB")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The page while an unknown building is mapped: the growing map, and saving it."""
+"""The page while an unknown building is mapped, and after it: the growing map, saving it, the next session."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def start_mapping(processes):
 def test_drive_explore_and_save(browser, processes):
     from tests.viewer.browser import visit  # without playwright these tests are skipped
 
-    viewer, _ = start_mapping(processes)
+    viewer, environment = start_mapping(processes)
     seen = visit(browser, page_of(viewer))
     seen.wait("store.map && store.frame?.belief?.estimator === 'mapper'", 60)
     seen.wait("store.frame.truth === null && store.frame.error === null")
@@ -48,5 +48,12 @@ def test_drive_explore_and_save(browser, processes):
     assert load_world(str(Path(processes.folder) / "here.yaml")).grid is not None
     save.locator("button").click()
     seen.toast("exists already", ok=False)
+
+    # The next session, in a known world, on the same page.
+    for service in processes.started:
+        if service.name in {"simulator", "mapper", "controller"}:
+            service.stop(timeout=60)
+    processes.start("simulator", "--world", "maze", env=environment)
+    seen.wait("store.map === null && store.world?.name === 'maze' && store.frame.truth !== null", 60)
     seen.page.context.close()
     assert seen.complaints == []

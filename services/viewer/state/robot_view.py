@@ -77,6 +77,7 @@ class RobotView:
         self.history, self.journal, self.fields = History(), Journal(), GoalFields()
         self.time_restarted = False  # stamps went back; reset by the caller once visitors have the new history
         self.journal_changed = False  # the journal has new rows; reset by the caller once visitors have them
+        self.map_changed = False  # there is another map, or none any more; reset by the caller once visitors know
         self.frame: bytes | None = None  # the last frame
         self.map: str | None = None  # the last map of the mapper, as a message for the page
         self._received: dict[str, ReceivedMessage] = {}  # the last message by topic name
@@ -166,14 +167,23 @@ class RobotView:
         self.journal.clear()
         self._waiting, self._latency_ms, self.time_restarted, self.journal_changed = None, None, True, True
 
+    def end_mapping(self) -> None:
+        """Forgets the map, because its mapper has ended. From now on the truth is shown again."""
+        if self.map is not None:
+            self.map, self.map_changed = None, True
+            self._change_frame()
+
     def _store_map(self, message: Map) -> None:
-        """Stores the map. Forgets the truth when the first one comes, because its frame is another one."""
         if self.map is None:
-            self._received.pop(TRUTH.name, None)
-            self._truths.clear()
-            self.history.clear()
-            self.time_restarted = True
-        self.map = frames.map_of(message, self.robot)
+            self._change_frame()
+        self.map, self.map_changed = frames.map_of(message, self.robot), True
+
+    def _change_frame(self) -> None:
+        """Forgets what was measured with the truth: with a map, all that is shown is in another frame than without."""
+        self._received.pop(TRUTH.name, None)
+        self._truths.clear()
+        self.history.clear()
+        self.time_restarted = True
 
     def _store_goal(self, message: Preference | Goal) -> None:
         """Stores a message that does not belong to a scan."""

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from common.geometry.coverage import reachable_area
 from common.geometry.world import World
 from common.robot.base import Robot
-from lab.exploration.drive import explore, measure, reachable_area
+from lab.exploration.drive import explore, measure
 from lab.exploration.experiment import EXPLORERS, summarise, table
 from lab.exploration.nearest_frontier import nearest_frontier
 from services.controller.policies.exploration import choose_viewpoint

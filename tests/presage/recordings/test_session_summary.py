@@ -73,10 +73,16 @@ def truth(stamp, x, y=0.0):
     return TRUTH, Truth(stamp_ns=stamp, pose=Pose(x=x, y=y), twist=Twist())
 
 
-def belief(stamp, x, y=0.0, state="tracking"):
+def belief(stamp, x, y=0.0, state="tracking", estimator="precise"):
     pose = Pose(x=x, y=y)
     return BELIEF, Belief(
-        stamp_ns=stamp, state=state, pose=pose, xi=np.zeros(3, np.float32), free_energy=1.0, accuracy=1.0
+        stamp_ns=stamp,
+        state=state,
+        pose=pose,
+        xi=np.zeros(3, np.float32),
+        free_energy=1.0,
+        accuracy=1.0,
+        estimator=estimator,
     )
 
 
@@ -88,6 +94,14 @@ def test_error_at_the_beliefs_stamp(tmp_path):
     assert errors[0] == pytest.approx(0.5)
     assert np.isnan(errors[1])  # no truth of that stamp
     assert summarise(path).position_error_m is None
+
+
+def test_error_while_mapping(tmp_path):
+    beliefs = [belief(k, k, estimator="mapper") for k in range(3)]
+    goal = GOAL, Goal(stamp_ns=0, pose=Pose(x=2, y=0.5))
+    path = write(tmp_path / "map.mcap", truth(0, 7.0, 2.0), truth(1, 8.0, 2.0), goal, truth(2, 9.0, 2.5), *beliefs)
+    assert load_session(path).errors() == pytest.approx([0.0, 0.0, 0.5])
+    assert summarise(path).goal_distance_m == pytest.approx(0.0)
 
 
 def test_error_after_a_restart(tmp_path):

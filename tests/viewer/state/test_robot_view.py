@@ -39,6 +39,10 @@ def test_no_truth_beside_a_growing_map():
     shown = json.loads(view.map)
     assert shown["closures"] == [[[0.0, 1.0], [2.0, 3.0]]]
     assert shown["world"]["grid"]["cells"] == grid.cells
+    view.end_mapping()
+    (frame,) = feed(view, 1.0 + 2 * PERIOD, x=3.0)
+    assert view.map is None
+    assert frame.header["truth"]["x"] == 3.0
 
 
 def test_frames():

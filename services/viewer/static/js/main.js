@@ -92,7 +92,7 @@ function takeHello(hello) {
 
 function takeWorld({ world: told, scanner, robot }) {
   const before = store.world, world = store.map?.world ?? told; // the map has another frame than the simulator's world
-  Object.assign(store, { world, scanner, robot });
+  Object.assign(store, { world, told, scanner, robot });
   if (view.gesture.selected && !modes.selected) modes.select("");
   redraw(); // first, for the view is fitted clear of the tools
   if (!before || before.name !== world?.name || String(before.boundary) !== String(world?.boundary)) {
@@ -101,11 +101,13 @@ function takeWorld({ world: told, scanner, robot }) {
   }
 }
 
-function takeMap(map) {
-  const first = !store.map;
-  Object.assign(store, { map, world: map.world });
-  if (first || view.camera.fitted) view.fit();
-  if (first) redraw();
+/** The mapper's map, which takes the place of the simulator's world; without a world, there is none any more. */
+function takeMap(message) {
+  const map = message.world ? message : null, changed = !map !== !store.map;
+  if (!map && !changed) return;
+  Object.assign(store, { map, world: map?.world ?? store.told });
+  if (changed || view.camera.fitted) view.fit();
+  if (changed) redraw();
   view.invalidate();
 }
 

@@ -15,7 +15,7 @@ export class Store {
 
   /** Forget the robot that was watched. */
   clear() {
-    this.world = this.scanner = this.robot = this.frame = this.field = null;
+    this.world = this.told = this.scanner = this.robot = this.frame = this.field = null; // told: the simulator's world
     this.map = null; // of the mapper: its world, the path of the key scans, loop closures
     this.journal = []; // {t, state, reason} of the controller, the oldest first
     this.stoppedAt = 0; // ms, since when the obstacle stop holds the wheels back
