@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import math
-
 from common.messages.definitions import Odom, Scan
 
+MAX_SILENCE_NS = 1_000_000_000  # without odometry, after which scans no longer wait for it
 ScanWithOdometry = tuple[Scan, Odom | None]
 
 
 class OdometrySync:
-    """Holds a scan back until its odometry or the next scan arrives; then it goes on without odometry."""
+    """Holds a scan back until its odometry arrives; without it, until later odometry or the next scan does."""
 
-    def __init__(self, max_silence_ns: int | None = None) -> None:
-        """A scan does not wait if no odometry came for ``max_silence_ns`` before it; by default it always waits."""
-        self._max_silence_ns = max_silence_ns
+    def __init__(self) -> None:
         self.clear()
 
     def clear(self) -> None:
@@ -31,8 +28,7 @@ class OdometrySync:
         """Returns the scans that no longer wait: the one before, and this one unless it waits itself."""
         ready = self._release()
         self._waiting = scan
-        silence_ns = math.inf if self._odom is None else scan.stamp_ns - self._odom.stamp_ns
-        waits = silence_ns > 0 and (self._max_silence_ns is None or silence_ns < self._max_silence_ns)
+        waits = self._odom is not None and 0 < scan.stamp_ns - self._odom.stamp_ns < MAX_SILENCE_NS
         return ready if waits else ready + self._release()
 
     def _release(self) -> list[ScanWithOdometry]:

@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from rich.console import Console
 from rich.table import Table
 
-from common.bus.bus import Link
+from common.bus.bus import Link, wait_until
 from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
 from common.messages.definitions import Goal, Pose, Status
@@ -26,7 +26,7 @@ BLOCKED_TIMEOUT_S = 30.0
 # Without statuses from the controller: time until a note is printed, and until the command gives up.
 STATUS_WARNING_S, STATUS_TIMEOUT_S = 3.0, 30.0
 MIN_PROGRESS_M = 0.3  # a smaller decrease of the distance to the goal does not end a blockage
-SAVE_TIMEOUT_S = 30.0  # a large map takes a while
+DISCOVERY_TIMEOUT_S, SAVE_TIMEOUT_S = 3.0, 30.0  # a large map takes a while to save
 MAX_TEXT = 200  # characters; longer texts are shortened
 
 
@@ -225,7 +225,8 @@ def relocalise(link: Link, pose: Pose | None, console: Console, *, heading_known
 def save_map(link: Link, name: str, console: Console) -> None:
     """Has the mapper write its map into files; raises UserError with the reason if it cannot."""
     with session(link) as bus:
-        if SAVE_MAP.server not in bus.alive():
+        # A session that has just opened does not know the services yet.
+        if not wait_until(lambda: SAVE_MAP.server in bus.alive(), DISCOVERY_TIMEOUT_S):
             raise UserError("no mapper is running: start one with `presage up --mapping`, and drive")
         reply = bus.ask(SAVE_MAP, SaveMapRequest(name=name), SaveMapReply, SAVE_TIMEOUT_S)
     if not reply.ok:

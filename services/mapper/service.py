@@ -31,7 +31,6 @@ from services.mapper.slam.search import search
 MAP_NAME = r"[A-Za-z0-9_-]{1,64}"
 UPDATE_PERIOD_NS = 1_000_000_000  # between the beginnings of two updates of the map, which leaves time for the scans
 REPEAT_PERIOD_NS = 5_000_000_000  # an unchanged map is published again after this time, for subscribers that came later
-MAX_ODOMETRY_SILENCE_NS = 1_000_000_000  # scans no longer wait for odometry if none came for this time
 
 
 class MapperService(Service):
@@ -52,7 +51,7 @@ class MapperService(Service):
         super().__init__(settings)
         self.mapper: Mapper | None = None
         self._belief: Belief | None = None  # of the latest scan
-        self._odometry_sync = OdometrySync(MAX_ODOMETRY_SILENCE_NS)
+        self._odometry_sync = OdometrySync()
         self._pool = ThreadPoolExecutor(1, "update")
         self._update: Future[GrownMap] | None = None  # that runs now
         self._update_ns = self._published_ns = -UPDATE_PERIOD_NS  # stamps of the last update and of the last map

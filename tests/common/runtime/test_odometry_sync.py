@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from common.messages.definitions import Odom, Pose, Scan, Twist
-from common.runtime.odometry_sync import OdometrySync
+from common.runtime.odometry_sync import MAX_SILENCE_NS, OdometrySync
 
 
 def a_scan(stamp):
@@ -30,6 +30,7 @@ def stamps(pairs):
 
 def test_scan_waits_for_its_odometry():
     sync = OdometrySync()
+    assert stamps(sync.add_odometry(an_odom(0))) == []
     assert stamps(sync.add_scan(a_scan(1))) == []
     assert stamps(sync.add_odometry(an_odom(1))) == [(1, 1)]
     assert stamps(sync.add_odometry(an_odom(2))) == []
@@ -38,14 +39,15 @@ def test_scan_waits_for_its_odometry():
 
 def test_scan_whose_odometry_never_comes():
     sync = OdometrySync()
+    sync.add_odometry(an_odom(0))
     sync.add_scan(a_scan(1))
     assert stamps(sync.add_scan(a_scan(2))) == [(1, None)]
     assert stamps(sync.add_odometry(an_odom(3))) == [(2, None)]
 
 
 def test_scans_do_not_wait_after_a_silence():
-    sync = OdometrySync(max_silence_ns=10)
+    sync, silence = OdometrySync(), MAX_SILENCE_NS
     assert stamps(sync.add_scan(a_scan(1))) == [(1, None)]
     sync.add_odometry(an_odom(2))
-    assert stamps(sync.add_scan(a_scan(11))) == []
-    assert stamps(sync.add_scan(a_scan(12))) == [(11, None), (12, None)]
+    assert stamps(sync.add_scan(a_scan(1 + silence))) == []
+    assert stamps(sync.add_scan(a_scan(2 + silence))) == [(1 + silence, None), (2 + silence, None)]
