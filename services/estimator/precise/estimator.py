@@ -510,11 +510,8 @@ class PreciseEstimator:
     def _probability(self) -> float:
         """Probability that the best hypothesis is within 0.2 m and 5 degrees of the truth."""
         best = self.modes[0]
-        near = [mode for mode in self.modes if same_place(mode.pose[None], best.pose)[0]]
-        return sum(
-            mode.weight * (1 - self._unknown_place.weight) * probability_of_being_near(self._covariance(mode))
-            for mode in near
-        )
+        at_best = best.weight * (1 - self._unknown_place.weight)
+        return at_best * probability_of_being_near(self._covariance(best))
 
     def _state(self, probability: float) -> State:
         if probability >= self.settings.tracking_probability:
