@@ -42,16 +42,15 @@ def accumulate(
     range_max: float,
     unseen: float,
     attention: Array,
-    total: Array,
+    energy: Array,
     gradient: Array,
     matrices: Array,
 ) -> None:
     """Sums -ln p(o | pose) and its derivatives over the beams; see `services.estimator.precise.likelihood`.
 
-    Adds to total (N, 3), whose columns are the energy, the expected number of inliers and the number of used beams; to
-    gradient (N, 3); and to matrices (N, 3, 3, 3), which are the curvature and the covariances of the gradient caused by
-    the scanner's noise and by the model's error. ``attention`` (N, B) scales the derivatives of each beam; it may be
-    empty, for 1.
+    Adds to energy (N,), to gradient (N, 3), and to matrices (N, 3, 3, 3): the curvature and the covariances of the
+    gradient caused by the scanner's noise and by the model's error. ``attention`` (N, B) scales the derivatives of each
+    beam; it may be empty, for 1.
     """
     flat = random / range_max
     for k in range(expected.shape[0]):
@@ -61,20 +60,17 @@ def accumulate(
                 continue
             if scale[k, b] == np.inf:  # unknown beyond g: all ranges beyond are equally likely
                 if o < g:
-                    total[k, 2] += 1.0
-                    total[k, 0] -= math.log((1.0 - unseen) * (flat + short / max(g, 1e-3)))
+                    energy[k] -= math.log((1.0 - unseen) * (flat + short / max(g, 1e-3)))
                 elif o < np.inf:
-                    total[k, 0] -= math.log((1.0 - unseen) * (flat + (1.0 - short - random) / max(range_max - g, 1.0)))
+                    energy[k] -= math.log((1.0 - unseen) * (flat + (1.0 - short - random) / max(range_max - g, 1.0)))
                 else:
-                    total[k, 0] -= math.log(unseen)
+                    energy[k] -= math.log(unseen)
                 continue
-            total[k, 2] += 1.0
             if o == np.inf:
-                total[k, 0] -= math.log(unseen if g < range_max else 1.0 - unseen)
-                total[k, 1] += 0.0 if g < range_max else 1.0
+                energy[k] -= math.log(unseen if g < range_max else 1.0 - unseen)
                 continue
             if g >= range_max:
-                total[k, 0] -= math.log(unseen / range_max)
+                energy[k] -= math.log(unseen / range_max)
                 continue
             noise, model = sigma * sigma + relative * relative * g * g, scale[k, b] * scale[k, b]
             variance = noise + model + extra_sigma * extra_sigma
@@ -83,8 +79,7 @@ def accumulate(
             early = short / max(g, 1e-3) if o < g else 0.0
             density = core + flat + early
             inlier = core / density
-            total[k, 0] -= math.log(density * (1.0 - unseen))
-            total[k, 1] += inlier
+            energy[k] -= math.log(density * (1.0 - unseen))
             share = attention[k, b] if attention.size else 1.0
             weight = share * inlier / variance
             slope = weight * e - share * early / (max(g, 1e-3) * density)  # d ln p / dg

@@ -170,7 +170,6 @@ class View:
         matrices = (at_laser.curvature, at_laser.xi_noise_covariance, model_covariance)
         return Evidence(
             at_laser.accuracy,
-            at_laser.inlier_ratio,
             (Tt @ at_laser.xi[..., None])[..., 0],
             *(Tt @ matrix @ T for matrix in matrices),
         )

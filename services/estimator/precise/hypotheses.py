@@ -40,11 +40,11 @@ class Mode:
     pose: Array  # (3,) base_link in map
     noise_covariance: Array  # (3, 3) caused by scanner noise and motion: fusion of scans reduces it
     model_covariance: Array  # (3, 3) caused by the model's error: fusion does not reduce it
-    explained: float  # share of the last scan's beams that end at surfaces of the map
     accuracy: float  # nats, -ln p of the last scan
     complexity: float  # nats
     xi: Array  # (3,)
     curvature: Array  # (3, 3)
+    explained: float = 0.0  # share of the last scan's beams that end at surfaces of the map
     log_evidence: float = 0.0  # nats, of the key scans and the prior; unnormalised
     present: float = 0.0  # nats, log likelihood of the present scan
     clutter: float = CLUTTER_PROBABILITY  # probability that all that was new in the last key scan was clutter
@@ -145,7 +145,6 @@ def mode_from_search(
         pose=pose,
         noise_covariance=inverse @ (evidence.xi_noise_covariance[k] + information) @ inverse,
         model_covariance=inverse @ evidence.xi_model_covariance[k] @ inverse,
-        explained=float(evidence.inlier_ratio[k]),
         accuracy=float(evidence.accuracy[k]),
         complexity=complexity,
         xi=evidence.xi[k],
@@ -184,7 +183,6 @@ def update_mode(mode: Mode, fused: Fused, evidence: Evidence, k: int, period: fl
         pose=fused.mean,
         noise_covariance=inverse @ (evidence.xi_noise_covariance[k] + prior_information) @ inverse,
         model_covariance=model_deviation @ model_deviation.T,
-        explained=float(evidence.inlier_ratio[k]),
         accuracy=float(evidence.accuracy[k]),
         complexity=fused.complexity,
         xi=evidence.xi[k],

@@ -28,9 +28,6 @@ if TYPE_CHECKING:
     from services.estimator.shared.generative_models import Expected
 
 
-MIN_KNOWN_SHARE = 0.3  # of the beams; if the model knows fewer, the inlier ratio is reduced accordingly
-
-
 _erf = np.vectorize(math.erf, otypes=[float])
 
 
@@ -39,7 +36,6 @@ class Evidence:
     """Accuracy of one scan at N poses, and its derivatives by the pose."""
 
     accuracy: Array  # (N,) nats, -ln p(o | pose)
-    inlier_ratio: Array  # (N,) expected share of the used beams that the model explains
     xi: Array  # (N, 3) minus the gradient of accuracy: 1/m, 1/m, 1/rad
     curvature: Array  # (N, 3, 3) Gauss-Newton Hessian
     xi_noise_covariance: Array  # (N, 3, 3) covariance of xi caused by the scanner's noise
@@ -74,7 +70,7 @@ class Likelihood:
         quadrature to every standard deviation. ``attention`` (N, B) scales the derivatives of each beam, by default 1.
         """
         count = len(expected.ranges)
-        total, gradient = np.zeros((count, 3)), np.zeros((count, 3))
+        energy, gradient = np.zeros(count), np.zeros((count, 3))
         matrices = np.zeros((count, 3, 3, 3))
         beam_sums.accumulate(
             measured,
@@ -89,14 +85,11 @@ class Likelihood:
             range_max,
             self.unseen,
             np.zeros((0, 0)) if attention is None else attention,
-            total,
+            energy,
             gradient,
             matrices,
         )
-        # A pose from which the model knows only a few beams must not get a high ratio from these alone.
-        min_beams = MIN_KNOWN_SHARE * len(measured) if np.isinf(expected.scale).any() else 1.0
-        inlier_ratio = total[:, 1] / np.maximum(total[:, 2], max(min_beams, 1.0))
-        return Evidence(total[:, 0], inlier_ratio, gradient, matrices[:, 0], matrices[:, 1], matrices[:, 2])
+        return Evidence(energy, gradient, matrices[:, 0], matrices[:, 1], matrices[:, 2])
 
     def deviation(self, expected: Array) -> Array | float:
         """Standard deviation in m of the scanner's noise at ranges ``expected`` m of any shape; +inf counts as 0 m."""
