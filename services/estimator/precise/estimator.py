@@ -18,7 +18,6 @@ from services.estimator.precise.hypotheses import (
     constraining_beams,
     probability_of_being_near,
     project_evidence,
-    protection_level,
     same_place,
     unobserved_direction,
     update_mode,
@@ -37,6 +36,7 @@ from services.estimator.precise.motion_model import (
     widen_unobserved,
 )
 from services.estimator.precise.precision import Precision
+from services.estimator.precise.protection import protection_level
 from services.estimator.precise.search import search_around, search_everywhere, search_near
 from services.estimator.precise.settings import Settings
 from services.estimator.shared.interface import (
@@ -481,9 +481,9 @@ class PreciseEstimator:
         predicted, probability = self.predict(poses[0][None], observation.angles), self._probability()
         if probability >= self.settings.tracking_probability:
             self._precision.learn(view, self.modes[0].pose)
-        return self._posterior(poses, predicted, probability)
+        return self._posterior(view, poses, predicted, probability)
 
-    def _posterior(self, poses: list[Array], predicted: Predicted, probability: float) -> Posterior:
+    def _posterior(self, view: View, poses: list[Array], predicted: Predicted, probability: float) -> Posterior:
         """The posterior with the hypotheses at ``poses``, those at the stamp of the scan."""
         best = self.modes[0]
         hypotheses = tuple(
@@ -500,7 +500,7 @@ class PreciseEstimator:
             predicted=predicted.ranges[0],
             sigma=predicted.sigma[0],
             probability=probability,
-            protection=protection_level(best, self._covariance(best), elsewhere),
+            protection=protection_level(view, best.pose, self._covariance(best), elsewhere),
         )
 
     def _covariance(self, mode: Mode) -> Array:

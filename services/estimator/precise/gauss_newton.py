@@ -162,6 +162,21 @@ class View:
         else:
             expected = self._expect(poses)[0]
         at_laser = self.likelihood.evaluate(self.ranges, self.range_max, expected, extra_sigma, attention)
+        return self._at_base(at_laser, poses, lasers)
+
+    def evidence_by_surface(self, pose: Array) -> Evidence:
+        """Returns the evidence at one ``pose`` (3,) of each of the N surfaces of the scan that the map shows."""
+        expected, surface = self._expect(pose[None])[0], np.cumsum(self.surfaces.starts)
+        weights = self.surface_evidence(pose[None]).weights[0] * ~self.surfaces.small
+        shown = np.unique(surface[weights > 0])
+        attention = np.where(surface == shown[:, None], weights, 0.0)
+        repeated = type(expected)(*(np.repeat(values, len(shown), axis=0) for values in vars(expected).values()))
+        at_laser = self.likelihood.evaluate(self.ranges, self.range_max, repeated, 0.0, attention)
+        poses = np.tile(pose, (len(shown), 1))
+        return self._at_base(at_laser, poses, se2.compose(poses, self.mount))
+
+    def _at_base(self, at_laser: Evidence, poses: Array, lasers: Array) -> Evidence:
+        """The evidence with derivatives by base_link poses (N, 3) instead of by those of the laser, ``lasers``."""
         # A rotation of base_link moves the laser sideways: J_base = J_laser T.
         T = np.tile(np.eye(3), (len(poses), 1, 1))
         T[:, 0, 2], T[:, 1, 2] = poses[:, 1] - lasers[:, 1], lasers[:, 0] - poses[:, 0]

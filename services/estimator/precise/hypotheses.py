@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from statistics import NormalDist
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
     from services.estimator.precise.motion_model import Fused
 
 NEAR_POSITION_M, NEAR_HEADING_RAD = 0.2, math.radians(5)  # a pose with a larger error is wrong
-EXCEEDED_SHARE = 1e-4  # of the scans, whose error may exceed the protection level
 SAME_POSITION_M, SAME_HEADING_RAD = 0.1, 0.1  # hypotheses nearer to one another than this are merged
 # A direction counts as unobserved if its information is less than this share of the information across it; a learned
 # field adds a multiple of its squared ripple to the share.
@@ -257,15 +255,3 @@ def probability_of_being_near(covariance: Array) -> float:
     position = 1 - math.exp(-0.5 * NEAR_POSITION_M**2 / max(variance, 1e-12))
     heading = math.erf(NEAR_HEADING_RAD / math.sqrt(2 * max(float(covariance[2, 2]), 1e-12)))
     return position * heading
-
-
-def protection_level(mode: Mode, covariance: Array, elsewhere: float) -> Array | None:
-    """Errors (3,) m along and m across base_link, and rad, that are exceeded with probability `EXCEEDED_SHARE`.
-
-    ``elsewhere`` is the probability that the robot is not at this hypothesis. Returns None if that alone is larger.
-    """
-    if elsewhere >= EXCEEDED_SHARE:
-        return None
-    turn = se2.rotation(-float(mode.pose[2]))
-    deviation = np.sqrt(np.diagonal(turn @ covariance @ turn.T))
-    return np.asarray(NormalDist().inv_cdf(1 - (EXCEEDED_SHARE - elsewhere) / 2) * deviation)
