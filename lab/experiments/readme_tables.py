@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from lab.accuracy.report import cell
-from lab.experiments.results import markdown, number, read
-from lab.real_logs.experiment import claims_of
+from lab.experiments.results import markdown, number, read, tracking_shares
 
 PRESETS = {"precise": "presage", "particle-filter": "particle filter, tuned", "amcl-defaults": "AMCL-like defaults"}
 # Labels in README, and the tasks of `presage bench accuracy`
@@ -27,7 +26,7 @@ def real_logs(folder: Path) -> str:
         [summary[f"{task}, {name}"] for name in PRESETS]
         for task in ("a: tracking with odometry", "b: tracking without", "c: from nothing")
     )
-    claims = [f"{claims_of(row)}; {row['wrong_claim_longest_s']:.1f} s" for row in odometry]
+    claims = [f"{tracking_shares(row)}; {row['wrong_claim_longest_s']:.1f} s" for row in odometry]
     return markdown(
         ["", *PRESETS.values()],
         [
