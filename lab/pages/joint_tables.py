@@ -1,4 +1,4 @@
-"""The tables of README.md: selected rows of the experiments' JSON."""
+"""Tables that are made from more than one result: those of README.md, and the comparison with other programs."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 
 from lab.accuracy.report import cell
 from lab.experiments.results import markdown, number, read
+from lab.peers.experiment import table_with_others
 from lab.real_logs.experiment import claims_of
 
 PRESETS = {"precise": "presage", "particle-filter": "particle filter, tuned", "amcl-defaults": "AMCL-like defaults"}
@@ -46,7 +47,7 @@ def simulation(folder: Path) -> str:
     for label, task in TASKS.items():
         both = [rows[task, name] for name in ("precise", "particle-filter")]
         bound = both[0]["bound_rms_m"]
-        lines.append([label, *(cell(row, nees=False) for row in both), f"{number(1e3 * bound, 2)} mm" if bound else ""])
+        lines.append([label, *(cell(row) for row in both), f"{number(1e3 * bound, 2)} mm" if bound else ""])
     moved = read(folder / "integrity-moved-50.json")["summary"]
     lines.append([MOVED, *(_integrity(moved[name]["moved-50"]) for name in ("precise", "particle-filter")), ""])
     return markdown(["", "presage", "particle filter", "bound (RMS)"], lines)
@@ -57,4 +58,4 @@ def _integrity(row: dict[str, Any]) -> str:
     return f"{tracking:.1f} % `tracking`, of which {wrong:.1f} % wrong"
 
 
-TABLES = {"readme-real": real_logs, "readme-simulation": simulation}
+TABLES = {"readme-real": real_logs, "readme-simulation": simulation, "peers": table_with_others}
