@@ -96,24 +96,17 @@ chaos: install ## inject faults into a system on three hosts; measure detection,
 PEERS ?=
 RESULTS := docs/experiments
 tables: install ## measure all tables of README and docs/ at this commit, and fill them (hours)
-	$(BIN)/presage bench accuracy --seed 2801 --seeds 5 --trials 20 --minutes 0.5 \
-	  --json $(RESULTS)/accuracy.json --figure docs/accuracy.png
-	$(BIN)/presage bench accuracy --estimators all --tasks standing,blocked,furnished,tracking,odometry \
-	  --seed 2801 --seeds 5 --trials 10 --minutes 0.2 --json $(RESULTS)/accuracy-rivals.json
+	$(BIN)/presage bench accuracy --seed 2801 --seeds 5 --trials 20 --minutes 0.5 --json $(RESULTS)/accuracy.json --figure docs/accuracy.png
+	$(BIN)/presage bench accuracy --estimators all --tasks standing,blocked,furnished,tracking,odometry --seed 2801 --seeds 5 --trials 10 --minutes 0.2 --json $(RESULTS)/accuracy-rivals.json
 	$(BIN)/presage experiment --out $(RESULTS) all
 	$(if $(PEERS),OMP_NUM_THREADS=1 PRESAGE_WORKERS=1 $(BIN)/presage experiment --seed 2801 --out $(RESULTS) peers '$(PEERS)')
-	$(call integrity,integrity,--worlds 10 --seed 2711 --model exact --seconds 10)
-	$(call integrity,integrity-long-corridor,--worlds 20 --seed 2712 --cases long-corridor --estimators precise --model exact)
-	cp experiments/integrity/integrity.png $(RESULTS)/integrity.png
-	$(call integrity,integrity-moved-50,--worlds 20 --seed 2611 --cases moved-50 --model exact)
-	$(call integrity,integrity-single-scan-moved-50,--worlds 20 --seed 2611 --cases single-scan-moved-50 --estimators precise \
-	  --model exact)
+	$(BIN)/presage bench integrity --out experiments/integrity --worlds 10 --seed 2711 --model exact --seconds 10
+	$(BIN)/presage bench integrity --out experiments/integrity-long-corridor --worlds 20 --seed 2712 --model exact --seconds 10 --cases long-corridor --estimators precise
+	$(BIN)/presage bench integrity --out experiments/integrity-moved-50 --worlds 20 --seed 2611 --model exact --cases moved-50
+	$(BIN)/presage bench integrity --out experiments/integrity-single-scan-moved-50 --worlds 20 --seed 2611 --model exact --cases single-scan-moved-50 --estimators precise
+	for folder in experiments/integrity*; do cp $$folder/integrity.json $(RESULTS)/$${folder#*/}.json || exit 1; done
+	cp experiments/integrity/integrity.png $(RESULTS)/
 	for page in README.md docs/*.md; do $(BIN)/presage experiment --out $(RESULTS) tables --page $$page || exit 1; done
-
-define integrity
-$(BIN)/presage bench integrity --out experiments/$(1) $(2)
-cp experiments/$(1)/integrity.json $(RESULTS)/$(1).json
-endef
 
 screenshots: install ## docs/page.png and docs/page.webp of the live page; needs Chromium
 	$(BIN)/python -m tests.viewer.screenshots $(ARGS)

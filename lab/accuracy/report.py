@@ -38,6 +38,7 @@ NEES are of these, with bootstrap intervals over trials, or over 5 s of a path. 
 bound is the Cramér-Rao bound, RMS. "Both kept": from scan {TWINS_REQUIRED_FROM_SCAN} until a scan distinguishes the two
 rooms, every belief contains a hypothesis at the true pose and one at its twin; wrong counts trials that published
 `tracking` at the wrong place during that time."""
+MILLIMETRES_ABOVE_M = 0.05  # larger errors are printed without decimals
 HEADS = ("estimator", "found (95 %)", "wrong", "median (95 %)", "RMS (95 %)", "all", "NEES", "update (ms)")
 
 
@@ -168,6 +169,7 @@ def _markdown(rows: list[dict[str, Any]], title: str) -> str:
 
 def _cells(row: dict[str, Any]) -> list[str]:
     every = [row.get(f"all_trials_position_error_{what}_m") for what in ("median", "rms")]
+    digits = 0 if any(value is not None and value > MILLIMETRES_ABOVE_M for value in every) else 2
     return [
         row["estimator"],
         _found(row),
@@ -176,7 +178,7 @@ def _cells(row: dict[str, Any]) -> list[str]:
             f"{_number(row[f'position_error_{what}_m'], 1e3)}{_interval(row.get(f'position_error_{what}_95_m'))}"
             for what in ("median", "rms")
         ),
-        "" if every[0] is None else "/".join(_number(value, 1e3, 2 if value < 0.01 else 0) for value in every),
+        "/".join(_number(value, 1e3, digits) for value in every if value is not None),
         _number(row["nees_mean"]),
         _number(row["update_ms_median"], 1, 1),
     ]

@@ -209,20 +209,19 @@ def peers(
     context: typer.Context,
     folder: Annotated[Path, typer.Argument(help="Folder with world.yaml, a ROS map*.yaml, held.npz and track.npz.")],
     trials: Annotated[int, typer.Option(min=1, help="Maximum number of trials of each task.")] = 100,
-    estimators: Annotated[str, typer.Option(help="Names as in the table, separated by semicolons.")] = "",
+    estimators: Estimators = "",
 ) -> None:
     """The scans on which Nav2's AMCL, Beluga and MRPT were measured (docs/peers.md), with the same protocol.
 
     Processor times are of one thread if OMP_NUM_THREADS=1. After Ctrl-C the same command continues.
     Examples: `presage experiment peers scans --trials 3`;
-    `presage experiment --out docs/experiments peers scans --estimators "presage, polygons; presage, 5 cm map"`.
+    `presage experiment --out mine peers scans --estimators "presage polygons,presage 5 cm map"`.
     """
+    from lab.experiments.estimators import parse_estimators
     from lab.peers import experiment
 
     seed, out = context.obj
-    names = [name.strip() for name in estimators.split(";")] if estimators else list(experiment.CONTENDERS)
-    if unknown := [name for name in names if name not in experiment.CONTENDERS]:
-        raise UserError(f"no estimator {unknown[0]!r}: choose from {'; '.join(experiment.CONTENDERS)}")
+    names = parse_estimators(estimators, experiment.CONTENDERS) if estimators else tuple(experiment.CONTENDERS)
     show(experiment, lambda: experiment.run(folder, names, trials, seed, out, worker_count(), console), out)
 
 
