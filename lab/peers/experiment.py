@@ -82,9 +82,11 @@ class PeersJob:
         return read_posed_scans(Path(self.folder) / (PLACES if self.task == STANDING else DRIVES))
 
     @property
-    def fold(self) -> int:
-        """Which half of the drives the model is not learned from; standing robots are in none of them."""
-        return 0 if self.task == STANDING else self.number % 2
+    def teachers(self) -> str:
+        """The drives of which the model is learned: all for a standing robot, else those of the other parity."""
+        if self.task == STANDING:
+            return "all"
+        return "odd" if self.number % 2 == 0 else "even"
 
 
 def run(
@@ -117,17 +119,18 @@ def _model_file(job: PeersJob) -> str:
     kind = CONTENDERS[job.contender].map
     if kind == FIELD:
         return str(weights.path_of(Path(job.out), load_world(str(map_file(Path(job.folder)))).name))
-    return str(weights.path_of(Path(job.out), f"posed-{job.fold}")) if kind == POSED else ""
+    return str(weights.path_of(Path(job.out), f"posed-{job.teachers}")) if kind == POSED else ""
 
 
 def learn(job: PeersJob) -> dict[str, Any]:
-    """Learns the job's model, unless an interrupted run has: from the map, or from every other drive."""
+    """Learns the job's model, unless an interrupted run has: from the map, or from drives on which it is not tested."""
     path = Path(_model_file(job))
     if CONTENDERS[job.contender].map == FIELD:
         field_file(path.parent, load_world(str(map_file(Path(job.folder)))), job.scans.scanner)
     elif not path.exists():
         scans = read_posed_scans(Path(job.folder) / DRIVES)
-        drive = scans.drive(range(1 - job.fold, len(scans.truth), 2))
+        numbers = range(len(scans.truth))
+        drive = scans.drive({"all": numbers, "odd": numbers[1::2], "even": numbers[::2]}[job.teachers])
         options = TrainDriveOptions(Path(DRIVES))
         began = time.monotonic()
         learned = learn_drive(drive, options.recipe, None, lambda _title, _done: None)
