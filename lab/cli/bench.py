@@ -319,7 +319,7 @@ def bench_integrity(
 
 @app.command("speed")
 def bench_speed(world: WorldName = "office", json_file: Json = None) -> None:
-    """Update time and memory of every estimator on one core, each in its own process, with 622 and 811 beams.
+    """Update time and memory of each estimator on one core, each in its own process, with 622 and 811 beams.
 
     Example: `presage bench speed --json speed.json`.
     """
