@@ -66,9 +66,7 @@ class Sensor:
             return self.field.log_cubes(ends, sigma, observation.range_max)
         return self.field.log_product(ends, sigma, observation.range_max)
 
-    def explain(
-        self, pose: Array, mount: Array, observation: Observation, sigma: float | None = None
-    ) -> Explanation:
+    def explain(self, pose: Array, mount: Array, observation: Observation, sigma: float | None = None) -> Explanation:
         """Evaluates all beams of a scan at base_link ``pose`` (3,) in map, by the product likelihood field.
 
         ``sigma`` m of a hit defaults to that of tracking. Derivatives of the distances are central differences.
