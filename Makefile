@@ -12,7 +12,7 @@ DEMO_STAMP := $(VENV)/.installed-demo
 # uv chooses PyTorch's index itself; another index is left to pip.
 UV ?= $(if $(WHEEL_INDEX),,$(shell command -v uv 2>/dev/null))
 
-.PHONY: help install demo test bless check bench chaos screenshots images lock platforms clean FORCE
+.PHONY: help install demo test bless check bench chaos tables screenshots images lock platforms clean FORCE
 .DELETE_ON_ERROR:
 
 help: ## list the targets
@@ -90,6 +90,23 @@ bench: install ## measure the latency from scan to command and zenoh's own round
 
 chaos: install ## inject faults into a system on three hosts; measure detection, stop and recovery
 	$(BIN)/presage bench chaos $(ARGS)
+
+# The command of each table also stands beside it. PEERS: a folder as described in docs/peers.md; without it, that table
+# stays. Interrupted experiments continue, bench accuracy begins again.
+PEERS ?=
+RESULTS := docs/experiments
+tables: install ## measure all tables of README and docs/ at this commit, and fill them (hours)
+	$(BIN)/presage bench accuracy --seed 2801 --seeds 5 --trials 20 --minutes 0.5 --json $(RESULTS)/accuracy.json --figure docs/accuracy.png
+	$(BIN)/presage bench accuracy --estimators all --tasks standing,blocked,furnished,tracking,odometry --seed 2801 --seeds 5 --trials 10 --minutes 0.2 --json $(RESULTS)/accuracy-rivals.json
+	$(BIN)/presage experiment --out $(RESULTS) all
+	$(if $(PEERS),OMP_NUM_THREADS=1 PRESAGE_WORKERS=1 $(BIN)/presage experiment --seed 2801 --out $(RESULTS) peers '$(PEERS)')
+	$(BIN)/presage bench integrity --out experiments/integrity --worlds 10 --seed 2711 --model exact --seconds 10
+	$(BIN)/presage bench integrity --out experiments/integrity-long-corridor --worlds 20 --seed 2712 --model exact --seconds 10 --cases long-corridor --estimators precise
+	$(BIN)/presage bench integrity --out experiments/integrity-moved-50 --worlds 20 --seed 2611 --model exact --cases moved-50
+	$(BIN)/presage bench integrity --out experiments/integrity-single-scan-moved-50 --worlds 20 --seed 2611 --model exact --cases single-scan-moved-50 --estimators precise
+	for folder in experiments/integrity*; do cp $$folder/integrity.json $(RESULTS)/$${folder#*/}.json || exit 1; done
+	cp experiments/integrity/integrity.png $(RESULTS)/
+	for page in README.md docs/*.md; do $(BIN)/presage experiment --out $(RESULTS) tables --page $$page || exit 1; done
 
 screenshots: install ## docs/page.png and docs/page.webp of the live page; needs Chromium
 	$(BIN)/python -m tests.viewer.screenshots $(ARGS)

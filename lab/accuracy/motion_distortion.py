@@ -22,11 +22,12 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.world import load_world
 from common.robot.motion_distortion import beam_times
-from lab.accuracy.runner import ESTIMATORS, provenance
+from lab.accuracy.contenders import CONTENDERS, Place
+from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import Scene
 from lab.accuracy.tasks import is_at
 from presage.terminal.output import check_file, write_json
-from services.estimator.factory import EstimatorOptions, Geometry, prepare
+from services.estimator.factory import Geometry
 from services.estimator.shared.interface import Observation
 from services.simulator.odometry import Drift, Odometer
 
@@ -51,7 +52,7 @@ class DistortionJob:
 
 def run(job: DistortionJob) -> list[dict[str, Any]]:
     """One row for each kind of scan, over all drives."""
-    world, (name, model) = load_world(job.world), ESTIMATORS[job.estimator]
+    world = load_world(job.world)
     errors: dict[str, list[Array]] = {kind: [] for kind in SCANS}
     update_ms: dict[str, list[float]] = {kind: [] for kind in SCANS}
     for number in range(job.drives):
@@ -59,8 +60,7 @@ def run(job: DistortionJob) -> list[dict[str, Any]]:
         path = scene.path(job.seconds, at_full_speed=True)
         for kind in SCANS:
             scene.rng = np.random.default_rng((job.seed, number, 1))
-            options = EstimatorOptions(job.world, name, model, seed=job.seed)
-            estimator = prepare(options)(Geometry.of(scene.scanner))
+            estimator = CONTENDERS[job.estimator].make(Place(world, Geometry.of(scene.scanner), job.seed))
             estimator.restart(path[0], np.diag([0.01, 0.01, 0.01]))
             estimates = []
             for observation in observations(scene, path, kind, job.prior):

@@ -16,7 +16,8 @@ from common.errors import UserError
 from common.geometry.world import load_world
 from common.robot.scanner import Scanner
 from common.robot.scanner_options import chosen_scanner
-from lab.accuracy.runner import ESTIMATORS, TASKS, AccuracyJob, provenance, run_all
+from lab.accuracy.contenders import CONTENDERS
+from lab.accuracy.runner import TASKS, AccuracyJob, provenance, run_all
 from lab.accuracy.tasks import FOUND_DISTANCE, FOUND_YAW, TWINS_REQUIRED_FROM_SCAN
 from presage.terminal.output import check_file, write_json
 
@@ -27,13 +28,18 @@ MARKS = {
     "particle-filter": ("#D55E00", "^", 7),
     "amcl-defaults": ("#CC79A7", "v", -14),
 }
-# Printed below each --markdown table, because the errors alone would hide the trials that failed.
-LEGEND = f"""Each cell: median/RMS position error of the trials that were found, i.e. within {FOUND_DISTANCE:g} m and
-{np.rad2deg(FOUND_YAW):g}° of the true pose; how many of all trials were found; wrong: how many of all trials published
-`tracking` while the robot was elsewhere; NEES of the trials found (3 means a consistent covariance). The bound is the
-Cramér-Rao bound, RMS in mm. "Both kept": from scan {TWINS_REQUIRED_FROM_SCAN} until a scan distinguishes the two rooms,
-every belief contains a hypothesis at the true pose and one at its twin; wrong counts trials that published `tracking`
-at the wrong place during that time."""
+# Of others that share a figure with these.
+OTHER_MARKS = (("#009E73", "D", 7), ("#E69F00", "P", -14), ("#F0E442", "X", 7), ("#000000", "*", -14))
+# Printed below each --markdown table.
+LEGEND = f"""Errors are of the position, in mm. *Found*: trials within {FOUND_DISTANCE:g} m and
+{np.rad2deg(FOUND_YAW):g}° of the true pose, with Wilson's 95 % interval, where trials are independent; median, RMS and
+NEES are of these, with bootstrap intervals over trials, or over 5 s of a path. *Wrong*: trials that published
+`tracking` elsewhere. *All*: median/RMS of all trials, found or not. A NEES of 3 means a consistent covariance. The
+bound is the Cramér-Rao bound, RMS. "Both kept": from scan {TWINS_REQUIRED_FROM_SCAN} until a scan distinguishes the two
+rooms, every belief contains a hypothesis at the true pose and one at its twin; wrong counts trials that published
+`tracking` at the wrong place during that time."""
+MILLIMETRES_ABOVE_M = 0.05  # larger errors are printed without decimals
+HEADS = ("estimator", "found (95 %)", "wrong", "median (95 %)", "RMS (95 %)", "all", "NEES", "update (ms)")
 
 
 def bench_accuracy(
@@ -44,6 +50,7 @@ def bench_accuracy(
     trials: int,
     minutes: float,
     seed: int,
+    seeds: int,
     workers: int,
     json_file: Path | None,
     figure: Path | None,
@@ -52,11 +59,14 @@ def bench_accuracy(
     markdown: bool = False,
     scanner: str = "tim571",
 ) -> int:
-    """Runs the benchmark, prints a table per world and scanner, and writes ``json_file`` and ``figure`` if given."""
-    chosen = estimators.split(",")
-    unknown = [name for name in chosen if name not in ESTIMATORS]
+    """Runs the benchmark, prints a table per world and scanner, and writes ``json_file`` and ``figure`` if given.
+
+    Each of ``seeds`` consecutive seeds has its own places, noise and paths; the rows are over all of them.
+    """
+    chosen = list(CONTENDERS) if estimators == "all" else estimators.split(",")
+    unknown = [name for name in chosen if name not in CONTENDERS]
     if unknown:
-        raise UserError(f"no estimator {unknown[0]!r} in this benchmark: choose from {', '.join(ESTIMATORS)}")
+        raise UserError(f"no estimator {unknown[0]!r} in this benchmark: choose from {', '.join(CONTENDERS)}")
     scanners = scanners_of(scanner, beams)
     wanted = tuple(tasks.split(",")) if tasks else TASKS
     if missing := [name for name in wanted if name not in TASKS]:
@@ -67,10 +77,11 @@ def bench_accuracy(
     check_file(json_file, "--json")
     check_file(figure, "--figure")
     jobs = [
-        AccuracyJob(estimator, world, each, trials, minutes * 60, seed, wanted)
+        AccuracyJob(estimator, world, each, trials, minutes * 60, own_seed, wanted)
         for world in names
         for each in scanners
         for estimator in chosen
+        for own_seed in range(seed, seed + seeds)
     ]
     rows = run_all(jobs, workers, console)
     if markdown:
@@ -78,7 +89,7 @@ def bench_accuracy(
     else:
         for title, own in _by_title(rows).items():
             console.print(_table(own, title))
-    write_json(json_file, {"rows": rows, "trials": trials, "minutes": minutes, **provenance(seed)})
+    write_json(json_file, {"rows": rows, "trials": trials, "minutes": minutes, "seeds": seeds, **provenance(seed)})
     if figure is not None:
         _draw(rows, figure)
     return 0
@@ -146,25 +157,50 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def _markdown(rows: list[dict[str, Any]], title: str) -> str:
-    """A Markdown table with one line per task; `LEGEND` explains the cells."""
-    names = list(dict.fromkeys(row["estimator"] for row in rows))
-    lines = [f"| {title} | " + " | ".join(names) + " | bound |", "|---" * (len(names) + 2) + "|"]
+    """A Markdown table with one line for each task and estimator; `LEGEND` explains the columns."""
+    lines = ["| " + " | ".join((title, *HEADS)) + " |", "|" + "---|" * (len(HEADS) + 1)]
     for task in dict.fromkeys(row["task"] for row in rows):
-        own = {row["estimator"]: row for row in rows if row["task"] == task}
-        limit = next((row["bound_rms_m"] for row in own.values() if row["bound_rms_m"] is not None), None)
-        cells = [cell(own[name]) if name in own else "" for name in names]
-        lines.append(f"| {task} | " + " | ".join(cells) + f" | {_number(limit, 1e3)} |")
+        own = [row for row in rows if row["task"] == task]
+        limit = next((row["bound_rms_m"] for row in own if row["bound_rms_m"] is not None), None)
+        bound = "" if limit is None else f" (bound {_number(limit, 1e3)})"
+        lines += [f"| {task}{bound} | " + " | ".join(_cells(row)) + " |" for row in own]
     return "\n".join(lines)
 
 
-def cell(row: dict[str, Any], *, nees: bool = True) -> str:
-    """Errors and counts of one task, for a Markdown table; `LEGEND` explains them."""
-    counts = f"{row['found']}/{row['of']}, {row['tracking_but_wrong']} wrong"
+def _cells(row: dict[str, Any]) -> list[str]:
+    every = [row.get(f"all_trials_position_error_{what}_m") for what in ("median", "rms")]
+    digits = 0 if any(value is not None and value > MILLIMETRES_ABOVE_M for value in every) else 2
+    return [
+        row["estimator"],
+        _found(row),
+        str(row["tracking_but_wrong"]),
+        *(
+            f"{_number(row[f'position_error_{what}_m'], 1e3)}{_interval(row.get(f'position_error_{what}_95_m'))}"
+            for what in ("median", "rms")
+        ),
+        "/".join(_number(value, 1e3, digits) for value in every if value is not None),
+        _number(row["nees_mean"]),
+        _number(row["update_ms_median"], 1, 1),
+    ]
+
+
+def _found(row: dict[str, Any]) -> str:
+    share = row["found_share_95"]
+    interval = "" if share is None else f" ({100 * share[0]:.0f} to {100 * share[1]:.0f} %)"
+    return f"{row['found']}/{row['of']}{interval}"
+
+
+def _interval(bounds: list[float] | None) -> str:
+    return "" if bounds is None else f" ({_number(bounds[0], 1e3)} to {_number(bounds[1], 1e3)})"
+
+
+def cell(row: dict[str, Any]) -> str:
+    """Errors and counts of one task, for the Markdown table of README; `LEGEND` explains them."""
+    counts = f"{_found(row)}, {row['tracking_but_wrong']} wrong"
     if row["position_error_median_m"] is None:
         return counts
-    error = f"{_number(row['position_error_median_m'], 1e3)}/{_number(row['position_error_rms_m'], 1e3)} mm"
-    consistency = f", NEES {row['nees_mean']:.2f}" if nees and row["nees_mean"] is not None else ""
-    return f"{error}, {counts}{consistency}"
+    median = f"{_number(row['position_error_median_m'], 1e3)}{_interval(row.get('position_error_median_95_m'))}"
+    return f"{median}/{_number(row['position_error_rms_m'], 1e3)} mm; {counts}"
 
 
 def _draw(rows: list[dict[str, Any]], file: Path) -> None:
@@ -175,9 +211,10 @@ def _draw(rows: list[dict[str, Any]], file: Path) -> None:
     figure = Figure(figsize=(9, 0.55 * len(tasks) + 2), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
+    others = iter(OTHER_MARKS * len(rows))
     for name in dict.fromkeys(row["estimator"] for row in rows):
         own = [row for row in rows if row["estimator"] == name]
-        colour, mark, above = MARKS[name]
+        colour, mark, above = MARKS.get(name) or next(others)
         axes.scatter(
             [row["position_error_rms_m"] * 1e3 for row in own],
             [tasks.index(row["task"]) for row in own],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,28 +17,18 @@ from common.geometry.world import World, load_world
 from common.robot.scanner import Scanner
 from common.versions import commit, versions
 from lab.accuracy import tasks
+from lab.accuracy.contenders import CONTENDERS, Place
 from lab.accuracy.scenes import TWINS, Scene
+from lab.statistics import bootstrap_interval, root_mean_square, wilson_interval
 from lab.workers import pool
-from services.estimator.factory import EstimatorOptions, Geometry, Name, prepare
-from services.estimator.particle_filter.filter import ParticleFilter
-from services.estimator.particle_filter.settings import Settings as ParticleSettings
-from services.estimator.precise.estimator import PreciseEstimator
+from services.estimator.factory import Geometry
 from services.estimator.precise.field import FieldModel
-from services.estimator.precise.global_seeds import SEED_SPACING_M, Seeds, thin_places
 from services.estimator.precise.learning.field_learning import Recipe, learn_field, learn_scales, measure_ripple
 from services.estimator.precise.learning.surfaces import Beams
-from services.estimator.shared.generative_models import RayCaster
 from services.estimator.shared.interface import Estimator
 
-# Estimator and generative model by the name that users give; "exact" casts rays in the world itself.
-ESTIMATORS: dict[str, tuple[Name, str]] = {
-    "precise": ("precise", "learned"),
-    "precise-exact": ("precise", "exact"),
-    "particle-filter": ("particle-filter", "learned"),
-    "amcl-defaults": ("amcl-defaults", "learned"),
-}
 DEGREES_OF_FREEDOM = 3
-TASKS = ("standing", "blocked", "kidnapped", "tracking", "odometry", "twins")
+TASKS = ("standing", "blocked", "furnished", "kidnapped", "tracking", "odometry", "twins")
 
 
 @dataclass(frozen=True)
@@ -55,34 +45,47 @@ class AccuracyJob:
 
 
 def run_all(jobs: list[AccuracyJob], workers: int, console: Console) -> list[dict[str, Any]]:
-    """Rows of all jobs, in the order of the jobs; shows a progress bar."""
+    """Rows of all jobs, in their order; jobs that differ only in the seed share their rows. Shows a progress bar."""
     if workers == 1:
-        return [row for job in track(jobs, "measuring", console=console, transient=True) for row in run(job)]
-    with pool(workers) as executor:
-        done = track(executor.map(run, jobs), "measuring", total=len(jobs), console=console, transient=True)
-        return [row for rows in done for row in rows]
+        found = [run(job) for job in track(jobs, "measuring", console=console, transient=True)]
+    else:
+        with pool(workers) as executor:
+            done = track(executor.map(run, jobs), "measuring", total=len(jobs), console=console, transient=True)
+            found = list(done)
+    shared: dict[tuple[AccuracyJob, str, str], list[tasks.TaskOutcome]] = {}
+    for job, outcomes in zip(jobs, found, strict=True):
+        for (world, task), outcome in outcomes.items():
+            shared.setdefault((replace(job, seed=0), world, task), []).append(outcome)
+    return [_row(job, world, task, tasks.TaskOutcome.joined(parts)) for (job, world, task), parts in shared.items()]
 
 
-def run(job: AccuracyJob) -> list[dict[str, Any]]:
-    """Runs the job's tasks. Returns one row for each result."""
+def run(job: AccuracyJob) -> dict[tuple[str, str], tasks.TaskOutcome]:
+    """Runs the job's tasks. Returns an outcome for each result, by world and name."""
     world = load_world(job.world)
-    geometry = Geometry.of(job.scanner)
-    name, model = ESTIMATORS[job.estimator]
-    estimator = prepare(EstimatorOptions(job.world, name, model, seed=job.seed))(geometry)
+    estimator = _estimator(job, world)
     outcomes: dict[str, tasks.TaskOutcome] = {}
-    for number, task in enumerate((tasks.standing, tasks.blocked, tasks.kidnapped)):
+    for number, task in enumerate((tasks.standing, tasks.blocked, tasks.kidnapped, tasks.furnished)):
         if task.__name__ in job.tasks:
             outcomes |= task(estimator, _scene(job, world, number), job.trials, _no_progress)
-    for number, name_of_task in enumerate(("tracking", "odometry")):
-        if name_of_task in job.tasks:
+    for number, name in enumerate(("tracking", "odometry")):
+        if name in job.tasks:
             scene = _scene(job, world, 10 + number)
-            outcomes |= tasks.tracking(estimator, scene, job.seconds, _no_progress, odometry=name_of_task == "odometry")
-    rows = [_row(job, job.world, task, outcome) for task, outcome in outcomes.items()]
-    if "twins" not in job.tasks:
-        return rows
-    scene = _scene(job, TWINS, 20)
-    outcomes = tasks.twins(_estimator_for_twins(job, geometry), scene, job.trials, _no_progress)
-    return rows + [_row(job, TWINS.name, task, outcome) for task, outcome in outcomes.items()]
+            outcomes |= tasks.tracking(estimator, scene, job.seconds, _no_progress, odometry=name == "odometry")
+    found = {(job.world, task): outcome for task, outcome in outcomes.items()}
+    if "twins" in job.tasks:
+        scene = _scene(job, TWINS, 20)
+        outcomes = tasks.twins(_estimator(job, TWINS), scene, job.trials, _no_progress)
+        found |= {(TWINS.name, task): outcome for task, outcome in outcomes.items()}
+    return found
+
+
+def _estimator(job: AccuracyJob, world: World) -> Estimator:
+    """The job's estimator; for the world of two identical rooms, trains a field from 2000 scans if it needs one."""
+    geometry, contender = Geometry.of(job.scanner), CONTENDERS[job.estimator]
+    learned = None
+    if world is TWINS and contender.learns:
+        learned = quick_field(TWINS, geometry, np.random.default_rng(job.seed), limited=True)
+    return contender.make(Place(world, geometry, job.seed, learned))
 
 
 def _no_progress(poses: Iterable[Array]) -> Iterator[Array]:
@@ -91,23 +94,6 @@ def _no_progress(poses: Iterable[Array]) -> Iterator[Array]:
 
 def _scene(job: AccuracyJob, world: World, number: int) -> Scene:
     return Scene.of(world, None, job.seed * 100 + number, job.scanner)
-
-
-def _estimator_for_twins(job: AccuracyJob, geometry: Geometry) -> Estimator:
-    """The job's estimator for the world of two identical rooms; trains its field from 2000 scans if it needs one."""
-    name, model = ESTIMATORS[job.estimator]
-    mount = (float(geometry.mount[0]), float(geometry.mount[1]), float(geometry.mount[2]))
-    if name == "amcl-defaults":
-        return ParticleFilter(TWINS, ParticleSettings(), mount, job.seed)
-    if name == "particle-filter":
-        return ParticleFilter(TWINS, ParticleSettings.tuned(), mount, job.seed)
-    rng = np.random.default_rng(job.seed)
-    places = thin_places(TWINS.sample_free(6000, rng, 0.05), SEED_SPACING_M)
-    if model == "exact":
-        exact = RayCaster(TWINS)
-        return PreciseEstimator(exact, Seeds.at(exact, places), geometry.mount, geometry.likelihood())
-    learned = quick_field(TWINS, geometry, rng, limited=True)
-    return PreciseEstimator(learned, Seeds.at(learned, places), geometry.mount, geometry.likelihood())
 
 
 def quick_field(
@@ -134,9 +120,11 @@ def _row(job: AccuracyJob, world: str, task: str, outcome: tasks.TaskOutcome) ->
     errors = np.array(outcome.errors).reshape(-1, 3)
     position = np.hypot(errors[:, 0], errors[:, 1])
     count, nees = len(position), np.array(outcome.nees)
-    rms = float(np.sqrt(np.mean(position**2))) if count else None
-    limit = float(np.sqrt(np.mean(np.square(outcome.bounds)))) if outcome.bounds else None
+    groups = [np.array(group) for group in outcome.by_group(position)]
+    rms = root_mean_square(position) if count else None
+    limit = root_mean_square(np.array(outcome.bounds)) if outcome.bounds else None
     half = 1.96 * np.sqrt(2 * DEGREES_OF_FREEDOM / max(len(nees), 1))
+    every = np.array(outcome.all_position_errors)
     return {
         "world": world,
         "scanner": job.scanner.name,
@@ -149,9 +137,13 @@ def _row(job: AccuracyJob, world: str, task: str, outcome: tasks.TaskOutcome) ->
         "found_share_95": wilson_interval(outcome.found, outcome.total) if outcome.independent else None,
         "tracking_but_wrong_share_95": wilson_interval(outcome.wrong, outcome.total) if outcome.independent else None,
         "position_error_median_m": float(np.median(position)) if count else None,
+        "position_error_median_95_m": bootstrap_interval(groups, lambda values: float(np.median(values))),
         "position_error_rms_m": rms,
+        "position_error_rms_95_m": bootstrap_interval(groups, root_mean_square),
         "position_error_p95_m": float(np.quantile(position, 0.95)) if count else None,
         "position_error_max_m": float(position.max()) if count else None,
+        "all_trials_position_error_median_m": float(np.median(every)) if len(every) else None,
+        "all_trials_position_error_rms_m": root_mean_square(every) if len(every) else None,
         "heading_error_median_deg": float(np.rad2deg(np.median(np.abs(errors[:, 2])))) if count else None,
         "bound_rms_m": limit,
         "rms_over_bound": rms / limit if rms is not None and limit else None,
@@ -159,13 +151,6 @@ def _row(job: AccuracyJob, world: str, task: str, outcome: tasks.TaskOutcome) ->
         "nees_band": [DEGREES_OF_FREEDOM - half, DEGREES_OF_FREEDOM + half] if len(nees) else None,
         "update_ms_median": float(np.median(outcome.update_ms)) if outcome.update_ms else None,
     }
-
-
-def wilson_interval(count: int, of: int) -> list[float]:
-    """Wilson's 95 % interval for the probability of an event that happened ``count`` times in ``of`` trials."""
-    z2 = 1.96**2
-    middle, half = count + z2 / 2, 1.96 * np.sqrt(count * (of - count) / of + z2 / 4)
-    return [float(np.clip((middle + side * half) / (of + z2), 0, 1)) for side in (-1, 1)]
 
 
 def provenance(seed: int) -> dict[str, Any]:

@@ -14,10 +14,12 @@ from common.geometry.se2 import Array
 from common.geometry.world import World
 from common.robot.base import Robot
 from common.robot.scanner import SCANNERS, Scanner
+from lab.accuracy.furniture import CATALOGUE, Piece
 from services.estimator.shared.interface import Observation
 
 ROBOT = Robot()
 TIM571 = SCANNERS["tim571"]
+GLASS_SHARE = 0.25  # of unknown furniture
 MAX_TURN_RATE = 1.0  # rad/s, on the paths
 
 
@@ -72,6 +74,28 @@ class Scene:
             if (ranges < 0.31).all():
                 break
         return np.asarray(ranges)
+
+    def furnished(self, pose: Array, share: float) -> Array:
+        """Ranges (B,) at ``pose`` (3,) with unknown furniture in at least ``share`` of the beams.
+
+        The pieces are those of generated buildings, such as cupboards, tables and chairs; a quarter of them are of
+        glass, from which no beam returns.
+        """
+        clean = self.clean(pose[None])[0]
+        laser = se2.compose(pose, np.array(self.scanner.mount))
+        nearest, silent = clean.copy(), np.zeros(len(clean), bool)
+        while ((nearest < clean) | silent).mean() < share:
+            shape, small, large, _ = CATALOGUE[self.rng.integers(len(CATALOGUE))]
+            width, depth = self.rng.uniform(small, large)
+            piece = Piece(shape, (width, width if shape == "disc" else depth))
+            away = self.rng.uniform(ROBOT.radius + np.hypot(*piece.size) / 2, 4.0)
+            bearing, yaw = self.rng.uniform(-np.pi, np.pi, 2)
+            piece = piece.at(np.array([*(pose[:2] + away * np.array([np.cos(bearing), np.sin(bearing)])), yaw]))
+            alone = self.world.with_obstacles(list(piece.obstacles))
+            seen = alone.ray_distances(laser[None], self.scanner.angles())[0]
+            hidden = seen < nearest
+            nearest[hidden], silent[hidden] = seen[hidden], self.rng.random() < GLASS_SHARE
+        return np.where(silent, np.inf, nearest)
 
     def path(
         self, seconds: float, speed: float = 1.0, start: Array | None = None, *, at_full_speed: bool = False

@@ -13,13 +13,15 @@ from rich.progress import track
 from rich.table import Table
 
 from common.geometry.world import load_world
-from lab.accuracy.runner import ESTIMATORS, provenance
+from lab.accuracy.contenders import CONTENDERS, Place
+from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import Scene
 from lab.workers import pool
 from presage.terminal.output import check_file, write_json
-from services.estimator.factory import EstimatorOptions, Geometry, prepare
+from services.estimator.factory import Geometry
 
 LIMITS = {"tracking": 5.0, "from nothing": 500.0}  # ms per update, the requirement for preset precise
+ESTIMATORS = ("precise", "precise-exact", "particle-filter", "amcl-defaults", "correlative")
 TRACKING_UPDATES = 300
 SKIPPED_UPDATES = 5  # at the start of the path, while caches warm up
 
@@ -57,11 +59,10 @@ def bench_speed(world: str, beams: str, seed: int, json_file: Path | None, conso
 
 def measure(estimator: str, world_name: str, beams: int, seed: int) -> dict[str, Any]:
     """Times one estimator: 20 global searches, then tracking along a path."""
-    name, model = ESTIMATORS[estimator]
     scene = Scene.of(load_world(world_name), beams, seed)
     began = time.perf_counter()
     geometry = Geometry.of(scene.scanner)
-    estimator_under_test = prepare(EstimatorOptions(world_name, name, model, seed=seed))(geometry)
+    estimator_under_test = CONTENDERS[estimator].make(Place(scene.world, geometry, seed))
     ready = time.perf_counter() - began
     searches = []
     for clean in scene.clean(scene.poses(20)):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,6 +19,7 @@ FOUND_DISTANCE, FOUND_YAW = 0.2, np.deg2rad(5)  # m, rad; an estimate with small
 STANDING_SCANS = 20
 # From this scan on, a belief must contain both of two identical rooms. Before, an estimator may still be searching.
 TWINS_REQUIRED_FROM_SCAN = 20
+DEPENDENT_SCANS = 75  # of one path; estimates farther apart are taken as independent
 ProgressWrapper = Callable[[Iterable[Array]], Iterator[Array]]
 
 
@@ -32,14 +33,38 @@ def is_at(believed: Array, pose: Array) -> bool:
 class TaskOutcome:
     """Results of one estimator in one task."""
 
-    errors: list[Array] = field(default_factory=list)  # (3,) m, m, rad
+    errors: list[Array] = field(default_factory=list)  # (3,) m, m, rad, of the estimates found
+    groups: list[int] = field(default_factory=list)  # of these, which depend on each other if they are in one
+    all_position_errors: list[float] = field(default_factory=list)  # m, of all estimates
     nees: list[float] = field(default_factory=list)  # NEES: error' covariance^-1 error, with the estimate's covariance
     bounds: list[float] = field(default_factory=list)  # m, Cramér-Rao bound of the position
-    update_ms: list[float] = field(default_factory=list)
+    update_ms: list[float] = field(default_factory=list)  # processor time
     found: int = 0
     total: int = 0
     wrong: int = 0  # estimates in state `tracking` while the robot was elsewhere
     independent: bool = True  # whether the counts are of separate trials, not of scans along one path
+
+    @classmethod
+    def joined(cls, parts: Sequence[TaskOutcome]) -> TaskOutcome:
+        """The results of several seeds."""
+        joined = cls(independent=parts[0].independent)
+        for part in parts:
+            first = max(joined.groups, default=-1) + 1
+            joined.groups += [first + group for group in part.groups]
+            joined.errors += part.errors
+            joined.all_position_errors += part.all_position_errors
+            joined.nees += part.nees
+            joined.bounds += part.bounds
+            joined.update_ms += part.update_ms
+            joined.found += part.found
+            joined.total += part.total
+            joined.wrong += part.wrong
+        return joined
+
+    def by_group(self, values: Array) -> list[Array]:
+        """``values`` (N,), one for each error, in groups that do not depend on each other."""
+        groups = np.array(self.groups, int)
+        return [values[groups == group] for group in np.unique(groups)]
 
     def add(self, posterior: Posterior, pose: Array, limit: float | None) -> bool:
         """Records an estimate. Returns whether it is at the true ``pose``; ``limit`` is the position bound in m."""
@@ -49,8 +74,10 @@ class TaskOutcome:
         self.total += 1
         self.found += found_here
         self.wrong += posterior.state == "tracking" and not found_here
+        self.all_position_errors.append(float(np.hypot(error[0], error[1])))
         if found_here:
             self.errors.append(error)
+            self.groups.append((self.total - 1) // (1 if self.independent else DEPENDENT_SCANS))
             if limit is not None:
                 self.bounds.append(limit)
             if posterior.covariance is not None:
@@ -59,10 +86,10 @@ class TaskOutcome:
 
 
 def _timed_update(estimator: Estimator, observation: Observation, outcome: TaskOutcome | None = None) -> Posterior:
-    began = time.perf_counter()
+    began = time.process_time()
     posterior = estimator.update(observation)
     if outcome is not None:
-        outcome.update_ms.append((time.perf_counter() - began) * 1e3)
+        outcome.update_ms.append((time.process_time() - began) * 1e3)
     return posterior
 
 
@@ -98,6 +125,20 @@ def blocked(estimator: Estimator, scene: Scene, trials: int, progress: ProgressW
                 one.add(posterior, pose, None)
         many.add(posterior, pose, None)
     return {"30 % blocked, 1 scan": one, "30 % blocked, 20 scans": many}
+
+
+def furnished(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, TaskOutcome]:
+    """Global localisation with 30 % of the beams changed by furniture and glass that the map lacks."""
+    one, many = TaskOutcome(), TaskOutcome()
+    for pose in progress(scene.poses(trials)):
+        estimator.restart()
+        clean = scene.furnished(pose, 0.3)
+        for k in range(STANDING_SCANS):
+            posterior = _timed_update(estimator, scene.observe(clean, k / scene.scanner.rate), one if k == 0 else many)
+            if k == 0:
+                one.add(posterior, pose, None)
+        many.add(posterior, pose, None)
+    return {"30 % furniture, 1 scan": one, "30 % furniture, 20 scans": many}
 
 
 def tracking(

@@ -23,6 +23,7 @@ from common.geometry.se2 import Array
 from common.geometry.shapes import Obstacle
 from common.geometry.world import load_world
 from common.robot.scanner import Scanner
+from lab.accuracy.furniture import Piece
 from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import ROBOT, Scene
 from lab.accuracy.tasks import is_at
@@ -30,7 +31,6 @@ from lab.experiments.trials import run_trials
 from lab.integrity.buildings import Building, Room, make_building, random_place
 from lab.integrity.cases import BEAMS
 from lab.integrity.changes import MAX_PLACES
-from lab.integrity.furniture import Piece
 from lab.navigation.shortest_path import ShortestPaths
 from presage.learning.map_of_log import MapOptions, map_command
 from presage.logs.log import Reading

@@ -201,30 +201,34 @@ def bench_localisation(
 def bench_accuracy(
     worlds: Annotated[str, typer.Option(help="Comma-separated worlds.")] = "office",
     estimators: Annotated[
-        str, typer.Option(help="Comma-separated: precise, precise-exact, particle-filter, amcl-defaults.")
+        str, typer.Option(help="Comma-separated names of docs/results.md, or all.")
     ] = "precise,precise-exact,particle-filter",
     tasks: Annotated[
         str,
-        typer.Option(help="Comma-separated: standing, blocked, kidnapped, tracking, odometry, twins. Defaults to all."),
+        typer.Option(
+            help="Comma-separated: standing, blocked, furnished, kidnapped, tracking, odometry, twins. Defaults to all."
+        ),
     ] = "",
     scanner: Annotated[
         str, typer.Option(help=f"Comma-separated: {', '.join(SCANNERS)}, or scanner files (docs/scanners.md).")
     ] = "tim571",
-    trials: Trials = 100,
+    trials: Annotated[int, typer.Option(min=1, help="Number of trials with each seed.")] = 100,
     minutes: Annotated[
-        float, typer.Option(min=0.05, help="Duration of each tracked path, at the scanner's rate.")
+        float, typer.Option(min=0.05, help="Duration of the tracked path of each seed, at the scanner's rate.")
     ] = 2.0,
     seed: Seed = 1,
+    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds, from --seed on; the rows are over all.")] = 1,
     json_file: Json = None,
     figure: Annotated[Path | None, typer.Option(help="File for a figure: PNG, SVG or PDF.")] = None,
     markdown: Annotated[bool, typer.Option("--markdown", help="Print a short Markdown table, as in README.")] = False,
 ) -> None:
     """Accuracy of the estimators compared with the Cramér-Rao bound.
 
-    The tasks: global localisation of a standing robot, also with blocked beams; kidnapping; tracking with and without
-    odometry; and two identical rooms. Scanner tim571 has 622 beams here, as in the paper.
+    The tasks: global localisation of a standing robot, also with blocked beams and among unknown furniture; kidnapping;
+    tracking with and without odometry; and two identical rooms. Scanner tim571 has 622 beams here, as in the paper.
 
     Examples: `presage bench accuracy --trials 20 --minutes 0.5`;
+    `presage bench accuracy --estimators all --seeds 5 --trials 20 --minutes 0.5 --markdown`;
     `presage bench accuracy --tasks standing --trials 1000 --estimators precise`;
     `presage bench accuracy --worlds office,corridor,maze --json accuracy.json --figure accuracy.png`;
     `presage bench accuracy --scanner lms200,rplidar-a1 --tasks standing,tracking --markdown`.
@@ -239,7 +243,8 @@ def bench_accuracy(
         trials,
         minutes,
         seed,
-        min(2, worker_count()),
+        seeds,
+        worker_count(),
         json_file,
         figure,
         console,
@@ -314,7 +319,7 @@ def bench_integrity(
 
 @app.command("speed")
 def bench_speed(world: WorldName = "office", json_file: Json = None) -> None:
-    """Update time and memory of every estimator on one core, each in its own process, with 622 and 811 beams.
+    """Update time and memory of each estimator on one core, each in its own process, with 622 and 811 beams.
 
     Example: `presage bench speed --json speed.json`.
     """

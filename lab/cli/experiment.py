@@ -204,6 +204,27 @@ def real_drive(
     show(real, lambda: real.run(job, out, worker_count(), console), out)
 
 
+@app.command("peers")
+def peers(
+    context: typer.Context,
+    folder: Annotated[Path, typer.Argument(help="Folder with world.yaml, a ROS map*.yaml, held.npz and track.npz.")],
+    trials: Annotated[int, typer.Option(min=1, help="Maximum number of trials of each task.")] = 100,
+    estimators: Estimators = "",
+) -> None:
+    """The scans on which Nav2's AMCL, Beluga and MRPT were measured (docs/peers.md), with the same protocol.
+
+    Processor times are of one thread if OMP_NUM_THREADS=1. After Ctrl-C the same command continues.
+    Examples: `presage experiment peers scans --trials 3`;
+    `presage experiment --out mine peers scans --estimators "presage polygons,presage 5 cm map"`.
+    """
+    from lab.experiments.estimators import parse_estimators
+    from lab.peers import experiment
+
+    seed, out = context.obj
+    names = parse_estimators(estimators, experiment.CONTENDERS) if estimators else tuple(experiment.CONTENDERS)
+    show(experiment, lambda: experiment.run(folder, names, trials, seed, out, worker_count(), console), out)
+
+
 @app.command("all")
 def all_experiments(
     context: typer.Context,
@@ -233,7 +254,7 @@ def tables(
     Examples: `presage experiment tables`;
     `presage experiment --out docs/experiments tables --page docs/experiments.md`.
     """
-    from lab.experiments.tables_page import MODULES, fill_tables, table_of
+    from lab.pages.tables_page import MODULES, fill_tables, table_of
 
     _, out = context.obj
     if page is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,12 +57,12 @@ class ExperimentWorld:
         return float(load_world(self.world).start_pose(0.0)[2])
 
 
-def parse_estimators(names: str) -> tuple[str, ...]:
+def parse_estimators(names: str, known: Iterable[str] = NAMES) -> tuple[str, ...]:
     """Estimator names from a comma-separated text, in which a name is written without its own comma.
 
     "particle-filter odometry" stands for "particle-filter, odometry". Raises UserError for unknown names.
     """
-    by_name = {name.replace(",", ""): name for name in NAMES}
+    by_name = {name.replace(",", ""): name for name in known}
     parsed = [" ".join(part.split()) for part in names.split(",")]
     if unknown := [name for name in parsed if name not in by_name]:
         raise UserError(f"no estimator {unknown[0]!r} in the experiments: choose from {', '.join(by_name)}")

@@ -111,9 +111,3 @@ def mean_std(summary: Mapping[str, Any], quantity: str, digits: int = 3) -> str:
     """Formats the summary's QUANTITY_mean_m and QUANTITY_std_m as mean ± standard deviation."""
     mean, std = summary.get(f"{quantity}_mean_m"), summary.get(f"{quantity}_std_m")
     return f"{number(mean, digits)} ± {number(std, digits)}"
-
-
-def tracking_shares(row: Mapping[str, Any]) -> str:
-    """Formats the share of scans in state `tracking`, and the share of these whose pose is wrong."""
-    wrong = row["wrong_claims_share"] / row["claimed_share"] if row["claimed_share"] else 0.0
-    return f"{row['claimed_share']:.1%}, {wrong:.1%}"

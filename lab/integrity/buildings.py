@@ -15,10 +15,9 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.shapes import Box, Obstacle
 from common.geometry.world import World
-from lab.integrity.furniture import Floor, Piece, Shape
+from lab.accuracy.furniture import CATALOGUE, Floor, Piece, Point, Shape
 
 Kind = Literal["office", "symmetric", "corridor"]
-Point = tuple[float, float]
 
 WALL_M, DOOR_M = 0.12, 1.05  # thickness, and width between the ends of the walls' centre lines
 DOOR_AREA_M = 0.9  # kept free on both sides of a door
@@ -27,19 +26,6 @@ TEMPLATES = 3  # different sets of furniture in a building
 PLACE_DEVIATION_M, YAW_DEVIATION = 0.08, np.deg2rad(3)  # between rooms with the same set
 CORRIDOR_SPACING_M = 4.0  # mean distance between pieces along a corridor
 
-# Shape, smallest and largest size in m, and whether it stands against a wall.
-CATALOGUE: tuple[tuple[Shape, Point, Point, bool], ...] = (
-    ("box", (0.8, 0.4), (1.6, 0.6), True),  # cupboard
-    ("box", (0.8, 0.3), (2.0, 0.4), True),  # shelf
-    ("box", (1.2, 0.7), (1.6, 0.8), True),  # desk
-    ("box", (1.2, 0.7), (1.6, 0.8), False),
-    ("box", (0.3, 0.3), (0.45, 0.45), False),  # column
-    ("legs", (1.2, 0.7), (1.8, 0.9), False),  # table
-    ("legs", (0.42, 0.42), (0.46, 0.46), False),  # chair
-    ("legs", (0.42, 0.42), (0.46, 0.46), False),
-    ("disc", (0.3, 0.3), (0.5, 0.5), True),  # plant
-    ("disc", (0.2, 0.2), (0.3, 0.3), False),  # bin
-)
 CORRIDOR_CATALOGUE = (CATALOGUE[1], CATALOGUE[8])
 
 

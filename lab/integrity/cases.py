@@ -84,6 +84,7 @@ CASES = {
         Case("sigma-double", sigma=2.0),
         Case("odometry", odometry=1.0),
         Case("odometry-too-good", odometry=2.0),
+        Case("odometry-too-bad", odometry=0.5),
         Case("slip", odometry=1.0, slip=True),
         Case("scaled-map", map="scaled"),
         Case("noisy-map", map="grid"),

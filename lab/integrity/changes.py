@@ -15,9 +15,9 @@ from common.geometry.ray_casting import cast_rays
 from common.geometry.se2 import Array
 from common.geometry.shapes import Box, Circle, Obstacle
 from common.geometry.world import World
+from lab.accuracy.furniture import Floor, Piece
 from lab.accuracy.scenes import ROBOT, Scene
 from lab.integrity.buildings import Building, random_piece, random_place
-from lab.integrity.furniture import Floor, Piece
 from services.simulator.people import People
 
 Kidnapping = Literal["anywhere", "similar", "nearby"]

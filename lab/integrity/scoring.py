@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from common.geometry import se2
 from common.geometry.se2 import Array
-from lab.accuracy.runner import wilson_interval
 from lab.accuracy.tasks import FOUND_DISTANCE, FOUND_YAW
+from lab.statistics import wilson_interval
 from services.estimator.shared.interface import Posterior
 
 Mask = npt.NDArray[np.bool_]

@@ -24,7 +24,6 @@ from common.geometry import se2
 from common.messages.definitions import Goal, Pose
 from common.robot.base import Robot
 from common.robot.scanner import SCANNERS
-from lab.accuracy.runner import wilson_interval
 from lab.experiments import results
 from lab.experiments.journeys import Journey
 from lab.experiments.lockstep import LockstepRun, RunTrace, session
@@ -32,6 +31,7 @@ from lab.experiments.lockstep import run as run_in_lockstep
 from lab.experiments.trials import run_trials
 from lab.navigation.experiment import DRIVES, SCANS_TO_STAND, WORLDS, columns
 from lab.navigation.shortest_path import MAX_DRAWS, Trip, draw_trip, load_shortest_paths
+from lab.statistics import wilson_interval
 from presage.plotting import style as drawing
 from services.controller.docking import Docking
 

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from common.versions import commit
 from lab.experiments import results
-from lab.experiments import tables_page as page
+from lab.pages import tables_page as page
 from lab.paper import aliasing, prediction, samples
 from lab.paper import alpha_sweep as step_size
 from lab.paper import e1_localisation as localisation

@@ -22,6 +22,7 @@ import numpy as np
 
 from common.geometry.ros_map_writer import write_grid
 from common.geometry.world import load_world
+from lab.accuracy.contenders import amcl_noise
 from lab.real_logs.drive import (
     GLOBAL,
     KIDNAPPED,
@@ -74,19 +75,8 @@ class TunedSettings:
 
 
 def starting_point(motion: MotionNoise) -> Settings:
-    """Odometry noise of AMCL's omnidirectional model, from the noise learned on the first half.
-
-    alpha1 to alpha5 are variances per square metre and per square radian.
-    """
-    # AMCL's standard deviation grows with the path, the learned variance does; they are equal over a decimetre.
-    along = float(np.sqrt(motion.path_by_path / 0.1))
-    return (
-        ("alpha1", motion.path_by_turn),
-        ("alpha2", motion.turn_by_path / 0.1),
-        ("alpha3", along**2),
-        ("alpha4", motion.turn_by_turn / 0.1),
-        ("alpha5", along**2),
-    )
+    """Odometry noise of AMCL's omnidirectional model, from the noise learned on the first half."""
+    return tuple(amcl_noise(motion).items())
 
 
 def tune(

@@ -66,13 +66,13 @@ class Sensor:
             return self.field.log_cubes(ends, sigma, observation.range_max)
         return self.field.log_product(ends, sigma, observation.range_max)
 
-    def explain(self, pose: Array, mount: Array, observation: Observation) -> Explanation:
+    def explain(self, pose: Array, mount: Array, observation: Observation, sigma: float | None = None) -> Explanation:
         """Evaluates all beams of a scan at base_link ``pose`` (3,) in map, by the product likelihood field.
 
-        Uses the sigma of tracking. Derivatives of the distances are central differences.
+        ``sigma`` m of a hit defaults to that of tracking. Derivatives of the distances are central differences.
         """
         _, ranges, angles = self._beams(observation, None)
-        sigma = self.settings.sigma_hit
+        sigma = self.settings.sigma_hit if sigma is None else sigma
         offsets = np.diag(GRADIENT_STEP)
         poses = se2.compose(np.concatenate([pose[None], pose + offsets, pose - offsets]), mount)
         ends = self.field.ends(poses, ranges, angles).astype(float)

@@ -13,8 +13,8 @@ from common.geometry import se2
 from common.geometry.world import load_world
 from common.robot.base import Robot
 from lab.accuracy import bound, tasks
-from lab.accuracy.report import _markdown, bench_accuracy, scanners_of
-from lab.accuracy.runner import AccuracyJob, _row, wilson_interval
+from lab.accuracy.report import _markdown, bench_accuracy, cell, scanners_of
+from lab.accuracy.runner import AccuracyJob, _row
 from lab.accuracy.scenes import TWINS, Scene, alike, twin_of, twin_path
 from services.estimator.shared.interface import Hypothesis, Posterior
 from services.simulator.odometry import Drift
@@ -81,6 +81,14 @@ def test_blocked_ranges():
         blocked = scene.blocked(clean, 0.3)
         assert (blocked <= clean).all()
         assert (blocked < clean).mean() >= 0.3
+
+
+def test_unknown_furniture():
+    scene = Scene.of(load_world("office"), 622, 0)
+    for pose in scene.poses(5):
+        seen, clean = scene.furnished(pose, 0.3), scene.clean(pose[None])[0]
+        assert ((seen <= clean) | np.isinf(seen)).all()
+        assert (seen != clean).mean() >= 0.3
 
 
 def test_twin_path():
@@ -150,20 +158,21 @@ def test_both_rooms_kept(believe, kept, wrong):
 
 
 def test_short_table(capsys):
-    outcome = tasks.TaskOutcome(found=1, total=3, wrong=2, errors=[np.array([0.003, 0.004, 0.0])], nees=[2.5])
+    outcome = tasks.TaskOutcome(
+        found=1, total=3, wrong=2, errors=[np.array([0.003, 0.004, 0.0])], groups=[0], nees=[2.5]
+    )
     nothing = tasks.TaskOutcome(total=3, wrong=1)
     tim = scanners_of("tim571", "")[0]
     job = AccuracyJob("precise", "office", tim, 3, 1.0, 0)
     rows = [_row(job, "office", task, each) for task, each in (("kidnapped", outcome), ("blocked", nothing))]
-    assert "| kidnapped | 5.00/5.00 mm, 1/3, 2 wrong, NEES 2.50 |" in _markdown(rows, "office")
-    assert "| blocked | 0/3, 1 wrong |" in _markdown(rows, "office")
+    table = _markdown(rows, "office")
+    assert "| kidnapped | precise | 1/3 (6 to 79 %) | 2 | 5.00 | 5.00 |  | 2.50 |  |" in table
+    assert "| blocked | precise | 0/3 (0 to 56 %) | 1 |  |  |  |  |  |" in table
+    assert cell(rows[0]) == "5.00/5.00 mm; 1/3 (6 to 79 %), 2 wrong"
     assert rows[0]["found_share_95"] == pytest.approx([0.061, 0.792], abs=1e-3)
 
 
-def test_confidence_intervals():
-    assert wilson_interval(294, 300) == pytest.approx([0.9570, 0.9908], abs=1e-3)
-    assert wilson_interval(0, 100) == pytest.approx([0.0, 0.0370], abs=1e-3)
-    assert wilson_interval(100, 100) == pytest.approx([0.9630, 1.0], abs=1e-3)
+def test_scans_of_a_path_have_no_confidence_interval():
     tim = scanners_of("tim571", "")[0]
     along = tasks.TaskOutcome(found=9, total=9, independent=False)
     assert _row(AccuracyJob("precise", "office", tim, 3, 1.0, 0), "office", "tracking", along)["found_share_95"] is None
@@ -171,12 +180,15 @@ def test_confidence_intervals():
 
 def test_rows_and_files(tmp_path):
     file, figure = tmp_path / "a.json", tmp_path / "a.png"
-    code = bench_accuracy("maze", "200", "precise-exact", "standing,odometry", 3, 0.1, 5, 1, file, figure, CONSOLE)
+    code = bench_accuracy("maze", "200", "precise-exact", "standing,odometry", 2, 0.05, 5, 2, 1, file, figure, CONSOLE)
     assert code == 0
     data = json.loads(file.read_text())
     rows = {row["task"]: row for row in data["rows"]}
     assert set(rows) == {"from nothing, 1 scan", "standing, 20 scans", "tracking, odometry"}
     assert rows["tracking, odometry"]["of"] == 90
+    assert rows["standing, 20 scans"]["of"] == 4
+    low, high = rows["standing, 20 scans"]["position_error_rms_95_m"]
+    assert low <= rows["standing, 20 scans"]["position_error_rms_m"] <= high
     assert 0 < rows["tracking, odometry"]["position_error_rms_m"] < 0.02
     assert rows["standing, 20 scans"]["bound_rms_m"] == pytest.approx(
         rows["from nothing, 1 scan"]["bound_rms_m"] / np.sqrt(20)
@@ -196,7 +208,7 @@ def test_rows_and_files(tmp_path):
 )
 def test_unknown_options(words, why):
     with pytest.raises(UserError, match=why):
-        bench_accuracy(*words, 2, 0.1, 0, 1, None, None, CONSOLE)
+        bench_accuracy(*words, 2, 0.1, 0, 1, 1, None, None, CONSOLE)
 
 
 def test_scanners():

@@ -19,7 +19,6 @@ from common.errors import UserError
 from common.geometry.world import Box, Obstacle, World, load_world, save_world
 from common.messages.definitions import Belief, Health, Pose, Status, Truth, Twist
 from common.robot.base import Robot
-from lab.experiments import tables_page as page
 from lab.experiments.journeys import Journey
 from lab.experiments.lockstep import LockstepRun, RunTrace, _append, _is_final
 from lab.navigation import drive as driven
@@ -32,6 +31,7 @@ from lab.navigation.shortest_path import (
     length,
     load_shortest_paths,
 )
+from lab.pages import tables_page as page
 from tests.conftest import ended
 
 QUIET = Console(quiet=True)

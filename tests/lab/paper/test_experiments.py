@@ -14,9 +14,9 @@ from rich.console import Console
 from common.errors import UserError
 from lab.accuracy.scenes import Scene
 from lab.experiments import results
-from lab.experiments import tables_page as page
 from lab.experiments.estimators import PAPER_DESCENT, ExperimentWorld, parse_estimators
 from lab.experiments.trials import TrialStore, run_trials
+from lab.pages import tables_page as page
 from lab.paper import alpha_sweep as step_size
 from lab.paper import e1_localisation as localisation
 from lab.paper import e2_crossing as crossing

@@ -12,7 +12,7 @@ from rich.console import Console
 from common.errors import UserError
 from common.geometry import se2
 from common.geometry.world import World, load_world, save_world
-from lab.experiments import tables_page as page
+from lab.pages import tables_page as page
 from lab.real_logs import experiment as real
 from lab.real_logs import filter_tuning as real_tuning
 from lab.real_logs.drive import (

@@ -1,4 +1,4 @@
-"""The tables of README.md: selected rows of the experiments' JSON."""
+"""Tables that are made from more than one result: those of README.md, and the comparison with other programs."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from lab.accuracy.report import cell
-from lab.experiments.results import markdown, number, read, tracking_shares
+from lab.experiments.results import markdown, number, read
+from lab.peers.experiment import table_with_others
+from lab.real_logs.experiment import claims_of
 
 PRESETS = {"precise": "presage", "particle-filter": "particle filter, tuned", "amcl-defaults": "AMCL-like defaults"}
 # Labels in README, and the tasks of `presage bench accuracy`
@@ -26,7 +28,7 @@ def real_logs(folder: Path) -> str:
         [summary[f"{task}, {name}"] for name in PRESETS]
         for task in ("a: tracking with odometry", "b: tracking without", "c: from nothing")
     )
-    claims = [f"{tracking_shares(row)}; {row['wrong_claim_longest_s']:.1f} s" for row in odometry]
+    claims = [f"{claims_of(row)}; {row['wrong_claim_longest_s']:.1f} s" for row in odometry]
     return markdown(
         ["", *PRESETS.values()],
         [
@@ -39,21 +41,29 @@ def real_logs(folder: Path) -> str:
 
 
 def simulation(folder: Path) -> str:
-    """Some tasks of the accuracy benchmark, and moved furniture, for presage and the particle filter."""
-    rows = {(row["task"], row["estimator"]): row for row in read(folder / "accuracy.json")["rows"]}
+    """Tasks of the accuracy benchmark and moved furniture, for presage, the particle filter and a scan matcher."""
+    found = [row for name in ("accuracy", "accuracy-rivals") for row in read(folder / f"{name}.json")["rows"]]
+    rows = {(row["task"], row["estimator"]): row for row in reversed(found)}  # those of `accuracy` have precedence
     lines = []
     for label, task in TASKS.items():
-        both = [rows[task, name] for name in ("precise", "particle-filter")]
-        bound = both[0]["bound_rms_m"]
-        lines.append([label, *(cell(row, nees=False) for row in both), f"{number(1e3 * bound, 2)} mm" if bound else ""])
+        own = [rows.get((task, name)) for name in ("precise", "particle-filter", "correlative")]
+        bound = next((row["bound_rms_m"] for row in own if row is not None), None)
+        lines.append(
+            [
+                label,
+                *("" if row is None else cell(row) for row in own),
+                f"{number(1e3 * bound, 2)} mm" if bound else "",
+            ]
+        )
     moved = read(folder / "integrity-moved-50.json")["summary"]
-    lines.append([MOVED, *(_integrity(moved[name]["moved-50"]) for name in ("precise", "particle-filter")), ""])
-    return markdown(["", "presage", "particle filter", "bound (RMS)"], lines)
+    lines.append([MOVED, *(_integrity(moved[name]["moved-50"]) for name in ("precise", "particle-filter")), "", ""])
+    return markdown(["", "presage", "particle filter", "scan matcher", "bound (RMS)"], lines)
 
 
 def _integrity(row: dict[str, Any]) -> str:
     tracking, wrong = (100 * row[name]["count"] / row[name]["of"] for name in ("tracking", "wrong"))
-    return f"{tracking:.1f} % `tracking`, of which {wrong:.1f} % wrong"
+    low, high = (100 * bound for bound in row["wrong"]["interval_95"])
+    return f"{tracking:.1f} % `tracking`, of which {wrong:.1f} % wrong ({low:.2g} to {high:.2g} %)"
 
 
-TABLES = {"readme-real": real_logs, "readme-simulation": simulation}
+TABLES = {"readme-real": real_logs, "readme-simulation": simulation, "peers": table_with_others}

@@ -13,11 +13,28 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.shapes import Box, Circle, Obstacle
 from common.geometry.world import World
-from lab.accuracy.scenes import ROBOT
+from common.robot.base import Robot
 
 Shape = Literal["box", "disc", "legs"]
+Point = tuple[float, float]
+
+ROBOT_RADIUS_M = Robot().radius
 LEG_RADIUS_M = 0.02
 GAP_M = 0.02  # between two pieces
+
+# Shape, smallest and largest size in m, and whether it stands against a wall.
+CATALOGUE: tuple[tuple[Shape, Point, Point, bool], ...] = (
+    ("box", (0.8, 0.4), (1.6, 0.6), True),  # cupboard
+    ("box", (0.8, 0.3), (2.0, 0.4), True),  # shelf
+    ("box", (1.2, 0.7), (1.6, 0.8), True),  # desk
+    ("box", (1.2, 0.7), (1.6, 0.8), False),
+    ("box", (0.3, 0.3), (0.45, 0.45), False),  # column
+    ("legs", (1.2, 0.7), (1.8, 0.9), False),  # table
+    ("legs", (0.42, 0.42), (0.46, 0.46), False),  # chair
+    ("legs", (0.42, 0.42), (0.46, 0.46), False),
+    ("disc", (0.3, 0.3), (0.5, 0.5), True),  # plant
+    ("disc", (0.2, 0.2), (0.3, 0.3), False),  # bin
+)
 
 
 @dataclass(frozen=True)
@@ -63,7 +80,7 @@ class Floor:
         """``keep_free`` is the area in which nothing may stand, such as in front of doors."""
         self._empty = walls.free_space
         self._taken = keep_free
-        self._reachable = shapely.buffer(self._empty, -ROBOT.radius)
+        self._reachable = shapely.buffer(self._empty, -ROBOT_RADIUS_M)
         self.pieces: list[Piece] = []
 
     def put(self, piece: Piece) -> bool:
@@ -71,7 +88,7 @@ class Floor:
         if not shapely.covers(self._empty, piece.footprint) or shapely.intersects(self._taken, piece.footprint):
             return False
         surfaces = shapely.union_all([obstacle.shape() for obstacle in piece.obstacles])
-        reachable = shapely.difference(self._reachable, shapely.buffer(surfaces, ROBOT.radius, quad_segs=32))
+        reachable = shapely.difference(self._reachable, shapely.buffer(surfaces, ROBOT_RADIUS_M, quad_segs=32))
         if not isinstance(reachable, shapely.Polygon) or reachable.is_empty:
             return False
         self._reachable = reachable

@@ -10,7 +10,7 @@ from typing import Any
 
 from common.errors import UserError
 from lab.experiments import results
-from lab.experiments.readme_tables import TABLES
+from lab.pages.joint_tables import TABLES
 
 # Modules of the experiments. Each has a function `table`.
 MODULES = {
@@ -28,6 +28,7 @@ MODULES = {
     "exploration": "lab.exploration.experiment",
     "real": "lab.real_logs.experiment",
     "integrity": "lab.integrity.report",
+    "peers": "lab.peers.experiment",
 }
 TABLE_MARKS = re.compile(r"(<!-- table (?P<name>[\w/.-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 

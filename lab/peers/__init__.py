@@ -1,0 +1,1 @@
+"""presage on the scans on which other programs were measured."""
