@@ -385,9 +385,7 @@ class PreciseEstimator:
         elif not self.modes:
             self._begin_with(view, self._search_everywhere(view), 1.0)
         else:
-            found = self._search_everywhere(view)
-            poses = np.array([mode.pose for mode in self.modes])
-            self._add_hypotheses([mode for mode in found if not same_place(poses, mode.pose).any()], view)
+            self._add_hypotheses(self._search_everywhere(view), view)
 
     def _search_everywhere(self, view: View) -> list[Mode]:
         """Hypotheses in the whole map that predict the scan clearly better than none does; at least one."""
