@@ -18,7 +18,6 @@ from services.estimator.precise.hypotheses import (
     constraining_beams,
     probability_of_being_near,
     project_evidence,
-    same_place,
     unobserved_direction,
     update_mode,
     weakest_direction,
@@ -310,18 +309,18 @@ class PreciseEstimator:
         """
         if local is None:
             local = self._local_map.to_local(modes[0].pose)
-        seen, appeared = self._local_map.find_old_beams(local, view)
+        poses = np.array([mode.pose for mode in modes])
+        states = view.surface_evidence(poses)
+        seen, appeared = self._local_map.find_old_beams(local, view, states.weights[0] > 0.5)
         old, small = seen | appeared | view.surfaces.small, view.surfaces.small
         changes = self._local_map.count_changes(self._last, LocalScan(local, view), period) if self._last else 0
         if changes:
             self._search_interval = 1
         log_change = changes * float(np.log(min(0.5, self.settings.change_rate * period)))
         log_change += float((view.surfaces.density - view.surfaces.ideal)[appeared & ~seen & ~small].sum())
-        poses = np.array([mode.pose for mode in modes])
-        explained = view.surface_evidence(poses).explained
         present, clutter = _log_at_poses(view, poses, old, np.array([mode.clutter for mode in modes]))
         modes = [
-            replace(mode, explained=explained[k], present=present[k] + log_change, present_clutter=clutter[k])
+            replace(mode, explained=states.explained[k], present=present[k] + log_change, present_clutter=clutter[k])
             for k, mode in enumerate(modes)
         ]
         self._local_pose, self._old_beams, self._log_change = local, old, log_change
@@ -342,10 +341,11 @@ class PreciseEstimator:
     def _add_key_scan(self, view: View) -> None:
         """Makes the present scan a key scan: its evidence counts from now on, and its surfaces are known."""
         best, log_unknown = self.modes[0], self._unknown_place.log_evidence
+        mapped = view.surface_evidence(best.pose[None]).weights[0] > 0.5
         if self._probability() >= self.settings.tracking_probability:
             self._precision.learn_changes(view, best.pose)
         self._unknown_place.add_key_scan()
-        key = KeyScan(self._local_pose, view, self._old_beams, self._log_change, log_unknown)
+        key = KeyScan(self._local_pose, view, self._old_beams, mapped, self._log_change, log_unknown)
         self._local_map.add(key, best.pose, best.noise_covariance)
         self.modes = [
             replace(mode, log_evidence=mode.log_weight, present=0.0, clutter=mode.present_clutter)
