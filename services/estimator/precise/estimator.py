@@ -35,7 +35,7 @@ from services.estimator.precise.motion_model import (
     widen_unobserved,
 )
 from services.estimator.precise.precision import Precision
-from services.estimator.precise.protection import protection_level
+from services.estimator.precise.protection import EstimateError
 from services.estimator.precise.search import search_around, search_everywhere, search_near
 from services.estimator.precise.settings import Settings
 from services.estimator.shared.interface import (
@@ -61,6 +61,7 @@ MAX_SEARCH_INTERVAL = 150  # scans between two searches without success; the int
 WRONG_MATCH = (
     1e-6  # probability that a match with recent scans is wrong, and the right motion one of many that fit the map
 )
+SIGNIFICANT_MAP_ERROR = 0.25  # of the scanner's noise: less is within what the noise of one scan makes it seem
 UNKNOWN_SIGMA_M = 100.0  # published where the model does not know what to expect
 TARGET_BEAMS = 2000  # a scan with at least twice as many is thinned, because the time of a search grows with the beams
 
@@ -177,8 +178,25 @@ class PreciseEstimator:
         if self._scan is None:
             raise RuntimeError("there is no scan to search with: call track first")
         view, observation = self._scan
+        start = self._start
         self._search_for_hypotheses(view)
+        if not self._precision.scans and self._probability() >= self.settings.tracking_probability:
+            view = self._search_with_map_error(view, start)
         return self._finish_scan(view, observation)
+
+    def _search_with_map_error(self, view: View, start: tuple[Array, Array] | None) -> View:
+        """Searches again if the first scan shows that the map is less precise than stated.
+
+        Returns the view with the map's error.
+        """
+        self._precision.learn(view, self.modes[0].pose)
+        error = self._precision.map_error
+        if error < max(view.map_error, SIGNIFICANT_MAP_ERROR * view.likelihood.sigma):
+            return view
+        view = replace(view, map_error=error)
+        self.modes, self._start = [], start
+        self._search_for_hypotheses(view)
+        return view
 
     def predict(self, poses: Array, angles: Array) -> Predicted:
         """Predicts scans (see Estimator); sigma combines the scanner's noise and the model's stated error."""
@@ -314,10 +332,11 @@ class PreciseEstimator:
         seen, appeared = self._local_map.find_old_beams(local, view, states.weights[0] > 0.5)
         old, small = seen | appeared | view.surfaces.small, view.surfaces.small
         changes = self._local_map.count_changes(self._last, LocalScan(local, view), period) if self._last else 0
-        if changes:
-            self._search_interval = 1
-        log_change = changes * float(np.log(min(0.5, self.settings.change_rate * period)))
+        log_of_one = float(np.log(min(0.5, self.settings.change_rate * period)))
+        log_change = changes * log_of_one
         log_change += float((view.surfaces.density - view.surfaces.ideal)[appeared & ~seen & ~small].sum())
+        if log_change <= self._log_change + log_of_one:
+            self._search_interval = 1
         present, clutter = _log_at_poses(view, poses, old, np.array([mode.clutter for mode in modes]))
         modes = [
             replace(mode, explained=states.explained[k], present=present[k] + log_change, present_clutter=clutter[k])
@@ -484,8 +503,11 @@ class PreciseEstimator:
     def _posterior(self, view: View, poses: list[Array], predicted: Predicted, probability: float) -> Posterior:
         """The posterior with the hypotheses at ``poses``, those at the stamp of the scan."""
         best = self.modes[0]
+        error = EstimateError.of(view, best.pose, self._covariance(best), best.explained)
+        covariances = [error.total_covariance(float(best.pose[2])), *map(self._covariance, self.modes[1:])]
         hypotheses = tuple(
-            Hypothesis(pose, self._covariance(mode), mode.weight) for pose, mode in zip(poses, self.modes, strict=True)
+            Hypothesis(pose, covariance, mode.weight)
+            for pose, covariance, mode in zip(poses, covariances, self.modes, strict=True)
         )
         elsewhere = 1 - best.weight * (1 - self._unknown_place.weight)
         return Posterior(
@@ -498,7 +520,7 @@ class PreciseEstimator:
             predicted=predicted.ranges[0],
             sigma=predicted.sigma[0],
             probability=probability,
-            protection=protection_level(view, best.pose, self._covariance(best), elsewhere),
+            protection=error.protection_level(elsewhere),
         )
 
     def _covariance(self, mode: Mode) -> Array:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from services.estimator.precise.gauss_newton import View
     from services.estimator.precise.likelihood import Likelihood
 
-UPDATE_SHARE = 0.1  # weight of the present scan in the averages
+UPDATE_SHARE = 0.1  # weight of the present scan in the averages, at least
 CHANGE_UPDATE_SHARE = 0.1  # the same for key scans
 MIN_CHANGED, MAX_CHANGED = 0.02, 0.5
 MAX_NOISE_FACTOR = 4.0  # the noise is never taken for more than this times the stated one, or less than its inverse
@@ -35,6 +35,7 @@ class Precision:
     noise_factor: float = 1.0  # of the scanner's noise, relative to what is stated
     changed: float = 0.25  # share of surfaces that the map does not show as they are
     excess: float = 0.0  # m², variance of the errors beyond the scanner's noise and what the model states
+    scans: int = 0  # from which the excess was learned
 
     @property
     def map_error(self) -> float:
@@ -66,4 +67,6 @@ class Precision:
             return
         variance = (NORMAL_MAD * float(np.median(errors[used]))) ** 2
         excess = variance - view.likelihood.sigma**2 - float(np.median(scale[used])) ** 2
-        self.excess += UPDATE_SHARE * (excess - self.excess)
+        # What was known before counts as one scan.
+        self.scans += 1
+        self.excess += max(UPDATE_SHARE, 1 / (self.scans + 1)) * (excess - self.excess)
