@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from services.estimator.precise.global_seeds import Seeds
     from services.estimator.precise.likelihood import Evidence
-    from services.estimator.shared.generative_models import GenerativeModel
+    from services.estimator.shared.generative_models import Expected, GenerativeModel
 
 START_COVARIANCE = np.diag([0.25, 0.25, 0.09])  # of a pose given without one
 MAX_SEARCH_INTERVAL = 150  # scans between two searches without success; the interval doubles from 1
@@ -200,7 +200,9 @@ class PreciseEstimator:
 
     def predict(self, poses: Array, angles: Array) -> Predicted:
         """Predicts scans (see Estimator); sigma combines the scanner's noise and the model's stated error."""
-        expected = self.model.expect(se2.compose(poses, self.mount), angles)
+        return self._predicted(self.model.expect(se2.compose(poses, self.mount), angles))
+
+    def _predicted(self, expected: Expected) -> Predicted:
         unknown = np.isinf(expected.scale)
         sigma = np.where(unknown, UNKNOWN_SIGMA_M, np.hypot(expected.scale, self.likelihood.deviation(expected.ranges)))
         return Predicted(np.where(unknown, np.inf, expected.ranges), sigma)
@@ -495,7 +497,11 @@ class PreciseEstimator:
         if self._is_key_scan_due():
             self._add_key_scan(view)
         self._last = LocalScan(self._local_pose, view)
-        predicted, probability = self.predict(poses[0][None], observation.angles), self._probability()
+        same_beams = np.array_equal(view.angles, observation.angles)
+        predicted = (
+            self._predicted(view.expected(poses[0])) if same_beams else self.predict(poses[0][None], observation.angles)
+        )
+        probability = self._probability()
         if probability >= self.settings.tracking_probability:
             self._precision.learn(view, self.modes[0].pose)
         return self._posterior(view, poses, predicted, probability)

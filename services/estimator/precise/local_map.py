@@ -133,9 +133,9 @@ class LocalMap:
     def _in_free_space(self, points: Array) -> npt.NDArray[np.bool_]:
         """Mask (K,) of local points (K, 2) in m through which a key scan saw."""
         free = np.zeros(len(points), np.bool_)
-        for key in self.scans:
+        for key in self.scans if len(points) else ():
             ranges, beam, inside = _beams_towards(key.view, se2.compose(key.pose, self.mount), points)
-            free |= inside & (_nearest_of_neighbours(key.view.ranges, beam) > ranges + SEEN_RADIUS_M)
+            free |= inside & (key.view.nearest_of_neighbours[beam] > ranges + SEEN_RADIUS_M)
         return free
 
     def count_changes(self, last: LocalScan, now: LocalScan, period: float) -> int:
@@ -150,7 +150,7 @@ class LocalMap:
         """How many things of ``width`` m another scan passes through, of those that one scan has ``seen``."""
         points = se2.transform(se2.compose(seen.pose, self.mount), seen.view.points)
         ranges, beam, inside = _beams_towards(by.view, se2.compose(by.pose, self.mount), points)
-        passed = inside & (_nearest_of_neighbours(by.view.ranges, beam) > ranges + PASSED_M)
+        passed = inside & (by.view.nearest_of_neighbours[beam] > ranges + PASSED_M)
         edges = np.flatnonzero(np.diff(np.concatenate([[0], passed.astype(int), [0]])))
         first, last = edges[::2], edges[1::2] - 1
         many = last - first + 1 >= MIN_BEAMS
@@ -273,16 +273,8 @@ def _beams_towards(
 ) -> tuple[Array, npt.NDArray[np.intp], npt.NDArray[np.bool_]]:
     """Distances (K,) in m of points (K, 2) from a laser pose, their beams (K,), and whether they are in its view."""
     local = se2.transform(se2.inverse(laser), points)
-    # The beams of a scan that was corrected for motion are not evenly spaced, and a few have changed places.
-    order = np.argsort(view.angles, kind="stable")
-    angles = view.angles[order]
+    order, angles = view.sorted_beams
     turned = angles[0] + (np.arctan2(local[:, 1], local[:, 0]) - angles[0]) % (2 * np.pi)
     place = np.searchsorted((angles[1:] + angles[:-1]) / 2, turned)
     inside = (place > 0) & (place < len(angles) - 1)
     return np.hypot(*local.T), np.where(inside, order[place], 0), inside
-
-
-def _nearest_of_neighbours(ranges: Array, beam: npt.NDArray[np.intp]) -> Array:
-    """The smallest (K,) of the ranges (B,) at each beam (K,) and its two neighbours; the first and last have one."""
-    around = np.stack([ranges[np.clip(beam + k, 0, len(ranges) - 1)] for k in (-1, 0, 1)])
-    return np.asarray(np.where(np.isnan(around), -np.inf, around).min(axis=0))

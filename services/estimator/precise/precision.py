@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from common.geometry import se2
 from services.estimator.precise.noise import estimate_noise
 
 if TYPE_CHECKING:
@@ -58,7 +57,7 @@ class Precision:
 
     def learn(self, view: View, pose: Array) -> None:
         """Learns the map's error from the errors of the scan's prediction at ``pose`` (3,)."""
-        expected = view.model.expect(se2.compose(pose, view.mount)[None], view.angles)
+        expected = view.expected(pose)
         surface, scale = expected.ranges[0], expected.scale[0]
         with np.errstate(invalid="ignore"):
             errors = np.abs(view.ranges - surface)

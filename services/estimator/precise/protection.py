@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 EXCEEDED_SHARE = 1e-4  # of the scans, whose error may exceed the protection level
 MISTAKEN_SURFACE = 0.01  # share of a scan's surfaces that are taken for a surface of the map and are another one
-BISECTIONS = 30  # of an interval of some metres, to well below a micrometre
+BISECTIONS = 20  # of an interval of some metres, to micrometres
 
 
 @dataclass(frozen=True)
