@@ -117,7 +117,7 @@ class PreciseEstimator:
         self._was_tracking = False
         self._unknown_place = UnknownPlace()
         self._local_map = LocalMap(self.mount)
-        self._precision = Precision(excess=self._map_error**2)
+        self._precision = Precision.of_map(self._map_error)
         self._scans_since_search, self._search_interval = 0, 1
 
         # Of the last scan.

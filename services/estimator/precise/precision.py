@@ -36,6 +36,14 @@ class Precision:
     excess: float = 0.0  # m², variance of the errors beyond the scanner's noise and what the model states
     scans: int = 0  # from which the excess was learned
 
+    @classmethod
+    def of_map(cls, error: float) -> Precision:
+        """What is known before the first scan; ``error`` m is that stated for the map, 0 if none is.
+
+        A stated one counts as much as many scans.
+        """
+        return cls(excess=error**2, scans=round(1 / UPDATE_SHARE) if error else 0)
+
     @property
     def map_error(self) -> float:
         """Standard deviation in m of the map's error beyond what the model states."""
@@ -66,6 +74,6 @@ class Precision:
             return
         variance = (NORMAL_MAD * float(np.median(errors[used]))) ** 2
         excess = variance - view.likelihood.sigma**2 - float(np.median(scale[used])) ** 2
-        # What was known before counts as one scan.
         self.scans += 1
+        # Before the first scan, the map was taken for exact; that counts as one more scan.
         self.excess += max(UPDATE_SHARE, 1 / (self.scans + 1)) * (excess - self.excess)
