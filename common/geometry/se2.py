@@ -18,16 +18,14 @@ def wrap(angle: npt.ArrayLike) -> Array:
 
 def compose(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
     """Pose in the parent of ``a`` of a frame with pose ``b`` in the frame ``a``; shapes (..., 3) broadcast."""
-    a, b = np.broadcast_arrays(np.asarray(a, float), np.asarray(b, float))
+    a, b = np.asarray(a, float), np.asarray(b, float)
     cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
-    return np.stack(
-        [
-            a[..., 0] + cos * b[..., 0] - sin * b[..., 1],
-            a[..., 1] + sin * b[..., 0] + cos * b[..., 1],
-            wrap(a[..., 2] + b[..., 2]),
-        ],
-        axis=-1,
-    )
+    x = a[..., 0] + cos * b[..., 0] - sin * b[..., 1]
+    composed = np.empty((*x.shape, 3))
+    composed[..., 0] = x
+    composed[..., 1] = a[..., 1] + sin * b[..., 0] + cos * b[..., 1]
+    composed[..., 2] = wrap(a[..., 2] + b[..., 2])
+    return composed
 
 
 def inverse(a: npt.ArrayLike) -> Array:

@@ -18,7 +18,6 @@ from services.estimator.precise.hypotheses import (
     constraining_beams,
     probability_of_being_near,
     project_evidence,
-    same_place,
     unobserved_direction,
     update_mode,
     weakest_direction,
@@ -36,7 +35,7 @@ from services.estimator.precise.motion_model import (
     widen_unobserved,
 )
 from services.estimator.precise.precision import Precision
-from services.estimator.precise.protection import protection_level
+from services.estimator.precise.protection import EstimateError
 from services.estimator.precise.search import search_around, search_everywhere, search_near
 from services.estimator.precise.settings import Settings
 from services.estimator.shared.interface import (
@@ -55,13 +54,14 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from services.estimator.precise.global_seeds import Seeds
     from services.estimator.precise.likelihood import Evidence
-    from services.estimator.shared.generative_models import GenerativeModel
+    from services.estimator.shared.generative_models import Expected, GenerativeModel
 
 START_COVARIANCE = np.diag([0.25, 0.25, 0.09])  # of a pose given without one
 MAX_SEARCH_INTERVAL = 150  # scans between two searches without success; the interval doubles from 1
 WRONG_MATCH = (
     1e-6  # probability that a match with recent scans is wrong, and the right motion one of many that fit the map
 )
+SIGNIFICANT_MAP_ERROR = 0.25  # of the scanner's noise: less is within what the noise of one scan makes it seem
 UNKNOWN_SIGMA_M = 100.0  # published where the model does not know what to expect
 TARGET_BEAMS = 2000  # a scan with at least twice as many is thinned, because the time of a search grows with the beams
 
@@ -117,7 +117,7 @@ class PreciseEstimator:
         self._was_tracking = False
         self._unknown_place = UnknownPlace()
         self._local_map = LocalMap(self.mount)
-        self._precision = Precision(excess=self._map_error**2)
+        self._precision = Precision.of_map(self._map_error)
         self._scans_since_search, self._search_interval = 0, 1
 
         # Of the last scan.
@@ -178,12 +178,31 @@ class PreciseEstimator:
         if self._scan is None:
             raise RuntimeError("there is no scan to search with: call track first")
         view, observation = self._scan
+        start = self._start
         self._search_for_hypotheses(view)
+        if not self._precision.scans and self._probability() >= self.settings.tracking_probability:
+            view = self._search_with_map_error(view, start)
         return self._finish_scan(view, observation)
+
+    def _search_with_map_error(self, view: View, start: tuple[Array, Array] | None) -> View:
+        """Searches again if the first scan shows that the map is less precise than stated.
+
+        Returns the view with the map's error.
+        """
+        self._precision.learn(view, self.modes[0].pose)
+        error = self._precision.map_error
+        if error < max(view.map_error, SIGNIFICANT_MAP_ERROR * view.likelihood.sigma):
+            return view
+        view = replace(view, map_error=error)
+        self.modes, self._start = [], start
+        self._search_for_hypotheses(view)
+        return view
 
     def predict(self, poses: Array, angles: Array) -> Predicted:
         """Predicts scans (see Estimator); sigma combines the scanner's noise and the model's stated error."""
-        expected = self.model.expect(se2.compose(poses, self.mount), angles)
+        return self._predicted(self.model.expect(se2.compose(poses, self.mount), angles))
+
+    def _predicted(self, expected: Expected) -> Predicted:
         unknown = np.isinf(expected.scale)
         sigma = np.where(unknown, UNKNOWN_SIGMA_M, np.hypot(expected.scale, self.likelihood.deviation(expected.ranges)))
         return Predicted(np.where(unknown, np.inf, expected.ranges), sigma)
@@ -310,18 +329,19 @@ class PreciseEstimator:
         """
         if local is None:
             local = self._local_map.to_local(modes[0].pose)
-        seen, appeared = self._local_map.find_old_beams(local, view)
+        poses = np.array([mode.pose for mode in modes])
+        states = view.surface_evidence(poses)
+        seen, appeared = self._local_map.find_old_beams(local, view, states.weights[0] > 0.5)
         old, small = seen | appeared | view.surfaces.small, view.surfaces.small
         changes = self._local_map.count_changes(self._last, LocalScan(local, view), period) if self._last else 0
-        if changes:
-            self._search_interval = 1
-        log_change = changes * float(np.log(min(0.5, self.settings.change_rate * period)))
+        log_of_one = float(np.log(min(0.5, self.settings.change_rate * period)))
+        log_change = changes * log_of_one
         log_change += float((view.surfaces.density - view.surfaces.ideal)[appeared & ~seen & ~small].sum())
-        poses = np.array([mode.pose for mode in modes])
-        explained = view.surface_evidence(poses).explained
+        if log_change <= self._log_change + log_of_one:
+            self._search_interval = 1
         present, clutter = _log_at_poses(view, poses, old, np.array([mode.clutter for mode in modes]))
         modes = [
-            replace(mode, explained=explained[k], present=present[k] + log_change, present_clutter=clutter[k])
+            replace(mode, explained=states.explained[k], present=present[k] + log_change, present_clutter=clutter[k])
             for k, mode in enumerate(modes)
         ]
         self._local_pose, self._old_beams, self._log_change = local, old, log_change
@@ -342,10 +362,11 @@ class PreciseEstimator:
     def _add_key_scan(self, view: View) -> None:
         """Makes the present scan a key scan: its evidence counts from now on, and its surfaces are known."""
         best, log_unknown = self.modes[0], self._unknown_place.log_evidence
+        mapped = view.surface_evidence(best.pose[None]).weights[0] > 0.5
         if self._probability() >= self.settings.tracking_probability:
             self._precision.learn_changes(view, best.pose)
         self._unknown_place.add_key_scan()
-        key = KeyScan(self._local_pose, view, self._old_beams, self._log_change, log_unknown)
+        key = KeyScan(self._local_pose, view, self._old_beams, mapped, self._log_change, log_unknown)
         self._local_map.add(key, best.pose, best.noise_covariance)
         self.modes = [
             replace(mode, log_evidence=mode.log_weight, present=0.0, clutter=mode.present_clutter)
@@ -385,9 +406,7 @@ class PreciseEstimator:
         elif not self.modes:
             self._begin_with(view, self._search_everywhere(view), 1.0)
         else:
-            found = self._search_everywhere(view)
-            poses = np.array([mode.pose for mode in self.modes])
-            self._add_hypotheses([mode for mode in found if not same_place(poses, mode.pose).any()], view)
+            self._add_hypotheses(self._search_everywhere(view), view)
 
     def _search_everywhere(self, view: View) -> list[Mode]:
         """Hypotheses in the whole map that predict the scan clearly better than none does; at least one."""
@@ -478,7 +497,11 @@ class PreciseEstimator:
         if self._is_key_scan_due():
             self._add_key_scan(view)
         self._last = LocalScan(self._local_pose, view)
-        predicted, probability = self.predict(poses[0][None], observation.angles), self._probability()
+        same_beams = np.array_equal(view.angles, observation.angles)
+        predicted = (
+            self._predicted(view.expected(poses[0])) if same_beams else self.predict(poses[0][None], observation.angles)
+        )
+        probability = self._probability()
         if probability >= self.settings.tracking_probability:
             self._precision.learn(view, self.modes[0].pose)
         return self._posterior(view, poses, predicted, probability)
@@ -486,8 +509,11 @@ class PreciseEstimator:
     def _posterior(self, view: View, poses: list[Array], predicted: Predicted, probability: float) -> Posterior:
         """The posterior with the hypotheses at ``poses``, those at the stamp of the scan."""
         best = self.modes[0]
+        error = EstimateError.of(view, best.pose, self._covariance(best), best.explained)
+        covariances = [error.total_covariance(float(best.pose[2])), *map(self._covariance, self.modes[1:])]
         hypotheses = tuple(
-            Hypothesis(pose, self._covariance(mode), mode.weight) for pose, mode in zip(poses, self.modes, strict=True)
+            Hypothesis(pose, covariance, mode.weight)
+            for pose, covariance, mode in zip(poses, covariances, self.modes, strict=True)
         )
         elsewhere = 1 - best.weight * (1 - self._unknown_place.weight)
         return Posterior(
@@ -500,7 +526,7 @@ class PreciseEstimator:
             predicted=predicted.ranges[0],
             sigma=predicted.sigma[0],
             probability=probability,
-            protection=protection_level(view, best.pose, self._covariance(best), elsewhere),
+            protection=error.protection_level(elsewhere),
         )
 
     def _covariance(self, mode: Mode) -> Array:

@@ -59,6 +59,22 @@ class GaussNewton:
 
 
 @dataclass(frozen=True)
+class _AtPoses:
+    """What was computed of a scan at some poses."""
+
+    poses: Array  # (N, 3)
+    stated: Expected  # as the model predicts
+    expected: Expected  # the same with the map's error
+    behind: Array  # (N, B) m, ranges behind the surfaces that the scan passed through
+    evidence: dict[tuple[float, bytes | None], SurfaceEvidence] = field(default_factory=dict)
+
+    def first(self, count: int) -> _AtPoses:
+        """The same at the first ``count`` poses."""
+        rows = slice(count)
+        return _AtPoses(self.poses[rows], self.stated.part(rows), self.expected.part(rows), self.behind[rows])
+
+
+@dataclass(frozen=True)
 class View:
     """One scan, with the model, the likelihood and the optimiser by which poses are compared with it."""
 
@@ -71,7 +87,7 @@ class View:
     optimiser: Optimiser = field(default_factory=GaussNewton)
     map_error: float = 0.0  # m, standard deviation beyond what the model states, alike for neighbouring beams
     changed: float = 0.25  # share of surfaces that the map does not show as they are
-    _predictions: dict[bytes, tuple[Expected, Array]] = field(default_factory=dict, init=False, repr=False)
+    _last: list[_AtPoses] = field(default_factory=list, init=False, repr=False)
 
     def thinned(self, beams: int) -> View:
         """Returns a view with every k-th beam, so that about ``beams`` are left."""
@@ -98,6 +114,22 @@ class View:
         return np.asarray(self.ranges[self.returned, None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1))
 
     @cached_property
+    def sorted_beams(self) -> tuple[npt.NDArray[np.intp], Array]:
+        """The beams (B,) in the order of their angles, and the sorted angles (B,) in rad.
+
+        The beams of a scan that was corrected for motion are not evenly spaced, and a few have changed places.
+        """
+        order = np.argsort(self.angles, kind="stable")
+        return order, self.angles[order]
+
+    @cached_property
+    def nearest_of_neighbours(self) -> Array:
+        """The smallest (B,) of the ranges of each beam and its two neighbours; the first and last have one."""
+        count = len(self.ranges)
+        around = np.stack([self.ranges[np.clip(np.arange(count) + k, 0, count - 1)] for k in (-1, 0, 1)])
+        return np.asarray(np.where(np.isnan(around), -np.inf, around).min(axis=0))
+
+    @cached_property
     def surfaces(self) -> ScanSurfaces:
         """The surfaces that the scan shows."""
         return ScanSurfaces.of(self.ranges, self.angles, self.likelihood)
@@ -121,34 +153,41 @@ class View:
         self, poses: Array, extra_sigma: float = 0.0, skip: npt.NDArray[np.bool_] | None = None
     ) -> SurfaceEvidence:
         """Returns the evidence by surfaces at base_link poses (N, 3); beams in ``skip`` (B,) do not count."""
-        expected, behind = self._expect(poses)
-        return SurfaceEvidence.of(
-            self.ranges,
-            self.range_max,
-            expected,
-            behind,
-            self.surfaces,
-            self.likelihood,
-            self.changed,
-            extra_sigma,
-            skip,
-        )
+        at, key = self._at(poses), (extra_sigma, None if skip is None else skip.tobytes())
+        if key not in at.evidence:
+            at.evidence[key] = SurfaceEvidence.of(
+                self.ranges,
+                self.range_max,
+                at.expected,
+                at.behind,
+                self.surfaces,
+                self.likelihood,
+                self.changed,
+                extra_sigma,
+                skip,
+            )
+        return at.evidence[key]
 
-    def _expect(self, poses: Array) -> tuple[Expected, Array]:
-        """Predicts the scan at poses (N, 3), and the ranges (N, B) behind the surfaces that the scan passed through.
+    def expected(self, pose: Array) -> Expected:
+        """The scan that the model predicts at one ``pose`` (3,)."""
+        return self._at(pose[None]).stated
 
-        Keeps the last result, because several kinds of evidence are computed at the same poses.
+    def _at(self, poses: Array) -> _AtPoses:
+        """The scan as predicted at poses (N, 3).
+
+        Keeps the last result, because several kinds of evidence are computed at the same poses, or at the first.
         """
-        key = poses.tobytes()
-        if key not in self._predictions:
+        if not self._last or not np.array_equal(self._last[0].poses[: len(poses)], poses):
             lasers = se2.compose(poses, self.mount)
-            expected = self._with_map_error(self.model.expect(lasers, self.angles))
+            stated = self.model.expect(lasers, self.angles)
+            expected = self._with_map_error(stated)
             with np.errstate(invalid="ignore"):
                 passed = self.ranges > expected.ranges + self.likelihood.deviation(expected.ranges)
             behind = self.model.expect_behind(lasers, self.angles, np.where(passed, expected.ranges, np.inf))
-            self._predictions.clear()
-            self._predictions[key] = expected, behind
-        return self._predictions[key]
+            self._last[:] = [_AtPoses(np.array(poses), stated, expected, behind)]
+        elif len(poses) < len(self._last[0].poses):
+            self._last[:] = [self._last[0].first(len(poses))]
+        return self._last[0]
 
     def evidence(self, poses: Array, extra_sigma: float = 0.0, attention: Array | None = None) -> Evidence:
         """Returns the evidence of the scan at base_link poses (N, 3), with derivatives by these poses.
@@ -160,18 +199,21 @@ class View:
         if attention is None:
             expected = self._with_map_error(self.model.expect(lasers, self.angles))
         else:
-            expected = self._expect(poses)[0]
+            expected = self._at(poses).expected
         at_laser = self.likelihood.evaluate(self.ranges, self.range_max, expected, extra_sigma, attention)
         return self._at_base(at_laser, poses, lasers)
 
     def evidence_by_surface(self, pose: Array) -> Evidence:
         """Returns the evidence at one ``pose`` (3,) of each of the N surfaces of the scan that the map shows."""
-        expected, surface = self._expect(pose[None])[0], np.cumsum(self.surfaces.starts)
-        weights = self.surface_evidence(pose[None]).weights[0] * ~self.surfaces.small
-        shown = np.unique(surface[weights > 0])
-        attention = np.where(surface == shown[:, None], weights, 0.0)
-        repeated = type(expected)(*(np.repeat(values, len(shown), axis=0) for values in vars(expected).values()))
-        at_laser = self.likelihood.evaluate(self.ranges, self.range_max, repeated, 0.0, attention)
+        expected, surface = self._at(pose[None]).expected, np.cumsum(self.surfaces.starts)
+        weights = self.surface_evidence(pose[None]).weights * ~self.surfaces.small
+        shown = np.unique(surface[weights[0] > 0])
+        first, last = np.searchsorted(surface, shown), np.searchsorted(surface, shown, "right")
+        parts = [
+            self.likelihood.evaluate(self.ranges[a:b], self.range_max, expected.beams(a, b), 0.0, weights[:, a:b])
+            for a, b in zip(first, last, strict=True)
+        ]
+        at_laser = Evidence.joined(parts) if parts else self.evidence(pose[None]).part(np.arange(0))
         poses = np.tile(pose, (len(shown), 1))
         return self._at_base(at_laser, poses, se2.compose(poses, self.mount))
 

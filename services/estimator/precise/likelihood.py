@@ -24,6 +24,8 @@ import numpy.typing as npt
 from services.estimator.precise import beam_sums
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from common.geometry.se2 import Array
     from services.estimator.shared.generative_models import Expected
 
@@ -40,6 +42,11 @@ class Evidence:
     curvature: Array  # (N, 3, 3) Gauss-Newton Hessian
     xi_noise_covariance: Array  # (N, 3, 3) covariance of xi caused by the scanner's noise
     xi_model_covariance: Array  # (N, 3, 3) covariance of xi caused by the model's error, for independent beams
+
+    @classmethod
+    def joined(cls, parts: Sequence[Evidence]) -> Evidence:
+        """The evidence at the poses of all parts, of which there is at least one."""
+        return cls(*(np.concatenate(values) for values in zip(*(vars(part).values() for part in parts), strict=True)))
 
     def part(self, rows: npt.NDArray[np.integer]) -> Evidence:
         """Returns the evidence at some of the poses."""

@@ -63,6 +63,7 @@ class KeyScan(LocalScan):
     """A scan of the local map."""
 
     seen: npt.NDArray[np.bool_]  # (B,) beams that are no new evidence, as they end at surfaces of earlier scans
+    mapped: npt.NDArray[np.bool_]  # (B,) beams that end at surfaces of the map
     log_change: float  # nats, log probability of what had changed since the scan before
     log_unknown: float  # nats, evidence before this scan that the robot is at none of the hypotheses
 
@@ -76,13 +77,14 @@ class LocalMap:
     frame: Array = field(default_factory=lambda: np.zeros(3))  # (3,) local frame in map
     covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))  # of the pose at the last key scan
     _tree: cKDTree | None = None
+    _unmapped: cKDTree | None = None  # of the points that are not on surfaces of the map
     _points: Array = field(default_factory=lambda: np.zeros((0, 2)))
     _normals: Array | None = None
 
     def clear(self) -> None:
         """Removes all scans."""
         self.scans.clear()
-        self._tree = None
+        self._tree = self._unmapped = None
 
     def to_local(self, pose: Array) -> Array:
         """A pose (3,) in map, in the local frame."""
@@ -100,14 +102,17 @@ class LocalMap:
         self.scans.append(key)
         self.frame = se2.compose(pose, se2.inverse(key.pose))
         self.covariance = covariance + np.diag(DRIFT_PER_SCAN**2)
-        self._tree = None
+        self._tree = self._unmapped = None
 
-    def find_old_beams(self, local: Array, view: View) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    def find_old_beams(
+        self, local: Array, view: View, mapped: npt.NDArray[np.bool_]
+    ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
         """Masks (B,) of the beams of a scan at ``local`` (3,) that are no new evidence: seen before, and appeared.
 
         Seen before are beams that end at surfaces of the key scans; beams without return have no end, and count as
-        seen once there are key scans. Appeared are surfaces where a key scan saw through: they came since then,
-        wherever the robot may be.
+        seen once there are key scans. A beam that is not ``mapped`` (B,), so does not end at a surface of the map, must
+        be near another such one: if the map's surface was seen there, this is another surface. Appeared are surfaces
+        where a key scan saw through: they came since then, wherever the robot may be.
         """
         seen, appeared = np.zeros(len(view.ranges), np.bool_), np.zeros(len(view.ranges), np.bool_)
         if not self.scans or not len(self._tree_of_points().data):
@@ -115,19 +120,22 @@ class LocalMap:
         placed = se2.transform(se2.compose(local, self.mount), view.points)
         distance, _ = self._tree_of_points().query(placed, distance_upper_bound=SEEN_RADIUS_M)
         near = np.isfinite(distance)
-        seen[:] = ~view.returned
-        seen[view.returned] = near
         free = np.zeros(len(near), np.bool_)
         free[~near] = self._in_free_space(placed[~near])
         appeared[view.returned] = free
+        unmapped = near & ~mapped[view.returned]
+        distance, _ = self._tree_of_unmapped_points().query(placed[unmapped], distance_upper_bound=SEEN_RADIUS_M)
+        near[unmapped] = np.isfinite(distance)
+        seen[:] = ~view.returned
+        seen[view.returned] = near
         return seen, appeared
 
     def _in_free_space(self, points: Array) -> npt.NDArray[np.bool_]:
         """Mask (K,) of local points (K, 2) in m through which a key scan saw."""
         free = np.zeros(len(points), np.bool_)
-        for key in self.scans:
+        for key in self.scans if len(points) else ():
             ranges, beam, inside = _beams_towards(key.view, se2.compose(key.pose, self.mount), points)
-            free |= inside & (_nearest_of_neighbours(key.view.ranges, beam) > ranges + SEEN_RADIUS_M)
+            free |= inside & (key.view.nearest_of_neighbours[beam] > ranges + SEEN_RADIUS_M)
         return free
 
     def count_changes(self, last: LocalScan, now: LocalScan, period: float) -> int:
@@ -142,7 +150,7 @@ class LocalMap:
         """How many things of ``width`` m another scan passes through, of those that one scan has ``seen``."""
         points = se2.transform(se2.compose(seen.pose, self.mount), seen.view.points)
         ranges, beam, inside = _beams_towards(by.view, se2.compose(by.pose, self.mount), points)
-        passed = inside & (_nearest_of_neighbours(by.view.ranges, beam) > ranges + PASSED_M)
+        passed = inside & (by.view.nearest_of_neighbours[beam] > ranges + PASSED_M)
         edges = np.flatnonzero(np.diff(np.concatenate([[0], passed.astype(int), [0]])))
         first, last = edges[::2], edges[1::2] - 1
         many = last - first + 1 >= MIN_BEAMS
@@ -189,6 +197,16 @@ class LocalMap:
             self._points, self._normals = _average_in_cells(np.concatenate(placed)), None
             self._tree = cKDTree(self._points)
         return self._tree
+
+    def _tree_of_unmapped_points(self) -> cKDTree:
+        """Index of the points of all scans that are not on surfaces of the map; kept until the scans change."""
+        if self._unmapped is None:
+            placed = [
+                se2.transform(se2.compose(each.pose, self.mount), each.view.points[~each.mapped[each.view.returned]])
+                for each in self.scans
+            ]
+            self._unmapped = cKDTree(np.concatenate(placed))
+        return self._unmapped
 
     def _normals_of_points(self) -> Array:
         """Normals (K, 2) of the surfaces at all points; 0 where there are too few neighbours."""
@@ -255,16 +273,8 @@ def _beams_towards(
 ) -> tuple[Array, npt.NDArray[np.intp], npt.NDArray[np.bool_]]:
     """Distances (K,) in m of points (K, 2) from a laser pose, their beams (K,), and whether they are in its view."""
     local = se2.transform(se2.inverse(laser), points)
-    # The beams of a scan that was corrected for motion are not evenly spaced, and a few have changed places.
-    order = np.argsort(view.angles, kind="stable")
-    angles = view.angles[order]
+    order, angles = view.sorted_beams
     turned = angles[0] + (np.arctan2(local[:, 1], local[:, 0]) - angles[0]) % (2 * np.pi)
     place = np.searchsorted((angles[1:] + angles[:-1]) / 2, turned)
     inside = (place > 0) & (place < len(angles) - 1)
     return np.hypot(*local.T), np.where(inside, order[place], 0), inside
-
-
-def _nearest_of_neighbours(ranges: Array, beam: npt.NDArray[np.intp]) -> Array:
-    """The smallest (K,) of the ranges (B,) at each beam (K,) and its two neighbours; the first and last have one."""
-    around = np.stack([ranges[np.clip(beam + k, 0, len(ranges) - 1)] for k in (-1, 0, 1)])
-    return np.asarray(np.where(np.isnan(around), -np.inf, around).min(axis=0))

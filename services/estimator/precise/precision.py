@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from common.geometry import se2
 from services.estimator.precise.noise import estimate_noise
 
 if TYPE_CHECKING:
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
     from services.estimator.precise.gauss_newton import View
     from services.estimator.precise.likelihood import Likelihood
 
-UPDATE_SHARE = 0.1  # weight of the present scan in the averages
+UPDATE_SHARE = 0.1  # weight of the present scan in the averages, at least
 CHANGE_UPDATE_SHARE = 0.1  # the same for key scans
 MIN_CHANGED, MAX_CHANGED = 0.02, 0.5
 MAX_NOISE_FACTOR = 4.0  # the noise is never taken for more than this times the stated one, or less than its inverse
@@ -35,6 +34,15 @@ class Precision:
     noise_factor: float = 1.0  # of the scanner's noise, relative to what is stated
     changed: float = 0.25  # share of surfaces that the map does not show as they are
     excess: float = 0.0  # m², variance of the errors beyond the scanner's noise and what the model states
+    scans: int = 0  # from which the excess was learned
+
+    @classmethod
+    def of_map(cls, error: float) -> Precision:
+        """What is known before the first scan; ``error`` m is that stated for the map, 0 if none is.
+
+        A stated one counts as much as many scans.
+        """
+        return cls(excess=error**2, scans=round(1 / UPDATE_SHARE) if error else 0)
 
     @property
     def map_error(self) -> float:
@@ -57,7 +65,7 @@ class Precision:
 
     def learn(self, view: View, pose: Array) -> None:
         """Learns the map's error from the errors of the scan's prediction at ``pose`` (3,)."""
-        expected = view.model.expect(se2.compose(pose, view.mount)[None], view.angles)
+        expected = view.expected(pose)
         surface, scale = expected.ranges[0], expected.scale[0]
         with np.errstate(invalid="ignore"):
             errors = np.abs(view.ranges - surface)
@@ -66,4 +74,6 @@ class Precision:
             return
         variance = (NORMAL_MAD * float(np.median(errors[used]))) ** 2
         excess = variance - view.likelihood.sigma**2 - float(np.median(scale[used])) ** 2
-        self.excess += UPDATE_SHARE * (excess - self.excess)
+        self.scans += 1
+        # Before the first scan, the map was taken for exact; that counts as one more scan.
+        self.excess += max(UPDATE_SHARE, 1 / (self.scans + 1)) * (excess - self.excess)

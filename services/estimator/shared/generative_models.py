@@ -30,6 +30,10 @@ class Expected:
         """Returns the scans at some of the poses."""
         return Expected(self.ranges[rows], self.scale[rows], self.jacobian[rows])
 
+    def beams(self, first: int, end: int) -> Expected:
+        """Returns the scans with only the beams from ``first`` to before ``end``."""
+        return Expected(self.ranges[:, first:end], self.scale[:, first:end], self.jacobian[:, first:end])
+
 
 class GenerativeModel(Protocol):
     """Predicts scans at poses of the laser."""

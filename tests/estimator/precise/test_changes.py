@@ -14,6 +14,7 @@ from common.geometry import se2
 from common.geometry.world import World, load_world
 from lab.accuracy import tasks
 from lab.accuracy.scenes import Scene
+from lab.integrity.maps import scaled_map
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.global_seeds import Seeds, thin_places
 from services.estimator.precise.hypotheses import NEAR_HEADING_RAD, NEAR_POSITION_M, probability_of_being_near
@@ -168,6 +169,31 @@ def test_probability_of_being_near(seed):
         assert found < near.mean() + 0.02
         if exact:
             assert found == pytest.approx(near.mean(), abs=0.02)
+
+
+@pytest.mark.parametrize("there", [(5.05, 4.47, 0.48), (4.77, 3.81, 0.57)])
+def test_carried_nearby(there):
+    """A robot that was carried so little that the scan matches at once is tracked at once, too."""
+    made, scene = estimator(OFFICE)
+    here = np.array([5.5, CORRIDOR_Y, 0.5])
+    made.restart(here, CLOSE)
+    drive(made, scene, np.tile(here, (10, 1)))
+    found = drive(made, scene, np.tile(there, (5, 1)), 10)
+    assert found[-1].state == "tracking"
+    assert tasks.is_at(found[-1].pose, np.array(there))
+
+
+def test_map_error_of_the_first_scan():
+    """The first scan shows that the map is 1 % larger, so its covariance is not that of an exact map (168)."""
+    made, scene = estimator(scaled_map(OFFICE, 1.01), OFFICE)
+    errors = []
+    for x in np.linspace(2.0, 14.0, 6):
+        truth = np.array([x, CORRIDOR_Y, 0.3])
+        made.restart(truth * [1.01, 1.01, 1.0], CLOSE / 4)
+        found = drive(made, scene, truth[None])[0]
+        off = (found.pose - truth * [1.01, 1.01, 1.0])[:2]
+        errors.append(off @ np.linalg.solve(found.covariance[:2, :2], off))
+    assert np.mean(errors) < 20, errors
 
 
 def test_heading_of_a_kidnapping():

@@ -32,7 +32,8 @@ def local_map(scene, *poses, frame=(0.0, 0.0, 0.0)):
     made = LocalMap(np.array(scene.scanner.mount), frame=np.array(frame))
     for pose in poses:
         scan = view(scene, pose)
-        key = KeyScan(made.to_local(np.array(pose)), scan, np.zeros(len(scan.ranges), np.bool_), 0.0, 0.0)
+        nothing, everything = np.zeros(len(scan.ranges), np.bool_), np.ones(len(scan.ranges), np.bool_)
+        key = KeyScan(made.to_local(np.array(pose)), scan, nothing, everything, 0.0, 0.0)
         made.add(key, np.array(pose), np.diag([1e-4, 1e-4, 1e-5]))
     return made
 
@@ -98,19 +99,34 @@ def changed(scan, beams, factor):
 def test_seen_surfaces():
     scene = Scene.of(ROOM, 361, 1)
     scan = view(scene, HERE)
-    nothing, arrived = LocalMap(np.array(scene.scanner.mount)).find_old_beams(HERE, scan)
+    mapped = np.ones(len(scan.ranges), np.bool_)
+    nothing, arrived = LocalMap(np.array(scene.scanner.mount)).find_old_beams(HERE, scan, mapped)
     assert not nothing.any()
     assert not arrived.any()
     made = local_map(scene, HERE)
     here = made.to_local(HERE)
     assert made.is_key_scan_due(made.to_local(HERE + np.array([1.01 * MIN_DISTANCE_M, 0.0, 0.0])))
     assert not made.is_key_scan_due(here)
-    assert made.find_old_beams(here, view(scene, HERE))[0].all()
-    seen, arrived = made.find_old_beams(here, changed(scan, slice(100, 150), 0.5))  # a person
+    assert made.find_old_beams(here, view(scene, HERE), mapped)[0].all()
+    seen, arrived = made.find_old_beams(here, changed(scan, slice(100, 150), 0.5), mapped)  # a person
     assert np.flatnonzero(~seen).tolist() == np.flatnonzero(arrived).tolist() == list(range(100, 150))
-    seen, arrived = made.find_old_beams(here, changed(scan, slice(100, 150), 1.5))  # a door was opened
+    seen, arrived = made.find_old_beams(here, changed(scan, slice(100, 150), 1.5), mapped)  # a door was opened
     assert np.flatnonzero(~seen).tolist() == list(range(100, 150))
     assert not arrived.any()
+
+
+def test_surface_in_place_of_another():
+    """What ends where the map's surface was seen, but not at that surface, was not seen before."""
+    scene = Scene.of(ROOM, 361, 1)
+    scan, made = view(scene, HERE), local_map(scene, HERE)
+    here, nothing = made.to_local(HERE), np.zeros(len(scan.ranges), np.bool_)
+    mapped = ~nothing
+    mapped[100:150] = False
+    seen, arrived = made.find_old_beams(here, scan, mapped)
+    assert np.flatnonzero(~seen).tolist() == list(range(100, 150))
+    assert not arrived.any()
+    made.add(KeyScan(here, scan, nothing, mapped, 0.0, 0.0), HERE, np.diag([1e-4, 1e-4, 1e-5]))
+    assert made.find_old_beams(here, view(scene, HERE), mapped)[0].all()
 
 
 def test_changes_between_scans():

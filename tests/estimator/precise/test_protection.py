@@ -1,13 +1,19 @@
-"""Protection levels: the pose without each surface, and errors that are exceeded with the probability asked for."""
+"""The error of an estimate: the pose without each surface, the covariance, and the protection level."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from common.geometry import se2
-from services.estimator.precise import protection
 from services.estimator.precise.hypotheses import WEAK_PRIOR
+from services.estimator.precise.protection import (
+    EXCEEDED_SHARE,
+    MISTAKEN_SURFACE,
+    EstimateError,
+    _without_each_surface,
+)
 from tests.estimator.precise.test_inference import TRUTH, scan, view
 
 COVARIANCE = np.diag([0.002, 0.001, 0.003]) ** 2
@@ -33,7 +39,7 @@ def test_evidence_by_surface(matched):
 def test_pose_without_each_surface(matched):
     made, pose = matched
     evidence = made.evidence_by_surface(pose)
-    offsets, widening = protection._without_each_surface(evidence, se2.rotation(-float(pose[2])))
+    offsets, widening = _without_each_surface(evidence, se2.rotation(-float(pose[2])))
 
     def solution(used):
         information = evidence.curvature[used].sum(axis=0) + WEAK_PRIOR
@@ -44,36 +50,48 @@ def test_pose_without_each_surface(matched):
     for k in everything:
         moved, wider = solution(everything[everything != k])
         in_base = np.array([*se2.rotate(-float(pose[2]), (moved - reference)[:2]), (moved - reference)[2]])
-        assert offsets[k] == pytest.approx(np.abs(in_base))
+        assert offsets[k] == pytest.approx(in_base)
         assert widening[k, 2] == pytest.approx(np.sqrt(wider[2, 2] / covariance[2, 2]))
     assert (widening >= 1).all()
 
 
-def test_level_of_a_mixture():
-    rng = np.random.default_rng(4)
-    deviation, offsets = np.array([1.0, 2.0, 0.5]), np.array([[8.0, 0.0, 1.0], [3.0, 5.0, 0.0]])
-    deviations = deviation * np.array([[1.5, 1.0, 2.0], [1.0, 3.0, 1.0]])
-    level, count = protection._level(deviation, offsets, deviations, 0.005), 400_000
-    share = np.mean(np.abs(rng.normal(0, deviation, (count, 3))) > level, axis=0)
-    for offset, each in zip(offsets, deviations, strict=True):
-        beyond = np.abs(rng.normal(offset, each, (count, 3))) > level
-        share += protection.MISTAKEN_SURFACE * beyond.mean(axis=0)
-    assert share == pytest.approx(0.005, abs=0.0006)
+def test_moments_and_level_of_a_mixture():
+    deviation, offsets = np.array([1.0, 2.0, 0.5]), np.array([[8.0, 0.0, 1.0], [3.0, -5.0, 0.0]])
+    widening = np.array([[1.5, 1.0, 2.0], [1.0, 3.0, 1.0]])
+    error = EstimateError(np.diag(deviation**2), offsets, widening, 0.01)
+    level = error.protection_level(0.4 * EXCEEDED_SHARE)
+    beyond = 2 * norm.sf(level, scale=deviation)
+    for offset, factor in zip(offsets, widening, strict=True):
+        beyond += 0.01 * (norm.sf(level, offset, deviation * factor) + norm.cdf(-level, offset, deviation * factor))
+    assert beyond == pytest.approx(0.6 * EXCEEDED_SHARE, rel=1e-3)
+    spread = np.diag(deviation**2) + 0.01 * (np.outer(offsets[0], offsets[0]) + np.outer(offsets[1], offsets[1]))
+    assert error.total_covariance(0.0) == pytest.approx(spread)
+    assert error.total_covariance(0.5 * np.pi)[1, 1] == pytest.approx(spread[0, 0])
+
+
+def of(scan_view, pose, explained=1.0):
+    return EstimateError.of(scan_view, pose, COVARIANCE, explained)
 
 
 def test_elsewhere(matched):
-    made, pose = matched
-    near = protection.protection_level(made, pose, COVARIANCE, 0.0)
+    near = of(*matched).protection_level(0.0)
     assert (near >= 3.89 * np.sqrt(np.diag(COVARIANCE)).min()).all()
-    assert (protection.protection_level(made, pose, COVARIANCE, 0.5 * protection.EXCEEDED_SHARE) > near).all()
-    assert protection.protection_level(made, pose, COVARIANCE, protection.EXCEEDED_SHARE) is None
+    assert (of(*matched).protection_level(0.5 * EXCEEDED_SHARE) > near).all()
+    assert of(*matched).protection_level(EXCEEDED_SHARE) is None
+
+
+def test_few_explained_surfaces(matched):
+    assert of(*matched, 1.0).mistaken == MISTAKEN_SURFACE
+    assert of(*matched, 0.1).mistaken == pytest.approx(10 * MISTAKEN_SURFACE)
+    assert of(*matched, 0.0).mistaken == 1.0
+    assert (of(*matched, 0.1).protection_level(0.0) > of(*matched, 1.0).protection_level(0.0)).all()
 
 
 def test_no_surface(matched):
     made, pose = matched
-    nothing = view(np.full_like(made.ranges, np.nan))
-    level = protection.protection_level(nothing, pose * [1, 1, 0], COVARIANCE, 0.0)
-    assert level == pytest.approx(3.8906 * np.sqrt(np.diag(COVARIANCE)), rel=1e-3)
+    error = of(view(np.full_like(made.ranges, np.nan)), pose * [1, 1, 0])
+    assert error.protection_level(0.0) == pytest.approx(3.8906 * np.sqrt(np.diag(COVARIANCE)), rel=1e-3)
+    assert error.total_covariance(0.0) == pytest.approx(COVARIANCE)
 
 
 def test_mistaken_surfaces(matched):
@@ -85,6 +103,6 @@ def test_mistaken_surfaces(matched):
         dragged = view(made.ranges + 0.04 * (surface == k))
         wrong = dragged.descend(pose[None])[0][0]
         error = np.abs(se2.between(wrong, pose))
-        beyond["level"] += (error > protection.protection_level(dragged, wrong, COVARIANCE, 0.0)).any()
+        beyond["level"] += (error > of(dragged, wrong).protection_level(0.0)).any()
         beyond["covariance"] += (error > 3.89 * np.sqrt(np.diag(COVARIANCE))).any()
     assert beyond["level"] < beyond["covariance"] / 2, beyond
