@@ -194,7 +194,7 @@ def _trial(estimator: PreciseEstimator, observation: Observation, truth: Array) 
         observation.range_max,
     )
     began = time.process_time()
-    ranked = estimator.seeds.rank(view, Settings().search_seeds)
+    ranked = estimator.seeds.rank(view, Settings().ranked_seeds)
     ranking = time.process_time() - began
     off = difference(ranked, truth)
     seeded = bool(((np.hypot(off[:, 0], off[:, 1]) < SEED_POSITION_M) & (np.abs(off[:, 2]) < SEED_HEADING_RAD)).any())

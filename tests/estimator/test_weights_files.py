@@ -69,7 +69,7 @@ def test_damaged_files(files, damage):
     [
         ("scales", np.ones(3, np.float32)),
         ("scales", np.full(int(np.prod(CLASSES)), np.nan, np.float32)),
-        ("panoramas", np.ones((2, 3, 120), np.uint16)),
+        ("panoramas_in_bytes", np.ones((2, 3, 120), np.uint8)),
     ],
     ids=["shape", "not finite", "panoramas"],
 )

@@ -16,13 +16,11 @@ if TYPE_CHECKING:
 
     from common.geometry.se2 import Array
 
-    Singles = npt.NDArray[np.float32]
-
-SHORT_MISFIT_FACTOR = 0.6  # a beam shorter than expected counts less than a longer one, because it may be blocked
-UNKNOWN_MISFIT = 0.4  # of a beam for which the model has no prediction
-
-# The same for whole steps of range: capped absolute errors, which fit into a byte and into vector registers.
-LONG_MISFIT_STEPS, SHORT_MISFIT_STEPS, UNKNOWN_MISFIT_STEPS = 6, 4, 2
+# Largest errors that count in a search, in steps of `global_seeds.RANGE_STEP_M`.
+LONG_MISFIT_STEPS, SHORT_MISFIT_STEPS = 10, 6  # a shorter beam counts less, because it may be blocked
+REMOVED_MISFIT_STEPS = 2  # of a beam that ends at the next surface behind the expected one
+BEHIND_MISFIT_STEPS = LONG_MISFIT_STEPS - REMOVED_MISFIT_STEPS
+UNKNOWN_MISFIT_STEPS = 4  # of a beam for which the model has no prediction
 LANES = 128  # of a vector register for bytes; headings are padded to a multiple
 
 jit = numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -96,77 +94,45 @@ def accumulate(
 
 @jit
 def rank_places(
-    panoramas: Singles,
-    bins: npt.NDArray[np.int_],
-    measured: Singles,
-    tolerance: float,
-    range_max: float,
-    costs: Singles,
-) -> None:
-    """Fills costs (S, H) of every place and heading with the mean over beams of e² / (e² + tolerance²).
-
-    ``panoramas`` (S, A) m are ranges all around each place, ``bins`` (B,) the direction of each beam among those A, and
-    ``measured`` (B,) m the scan. Beams shorter than expected count less, see `SHORT_MISFIT_FACTOR`.
-    """
-    size, headings = panoramas.shape[1], costs.shape[1]
-    for s in range(panoramas.shape[0]):
-        for h in range(headings):
-            shift = h * size // headings
-            total, used = 0.0, 0
-            for b in range(bins.shape[0]):
-                o = measured[b]
-                if o == -np.inf or np.isnan(o):
-                    continue
-                g = panoramas[s, (bins[b] + shift) % size]
-                if np.isnan(g):
-                    total, used = total + UNKNOWN_MISFIT, used + 1
-                    continue
-                e = min(o, range_max) - min(g, range_max)
-                misfit = e * e / (e * e + tolerance * tolerance)
-                total += misfit if e > 0.0 else SHORT_MISFIT_FACTOR * misfit
-                used += 1
-            costs[s, h] = total / max(used, 1)
-
-
-@jit
-def rank_roughly(
-    panoramas: npt.NDArray[np.uint16],
+    panoramas: npt.NDArray[np.uint8],
     bins: npt.NDArray[np.int64],
-    measured: npt.NDArray[np.uint16],
-    range_max: int,
-    shift: int,
+    measured: npt.NDArray[np.uint8],
+    most: int,
     costs: npt.NDArray[np.uint16],
 ) -> None:
-    """Fills costs (S,) of every place with the least sum of capped errors over beams, at any of H headings.
+    """Fills costs (S, H) of every place and heading with the sum of capped absolute errors over beams.
 
-    ``panoramas`` (S, P, H) are ranges in the directions P h + p, 0 if unknown, ``bins`` (B,) the direction of each
-    beam, and ``measured`` (B,) the scan. All ranges are in the same steps, limited to ``range_max``, and compared
-    without their lowest ``shift`` bits. Beams shorter than expected count less, see `SHORT_MISFIT_FACTOR`.
+    ``panoramas`` (S, 2, P, H) are ranges in the directions P h + p, to the first surface (0 if unknown) and to the next
+    one behind it, where a beam ends if the first was removed. ``bins`` (B,) is the direction of each beam, and
+    ``measured`` (B,) the scan. All ranges are in the same steps, limited to ``most``.
     """
-    phases, headings = panoramas.shape[1:]
+    phases, headings = panoramas.shape[2:]
     lanes = (headings + LANES - 1) // LANES * LANES
-    around = np.zeros((phases, headings + lanes), np.uint8)  # a byte for each direction, more than once around
+    around = np.zeros((2, phases, headings + lanes), np.uint8)  # a byte for each direction, more than once around
     sums = np.empty(lanes, np.uint16)
-    most, long, short, unknown = (
-        np.uint16(min(range_max >> shift, 255)),
+    long, short, removed, beyond, unknown, limit = (
         np.uint8(LONG_MISFIT_STEPS),
         np.uint8(SHORT_MISFIT_STEPS),
+        np.uint8(REMOVED_MISFIT_STEPS),
+        np.uint8(BEHIND_MISFIT_STEPS),
         np.uint8(UNKNOWN_MISFIT_STEPS),
+        np.uint8(most),
     )
     for s in range(panoramas.shape[0]):
-        for p in range(phases):
-            for h in range(headings):
-                steps = panoramas[s, p, h]
-                around[p, h] = np.uint8(max(min(np.uint16(steps >> shift), most), min(steps, np.uint16(1))))
-            around[p, headings : 2 * headings] = around[p, :headings]
+        for layer in range(2):
+            for p in range(phases):
+                for h in range(headings):
+                    around[layer, p, h] = min(panoramas[s, layer, p, h], limit)
+                around[layer, p, headings : 2 * headings] = around[layer, p, :headings]
         sums[:] = 0
         for b in range(bins.shape[0]):
-            o = np.uint8(min(np.uint16(measured[b] >> shift), most))
-            first = bins[b] // phases
-            expected = around[bins[b] % phases, first : first + lanes]  # a slice, so that the loop is vectorised
+            o, first, p = min(measured[b], limit), bins[b] // phases, bins[b] % phases
+            # Slices, so that the loop is vectorised.
+            surface, behind = around[0, p, first : first + lanes], around[1, p, first : first + lanes]
             for h in range(lanes):
-                g = expected[h]
-                higher = max(o, g)
-                misfit = min(np.uint8(higher - g), long) + min(np.uint8(higher - o), short)
+                g, next_g = surface[h], behind[h]
+                past = min(np.uint8(max(o, next_g) - min(o, next_g)), beyond)
+                late = min(np.uint8(max(o, g) - g), long, np.uint8(removed + past))
+                misfit = late if o > g else min(np.uint8(g - min(o, g)), short)
                 sums[h] = np.uint16(sums[h] + (misfit if g > 0 else unknown))
-        costs[s] = sums[:headings].min()
+        costs[s] = sums[:headings]

@@ -21,12 +21,8 @@ SEED_SPACING_M = 0.3  # between the places at which a search begins
 RANKED_HEADINGS, RANKED_BEAMS = 120, 72  # that are compared with the panorama of each place
 PANORAMA_PHASES = 3  # directions of a panorama for each of these headings
 PANORAMA_BINS = PANORAMA_PHASES * RANKED_HEADINGS
-RANGE_STEP_M = 0.002  # of a stored range; 0 is unknown
-RANKED_PLACES = 1000  # that are best by a rough comparison and ranked exactly
-ROUGH_SHIFT = 6  # bits by which that comparison shortens stored ranges, to steps of 0.128 m
-MISFIT_TOLERANCE_M = 0.35  # typical error of a beam if the nearest seed is this far from the true place
-
-StoredRanges = npt.NDArray[np.uint16]
+RANGE_STEP_M = 0.1  # of a stored range; 0 is unknown
+MAX_RANGE_STEPS = 255  # of which a stored range has at most this many
 
 
 @dataclass(frozen=True)
@@ -34,20 +30,22 @@ class Seeds:
     """Places in free space, with the panorama of ranges that the model expects at each."""
 
     places: Array  # (S, 2) m in map, of the laser
-    # (S, PANORAMA_PHASES, RANKED_HEADINGS) ranges in the directions 2 pi (PANORAMA_PHASES k + phase) / PANORAMA_BINS
-    panoramas: StoredRanges
+    # (S, 2, PANORAMA_PHASES, RANKED_HEADINGS) in steps of `RANGE_STEP_M`, in the directions
+    # 2 pi (PANORAMA_PHASES k + phase) / PANORAMA_BINS: ranges to the first surface, and to the next behind it
+    panoramas: npt.NDArray[np.uint8]
 
     @classmethod
     def at(cls, model: GenerativeModel, places: Array) -> Seeds:
         """Predicts the panorama at every place (S, 2)."""
         lasers = np.column_stack([places, np.zeros(len(places))])
         directions = np.linspace(0.0, 2 * np.pi, PANORAMA_BINS, endpoint=False)
-        panoramas = np.empty((len(lasers), PANORAMA_PHASES, RANKED_HEADINGS), np.uint16)
+        panoramas = np.empty((len(lasers), 2, PANORAMA_PHASES, RANKED_HEADINGS), np.uint8)
         for begin in range(0, len(lasers), 500):
-            expected = model.expect(lasers[begin : begin + 500], directions)
-            steps = np.clip(np.round(expected.ranges / RANGE_STEP_M), 1, np.iinfo(np.uint16).max)
-            steps = np.where(np.isinf(expected.scale), 0, steps).reshape(-1, RANKED_HEADINGS, PANORAMA_PHASES)
-            panoramas[begin : begin + 500] = steps.transpose(0, 2, 1)
+            part = slice(begin, begin + 500)
+            expected = model.expect(lasers[part], directions)
+            behind = model.expect_behind(lasers[part], directions, expected.ranges)
+            steps = np.stack([np.where(np.isinf(expected.scale), 0, _steps(expected.ranges)), _steps(behind)], axis=1)
+            panoramas[part] = steps.reshape(-1, 2, RANKED_HEADINGS, PANORAMA_PHASES).transpose(0, 1, 3, 2)
         return cls(np.asarray(places, float), panoramas)
 
     @property
@@ -66,33 +64,28 @@ class Seeds:
         thin = view.thinned(RANKED_BEAMS)
         used = ~(np.isnan(thin.ranges) | np.isneginf(thin.ranges))
         bins = np.round(thin.angles[used] / (2 * np.pi / PANORAMA_BINS)).astype(np.int64) % PANORAMA_BINS
-        measured = np.minimum(thin.ranges[used], view.range_max)
-        candidates = self._best_places(bins, measured, view.range_max)
-        steps = self.panoramas[candidates].transpose(0, 2, 1).reshape(-1, PANORAMA_BINS)
-        panoramas = np.where(steps > 0, steps * np.float32(RANGE_STEP_M), np.float32(np.nan))
-        costs = np.empty((len(candidates), RANKED_HEADINGS), np.float32)
-        tolerance, range_max = np.float32(MISFIT_TOLERANCE_M), np.float32(view.range_max)
-        beam_sums.rank_places(panoramas, bins, measured.astype(np.float32), tolerance, range_max, costs)
-        place, heading = _least_costs(costs, count)
+        costs = np.empty((len(self.places), RANKED_HEADINGS), np.uint16)
+        most = int(_steps(np.array(view.range_max)))
+        beam_sums.rank_places(self.panoramas, bins, _steps(thin.ranges[used]), most, costs)
+        best = np.sort(np.argsort(costs.min(axis=1), kind="stable")[:count])
+        place, heading = _least_costs(costs[best], count)
         headings = se2.wrap(heading * (2 * np.pi / RANKED_HEADINGS))
-        lasers = np.column_stack([self.places[candidates[place]], headings])
+        lasers = np.column_stack([self.places[best[place]], headings])
         return se2.compose(lasers, se2.inverse(view.mount))
 
-    def _best_places(self, bins: npt.NDArray[np.int64], measured: Array, range_max: float) -> npt.NDArray[np.intp]:
-        """Indices of the `RANKED_PLACES` that fit best by a rough comparison, in ascending order."""
-        steps = np.minimum(measured / RANGE_STEP_M, np.iinfo(np.uint16).max).astype(np.uint16)
-        costs = np.empty(len(self.places), np.uint16)
-        beam_sums.rank_roughly(self.panoramas, bins, steps, int(range_max / RANGE_STEP_M), ROUGH_SHIFT, costs)
-        return np.sort(np.argsort(costs, kind="stable")[:RANKED_PLACES])
+
+def _steps(ranges: Array) -> npt.NDArray[np.uint8]:
+    """Ranges in m as steps of `RANGE_STEP_M`, at least 1."""
+    return np.clip(np.round(ranges / RANGE_STEP_M), 1, MAX_RANGE_STEPS).astype(np.uint8)
 
 
-def _least_costs(costs: np.ndarray[tuple[int, ...], np.dtype[np.float32]], count: int) -> tuple[Array, Array]:
+def _least_costs(costs: npt.NDArray[np.uint16], count: int) -> tuple[Array, Array]:
     """Indices of place and heading of the ``count`` lowest costs, with at most two separate headings per place."""
     rows = np.arange(len(costs))
     first = costs.argmin(axis=1)
     rest = costs.copy()
     for offset in range(-3, 4):
-        rest[rows, (first + offset) % costs.shape[1]] = np.inf
+        rest[rows, (first + offset) % costs.shape[1]] = np.iinfo(np.uint16).max
     second = rest.argmin(axis=1)
     place = np.concatenate([rows, rows])
     heading = np.concatenate([first, second])

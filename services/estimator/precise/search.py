@@ -23,21 +23,27 @@ if TYPE_CHECKING:
     from services.estimator.precise.settings import Settings
 
 
-# Added in quadrature to every beam's standard deviation, step by step, from poses that may be half a metre off.
-SEARCH_SCHEDULE_M = (COARSE_SIGMA_M, COARSE_SIGMA_M, COARSE_SIGMA_M, MEDIUM_SIGMA_M, MEDIUM_SIGMA_M)
+SEED_BEAMS = 75  # with which seeds are compared
+SEED_SIGMA_M = 0.15  # typical error of a range at the nearest seed; added in quadrature to every beam's deviation
+# Added in the same way, step by step: in a descent from a seed, where more would take moved furniture for the map's,
+# and from a pose that may be half a metre off.
+SEED_SCHEDULE_M = (MEDIUM_SIGMA_M, MEDIUM_SIGMA_M, 0.05, 0.05)
 NEAR_SCHEDULE_M = (COARSE_SIGMA_M, COARSE_SIGMA_M, MEDIUM_SIGMA_M, MEDIUM_SIGMA_M, *FOLLOWING_SCHEDULE_M)
 
 
 def search_everywhere(view: View, seeds: Seeds, settings: Settings) -> list[Mode]:
     """Returns the hypotheses that fit best in the whole map, best first.
 
-    Descends from the best seeds with few beams and wide deviations, then from the best results with all beams.
+    Descends from those of the best seeds that have the most evidence by surfaces: with few beams, and from the best
+    results with all beams.
     """
+    starts = seeds.rank(view, settings.ranked_seeds)
+    fit = view.thinned(SEED_BEAMS).surface_evidence(starts, SEED_SIGMA_M).log_likelihood
+    starts = starts[np.argsort(-fit, kind="stable")[: settings.search_starts]]
     few = view.thinned(settings.search_beams)
-    poses, _ = few.descend(seeds.rank(view, settings.search_seeds), None, SEARCH_SCHEDULE_M)
-    fit = few.surface_evidence(poses).log_likelihood
-    poses = poses[select_distinct(poses, -fit, 3 * settings.max_hypotheses)]
-    poses, evidence = view.descend(poses)
+    poses, _ = few.descend(starts, None, SEED_SCHEDULE_M)
+    fit = few.surface_evidence(poses, SEED_SCHEDULE_M[-1]).log_likelihood
+    poses, evidence = view.descend(poses[select_distinct(poses, -fit, settings.search_results)])
     return _best_modes(view, poses, evidence, None, seeds, settings)
 
 
@@ -45,7 +51,7 @@ def search_near(
     view: View, pose: Array, covariance: Array, seeds: Seeds, settings: Settings, rng: np.random.Generator
 ) -> list[Mode]:
     """Returns the hypotheses that fit best near ``pose`` (3,), which is known within ``covariance`` (3, 3)."""
-    starts = rng.multivariate_normal(pose, covariance, settings.search_seeds)
+    starts = rng.multivariate_normal(pose, covariance, settings.near_starts)
     starts[0] = pose
     prior = Prior.repeated(len(starts), pose, covariance)
     poses, evidence = view.descend(starts, prior, NEAR_SCHEDULE_M)

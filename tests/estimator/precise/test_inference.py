@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from common.geometry import se2
 from common.geometry.ray_casting import MIN_COSINE
 from common.geometry.world import World
-from services.estimator.precise import global_seeds
+from services.estimator.precise import beam_sums
 from services.estimator.precise.gauss_newton import MAX_STEP, Prior, View, descend, difference
 from services.estimator.precise.global_seeds import Seeds, thin_places
 from services.estimator.precise.hypotheses import Mode, constraining_beams, select_distinct, weigh
@@ -266,16 +266,19 @@ def test_seed_ranking():
         assert (near & (np.abs(se2.wrap(ranked[:, 2] - pose[2])) < 0.2)).any()
 
 
-@pytest.mark.parametrize("range_max", [25.0, 4.0])
-def test_rough_ranking(monkeypatch, range_max):
+def test_ranking_costs():
     rng = np.random.default_rng(4)
-    seeds = Seeds.at(RayCaster(ROOM), thin_places(ROOM.sample_free(2000, rng, 0.05), 0.3))
-    scans = [scan(pose, rng) for pose in ROOM.sample_poses(10, rng, 0.27)]
-    views = [view(np.where(each < range_max, each, np.inf), range_max=range_max) for each in scans]
-    best = [seeds.rank(each, 10) for each in views]  # there are so few places that all are ranked exactly
-    monkeypatch.setattr(global_seeds, "RANKED_PLACES", len(seeds.places) // 4)
-    for each, exhaustive in zip(views, best, strict=True):
-        assert np.array_equal(seeds.rank(each, 10), exhaustive)
+    panoramas = rng.integers(0, 256, (5, 2, 3, 120)).astype(np.uint8)
+    bins, measured, most = np.arange(0, 360, 5), rng.integers(1, 256, 72).astype(np.uint8), 200
+    costs = np.empty((5, 120), np.uint16)
+    beam_sums.rank_places(panoramas, bins, measured, most, costs)
+    around = np.minimum(panoramas, most).transpose(1, 0, 3, 2).reshape(2, 5, 360).astype(int)
+    o = np.minimum(measured, most).astype(int)
+    for heading in range(120):
+        surface, behind = around[:, :, (bins + 3 * heading) % 360]
+        late = np.minimum(np.minimum(o - surface, 10), 2 + np.minimum(np.abs(o - behind), 8))
+        misfit = np.where(o > surface, late, np.minimum(surface - o, 6))
+        assert np.array_equal(costs[:, heading], np.where(surface > 0, misfit, 4).sum(axis=1))
 
 
 def test_thin_places():

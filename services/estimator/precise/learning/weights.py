@@ -73,7 +73,7 @@ def save(path: Path, model: FieldModel, places: Array, card: FieldCard) -> None:
         "phi": field.phi.astype(np.float16),
         "scales": model.scales.astype(np.float32),
         "places": places.astype(np.float32),
-        "panoramas": seeds.panoramas,
+        "panoramas_in_bytes": seeds.panoramas,
     }
     if model.seen is not None:
         tensors |= {"seen": model.seen.cells.astype(np.uint8), "seen_origin": np.array(model.seen.origin)}
@@ -104,13 +104,13 @@ def load(path: Path) -> tuple[FieldModel, Seeds, FieldCard]:
         raise UserError(
             f"weights {path}: this is not a file of field weights ({' '.join(str(error).split())[:200]})"
         ) from None
-    panoramas = tensors.get("panoramas")  # files written by older versions have none
+    panoramas = tensors.get("panoramas_in_bytes")  # files written by older versions have none
     if (
         phi.ndim != 2
         or min(phi.shape) < 2
         or scales.shape != (int(np.prod(CLASSES)),)
         or places.shape[1:] != (2,)
-        or (panoramas is not None and panoramas.shape != (len(places), PANORAMA_PHASES, RANKED_HEADINGS))
+        or (panoramas is not None and panoramas.shape != (len(places), 2, PANORAMA_PHASES, RANKED_HEADINGS))
     ):
         raise UserError(f"weights {path}: an array does not have the shape that a field needs")
     if not all(np.isfinite(a).all() for a in (phi, scales, places)):
