@@ -26,6 +26,7 @@ class BackEnd:
         self._uncertainty: Uncertainty | None = None  # of the segments; computed again after a change
         self._tried: set[tuple[int, int]] = set()  # pairs of segments
         self._joining = Joining()
+        self._cuts: set[int] = set()  # numbers of the key scans whose link to the one before turned out to be wrong
 
     def extend(self, scans: KeyScans) -> None:
         """Adds key scans that follow those that are known, at the places where the front end sees them."""
@@ -55,11 +56,11 @@ class BackEnd:
         self._add(found, scans)
 
     def join_pieces(self, scans: KeyScans, *, growing: bool = False) -> bool:
-        """Searches the map for a piece without a link to it; returns whether one was found."""
+        """Separates contradicted pieces, then searches the map for one that is apart; returns whether it was found."""
         if not scans.pieces.any():
             return False
         segments = self._segments(scans, growing=growing)
-        self._separate_if_contradicted(segments)
+        self._separate_contradicted(scans, segments)
         component = self._components(scans)
         if not component.any():
             return False
@@ -94,22 +95,41 @@ class BackEnd:
         self._drop_implausible()
         self.poses = optimise(self.poses, self._links(scans))
 
-    def _separate_if_contradicted(self, segments: list[Segment]) -> None:
-        """Separates the last piece from the others if its last segment contradicts them."""
-        last, number = segments[-1], len(segments) - 1
-        pieces = [{segments[k].piece for k in (each.first, each.second)} for each in self.closures]
-        joins_last = [last.piece in each and len(each) > 1 for each in pieces]
-        others = [k for k, each in enumerate(segments) if each.piece != last.piece]
-        if any(joins_last) and is_contradicted(number, self.poses[last.reference], others, segments, self.poses):
-            self.closures = [each for each, joins in zip(self.closures, joins_last, strict=True) if not joins]
-            self._uncertainty = None
+    def _separate_contradicted(self, scans: KeyScans, segments: list[Segment]) -> None:
+        """Cuts the drive where a piece begins that contradicts the ones before: all links across are taken back."""
+        for piece in range(1, segments[-1].piece + 1):
+            component = self._components(scans)[[each.reference for each in segments]]
+            before = [k for k, each in enumerate(segments) if each.piece < piece]
+            if any(
+                each.piece == piece
+                and is_contradicted(
+                    k,
+                    self.poses[each.reference],
+                    [other for other in before if component[other] == component[k]],
+                    segments,
+                    self.poses,
+                )
+                for k, each in enumerate(segments)
+            ):
+                self._cut(len(before), int(np.searchsorted(scans.pieces, piece)), scans)
+
+    def _cut(self, segment: int, key: int, scans: KeyScans) -> None:
+        """Takes back all links across the beginning of a ``segment``, whose first key scan is number ``key``."""
+        self._cuts.add(key)
+        self.closures = [each for each in self.closures if (each.first < segment) == (each.second < segment)]
+        self._tried = {pair for pair in self._tried if (pair[0] < segment) == (pair[1] < segment)}
+        self._uncertainty = None
+        self.poses = optimise(self.poses, self._links(scans))
 
     def _segments(self, scans: KeyScans, *, growing: bool) -> list[Segment]:
         laser, ranges = self.laser, np.array(scans.ranges)
         return segments_of(self.poses, scans.pieces, scans.elements, ranges, laser.angles, laser.mount, growing=growing)
 
     def _links(self, scans: KeyScans) -> list[PoseLink]:
-        return [*scans.links, *(each.link for each in self.closures)]
+        return [
+            *(each for each in scans.links if each.second not in self._cuts),
+            *(each.link for each in self.closures),
+        ]
 
     def _components(self, scans: KeyScans) -> npt.NDArray[np.int_]:
         return components(len(self.poses), self._links(scans))

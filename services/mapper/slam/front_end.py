@@ -3,6 +3,10 @@
 A scan that contradicts the last key scans is suspect: something hides the surroundings, or the robot was carried off.
 It gets no place. After `MAX_SUSPECT_SCANS` in a row, another piece of the drive begins, whose place relative to the
 former pieces is unknown.
+
+A scan that matches, but far from where the motion model expects it, or with more contradictions than usual, also begins
+a piece: the wheels may have slipped or a door moved, or the robot was carried to a place that looks alike. The link to
+the former piece may turn out to be wrong.
 """
 
 from __future__ import annotations
@@ -38,10 +42,14 @@ FAMILIAR_SHARE, EARLY_KEY_SHARE = 0.7, 0.25
 SEARCH_WINDOW, SEARCH_RANGE_M = np.array([0.3, 0.3, 0.4]), 10.0  # around the prior; of the elements that take part
 LOCAL_SCANS = 12  # key scans in the local map
 MIN_SHARE = 0.2  # of a scan's elements that must match the local map
-# Share of agreeing elements, among those that agree with or contradict the local map, at a pose that may be right; and
-# the number of elements that are taken to agree in addition, so that a few contradictions alone are no evidence.
-MIN_AGREEMENT, PRIOR_AGREEMENT = 0.78, 10
+# Largest share of contradicting elements, among those that agree with or contradict the local map, at a pose that may
+# be right; and the number of elements that are taken to agree in addition, so that a few contradictions prove nothing.
+MAX_CONTRADICTION, PRIOR_AGREEMENT = 0.22, 10
+# A scan with a larger share than this, and so many times the largest one until now, begins a piece. The largest one
+# fades over about so many scans.
+DOUBTFUL_CONTRADICTION, DOUBTFUL_RATIO, FADING_SCANS = 0.05, 1.5, 50
 MAX_SUSPECT_SCANS = 10  # in a row; the last of them begins another piece
+MAX_SLIP = 6.0  # standard deviations of the motion; a scan that matches farther from the prior begins a piece
 CLOSE_TO_PRIOR = np.array([0.1, 0.1, 0.1])  # m, m, rad: after a suspect scan, a match farther away may be chance
 NO_PIECE = -1
 # Standard deviations of the motion. With odometry: of its error, as a share of the motion. Without: of the change of
@@ -64,7 +72,7 @@ class KeyScans:
     poses: Array  # (K, 3)
     elements: list[Elements]
     ranges: list[Array]  # (B,) m
-    links: list[PoseLink]  # between successive ones of one piece, by their numbers
+    links: list[PoseLink]  # between successive ones, by their numbers; a piece may begin with a link to the one before
     pieces: npt.NDArray[np.int_]  # (K,) piece of the drive to which each belongs
 
 
@@ -87,6 +95,7 @@ class Place:
     covariance: Array  # (3, 3) relative to the last key scans
     matched: bool  # otherwise only the motion model gives the pose
     piece: int = 0  # of the drive, or `NO_PIECE` for a suspect scan
+    linked: bool = False  # whether a piece begins here, with a link to the one before
 
 
 @dataclass(frozen=True)
@@ -117,12 +126,14 @@ class FrontEnd:
         # The local map: its surfaces, and the same with what its scans saw through.
         self._surface: Surface
         self._local: Segment
+        self._first_local = 0  # number of the first key scan with a link to those that follow
         # The motion.
         self._odom: Array | None = None  # (3,) of the last scan
         self._velocity: Array | None = None  # (3,) base_link
         self._scale = np.ones(3)  # of the deviations of the motion, learned
         self._since_key = np.zeros((3, 3))  # covariance of the motion since the last key scan, by the motion model
         self._suspect_scans = 0  # in a row until now
+        self._recent_contradiction = 0.0  # largest share of elements, in the last scans of which little matched
 
     def add(self, stamp: float, ranges: Array, odom: Array | None = None) -> Place:
         """Registers a scan ``ranges`` (B,) m at ``stamp`` s, later than the one before, with or without odometry."""
@@ -136,9 +147,11 @@ class FrontEnd:
         prior, covariance = self._prior(motion, deviation)
         self._since_key = self._since_key + PRIOR_SCALE**2 * covariance
         found = self._register(scan, prior, period)
-        suspect = self._is_suspect(scan, found, prior, period)
+        contradiction = self._contradiction(scan, found, prior)
+        suspect = contradiction > MAX_CONTRADICTION or self._is_suspect(found, prior, period)
         if found is not None and not suspect:
-            return self._add_matched(scan, found, prior, deviation, period)
+            doubtful = self._is_doubtful(contradiction) or prior.off(found.pose)[1] > MAX_SLIP**2
+            return self._add_matched(scan, found, prior, deviation, period, doubtful=doubtful)
         self.unmatched += 1
         if used_odometry:
             self._velocity = None
@@ -202,45 +215,53 @@ class FrontEnd:
         best = min(matches, key=lambda each: each.cost, default=None)
         return None if best is None or best.share < MIN_SHARE else best
 
-    def _is_suspect(self, scan: _Scan, found: Registration | None, prior: PosePrior, period: float) -> bool:
-        """Whether a scan shows that something hides the surroundings, or that the robot was carried off."""
+    def _is_suspect(self, found: Registration | None, prior: PosePrior, period: float) -> bool:
+        """Whether a registration shows that the robot was carried off, or may have been found by chance."""
         pose = prior.mean if found is None else found.pose
         if (np.abs(se2.between(self.poses[-1], pose)) > MAX_MOTION * period).any():
             return True
         if found is not None and found.share > FAMILIAR_SHARE:
             return False
         far = bool((np.abs(se2.between(prior.mean, pose)) > CLOSE_TO_PRIOR).any())
-        if self._suspect_scans and (found is None or far):
-            return True
-        return self._contradicts_local_map(scan, pose)
+        return self._suspect_scans > 0 and (found is None or far)
 
-    def _contradicts_local_map(self, scan: _Scan, pose: Array) -> bool:
-        """Whether a scan at a pose (3,) contradicts the local map more than moving things would make it."""
-        mount = self.laser.mount
-        scans = PosedScans(mount[None], self._evenly_spaced(scan)[None], self.laser.angles)
-        found = compare(self._local, self._surface, Segment(0, 0, scan.elements, scans), pose)
-        agreeing = found.agreeing + PRIOR_AGREEMENT
-        return agreeing < MIN_AGREEMENT * (agreeing + found.contradicting)
+    def _contradiction(self, scan: _Scan, found: Registration | None, prior: PosePrior) -> float:
+        """Share of contradictions between a scan and the local map; 0 if most of the scan matches."""
+        if found is not None and found.share > FAMILIAR_SHARE:
+            return 0.0
+        scans = PosedScans(self.laser.mount[None], self._evenly_spaced(scan)[None], self.laser.angles)
+        pose = prior.mean if found is None else found.pose
+        counted = compare(self._local, self._surface, Segment(0, 0, scan.elements, scans), pose)
+        return counted.contradicting / (counted.agreeing + PRIOR_AGREEMENT + counted.contradicting)
+
+    def _is_doubtful(self, contradiction: float) -> bool:
+        """Whether a share of contradictions is more than moving things caused until now."""
+        before = self._recent_contradiction
+        self._recent_contradiction = max(contradiction, before * (1 - 1 / FADING_SCANS))
+        return contradiction > max(DOUBTFUL_CONTRADICTION, DOUBTFUL_RATIO * before)
 
     def _add_matched(
-        self, scan: _Scan, found: Registration, prior: PosePrior, deviation: Array, period: float
+        self, scan: _Scan, found: Registration, prior: PosePrior, deviation: Array, period: float, *, doubtful: bool
     ) -> Place:
+        """Adds a scan at its pose; a ``doubtful`` one begins a piece."""
         self._suspect_scans = 0
-        self._velocity = se2.between(self.poses[-1], found.pose) / period
+        self._velocity = None if doubtful else se2.between(self.poses[-1], found.pose) / period
         familiar = found.share > FAMILIAR_SHARE
         if familiar:
             self._scale = _learn_scale(self._scale, self._scale * deviation, prior.mean, found)
         covariance = found.covariance + np.diag(REGISTRATION_DEVIATION**2)
-        place = Place(found.pose, covariance, matched=True, piece=self._key_pieces[-1])
+        place = Place(found.pose, covariance, matched=True, piece=self._key_pieces[-1] + doubtful, linked=doubtful)
         self._append(place)
-        self._add_key_if_due(scan, found.information, familiar=familiar)
+        if doubtful or self._is_key_due(scan, familiar=familiar):
+            self._add_linked_key(scan, found.information)
         return place
 
     def _add_unmatched(self, scan: _Scan, pose: Array) -> Place:
         """Adds a scan of which too little matches, at the pose that the motion model predicts."""
         place = Place(pose, self._since_key, matched=False, piece=self._key_pieces[-1])
         self._append(place)
-        self._add_key_if_due(scan, np.zeros((3, 3)), familiar=True)
+        if self._is_key_due(scan, familiar=True):
+            self._add_linked_key(scan, np.zeros((3, 3)))
         return place
 
     def _add_suspect(self, scan: _Scan, pose: Array) -> Place:
@@ -255,6 +276,7 @@ class FrontEnd:
     def _begin_piece(self, pose: Array, scan: _Scan) -> Place:
         """Begins a piece with a scan, whose pose (3,) may be any."""
         self._velocity, self._suspect_scans = None, 0
+        self._first_local = len(self.keys)
         piece = max(self._key_pieces, default=-1) + 1
         place = Place(pose, np.diag(REGISTRATION_DEVIATION**2), matched=True, piece=piece)
         self._append(place)
@@ -265,15 +287,18 @@ class FrontEnd:
         self.poses.append(place.pose)
         self.pieces.append(place.piece)
 
-    def _add_key_if_due(self, scan: _Scan, information: Array, *, familiar: bool) -> None:
-        """Makes the last scan, registered with an ``information`` (3, 3), a key scan if it is far from the last one."""
-        last_key, pose = self.poses[self.keys[-1]], self.poses[-1]
-        off = se2.between(last_key, pose)
+    def _is_key_due(self, scan: _Scan, *, familiar: bool) -> bool:
+        """Whether the last scan is far from the last key scan."""
+        off = se2.between(self.poses[self.keys[-1]], self.poses[-1])
         distance = max(KEY_DISTANCE_M, KEY_SHARE * _median_range(scan.elements))
         share = max(np.hypot(off[0], off[1]) / distance, abs(off[2]) / KEY_TURN_RAD)
-        if share >= (1.0 if familiar else EARLY_KEY_SHARE):
-            self._links.append(_link(len(self.keys) - 1, last_key, pose, information, self._since_key))
-            self._add_key(scan)
+        return bool(share >= (1.0 if familiar else EARLY_KEY_SHARE))
+
+    def _add_linked_key(self, scan: _Scan, information: Array) -> None:
+        """Makes the last scan, registered with an ``information`` (3, 3), a key scan with a link to the last one."""
+        last_key, pose = self.poses[self.keys[-1]], self.poses[-1]
+        self._links.append(_link(len(self.keys) - 1, last_key, pose, information, self._since_key))
+        self._add_key(scan)
 
     def _add_key(self, scan: _Scan) -> None:
         """Makes the last scan a key scan, and updates the local map."""
@@ -283,7 +308,7 @@ class FrontEnd:
         self._elements.append(scan.elements)
         self._ranges.append(self._evenly_spaced(scan))
         self._since_key = np.zeros((3, 3))
-        recent = [k for k in range(-min(LOCAL_SCANS, len(self.keys)), 0) if self._key_pieces[k] == piece]
+        recent = range(max(self._first_local, len(self.keys) - LOCAL_SCANS), len(self.keys))
         poses = np.array([self.poses[self.keys[k]] for k in recent])
         local = concatenate([self._elements[k].transformed(pose) for k, pose in zip(recent, poses, strict=True)])
         scans = PosedScans(

@@ -26,7 +26,7 @@ SEARCH_RANGE_M, TURN_STEP = 4.0, 0.06  # m from them, and rad between the headin
 SAME_PLACE_M, SAME_PLACE_RAD = 0.5, 0.1  # candidates that place a segment closer together than this agree
 MIN_SUPPORT = 2  # segments that agree
 # Share of contradictions with the nearest segments of the map that refutes a place, beyond those that people cause.
-MAX_CONTRADICTION, NEAREST = 0.05, 3
+MAX_CONTRADICTION, NEAREST = 0.03, 3
 
 
 @dataclass(frozen=True)
@@ -57,12 +57,12 @@ class Joining:
                 if (first, second) not in self._searched:
                     self._searched.add((first, second))
                     self._candidates += _search_segment(segments, first, second, poses)
-            of_piece = [
-                each
-                for each in self._candidates
-                if in_map[each.closure.first] and of_segment[each.closure.second] == of_segment[second]
+            of_part = of_segment == of_segment[second]
+            candidates = [
+                each for each in self._candidates if in_map[each.closure.first] and of_part[each.closure.second]
             ]
-            if found := _agreed_closures(of_piece, segments, poses):
+            parts = np.flatnonzero(in_map).tolist(), np.flatnonzero(of_part).tolist()
+            if found := _agreed_closures(candidates, parts, segments, poses):
                 # Once only: if this join is taken back, the same candidates must not lead to it again.
                 self._candidates = [
                     each for each in self._candidates if all(each.closure is not used for used in found)
@@ -101,8 +101,13 @@ def _search_segment(segments: Sequence[Segment], first: int, second: int, poses:
     ]
 
 
-def _agreed_closures(candidates: Sequence[JoinCandidate], segments: Sequence[Segment], poses: Array) -> list[Closure]:
-    """The closures of one piece that agree on its place, if no other place is as good."""
+def _agreed_closures(
+    candidates: Sequence[JoinCandidate], parts: tuple[list[int], list[int]], segments: Sequence[Segment], poses: Array
+) -> list[Closure]:
+    """The closures that agree on the place of one part of the drive in another, if no other place is as good.
+
+    ``parts`` are the numbers of their segments, those of the map first.
+    """
     if not candidates:
         return []
     places = np.array([_place_of_piece(each.closure.link, poses) for each in candidates])
@@ -115,7 +120,7 @@ def _agreed_closures(candidates: Sequence[JoinCandidate], segments: Sequence[Seg
         best = int(np.argmax(np.where(possible, totals, 0.0)))
         if len(scores[best]) < MIN_SUPPORT:
             return []
-        if not _is_place_contradicted(places[best], candidates[best], segments, poses):
+        if not _is_place_contradicted(places[best], parts, segments, poses):
             rival = totals[possible & ~agree[best]].max(initial=0.0)
             return [] if rival > RIVAL_SHARE * totals[best] else [each.closure for each in groups[best]]
         possible &= ~agree[best]
@@ -144,38 +149,50 @@ def _place_of_piece(link: PoseLink, poses: Array) -> Array:
     return np.asarray(se2.compose(se2.compose(poses[link.first], link.pose), se2.inverse(poses[link.second])))
 
 
-def _is_place_contradicted(place: Array, candidate: JoinCandidate, segments: Sequence[Segment], poses: Array) -> bool:
-    """Whether some segment of the piece contradicts the map, if the frame of the piece is at ``place`` (3,)."""
-    piece = segments[candidate.closure.second].piece
-    targets = [k for k, each in enumerate(segments) if each.piece == segments[candidate.closure.first].piece]
+def _is_place_contradicted(
+    place: Array, parts: tuple[list[int], list[int]], segments: Sequence[Segment], poses: Array
+) -> bool:
+    """Whether some segment of the second part contradicts the first one, if the frame of the second is at a place."""
+    targets, moved = parts
     return any(
-        is_contradicted(number, se2.compose(place, poses[each.reference]), targets, segments, poses)
-        for number, each in enumerate(segments)
-        if each.piece == piece
+        is_contradicted(number, se2.compose(place, poses[segments[number].reference]), targets, segments, poses)
+        for number in moved
     )
 
 
 def is_contradicted(
     number: int, pose: Array, targets: Sequence[int], segments: Sequence[Segment], poses: Array
 ) -> bool:
-    """Whether a segment at a pose (3,) contradicts the segments ``targets``, more than its own piece contradicts it."""
-    moved = segments[number]
-    own = [k for k in (number - 1, number + 1) if 0 <= k < len(segments) and segments[k].piece == moved.piece]
-    among_itself = _contradicting_share(moved, poses[moved.reference], own, segments, poses)
-    return _contradicting_share(moved, pose, targets, segments, poses) > MAX_CONTRADICTION + 2 * among_itself
+    """Whether a segment at a pose (3,) contradicts the segments ``targets``.
+
+    It does if the contradictions are more than those between successive segments, which moving things cause.
+    """
+    nearest = _nearest(pose, targets, segments, poses)
+    if not nearest:
+        return False
+    usual = max(_contradiction_among_successive(k, segments, poses) for k in (number, *nearest))
+    return _contradicting_share(segments[number], pose, nearest, segments, poses) > MAX_CONTRADICTION + 2 * usual
+
+
+def _nearest(pose: Array, targets: Sequence[int], segments: Sequence[Segment], poses: Array) -> list[int]:
+    """Those of the segments ``targets`` that are nearest to a pose (3,)."""
+    distance = np.hypot(*(poses[[segments[k].reference for k in targets], :2] - pose[:2]).T) if targets else np.zeros(0)
+    return [targets[k] for k in np.argsort(distance)[:NEAREST] if distance[k] < MAX_DISTANCE_M]
+
+
+def _contradiction_among_successive(number: int, segments: Sequence[Segment], poses: Array) -> float:
+    """Share of contradictions between a segment and those before and after it in its piece."""
+    segment = segments[number]
+    around = [k for k in (number - 1, number + 1) if 0 <= k < len(segments) and segments[k].piece == segment.piece]
+    return _contradicting_share(segment, poses[segment.reference], around, segments, poses)
 
 
 def _contradicting_share(
-    moved: Segment, pose: Array, targets: Sequence[int], segments: Sequence[Segment], poses: Array
+    moved: Segment, pose: Array, others: Sequence[int], segments: Sequence[Segment], poses: Array
 ) -> float:
-    """Share of contradictions between a segment at a pose (3,) and the nearest of other segments."""
-    references = np.array([segments[k].reference for k in targets], int)
-    distance = np.hypot(*(poses[references, :2] - pose[:2]).T)
+    """Share of contradictions between a segment at a pose (3,) and others."""
     agreeing = contradicting = 0
-    for k in np.argsort(distance)[:NEAREST]:
-        if distance[k] < MAX_DISTANCE_M:
-            target = segments[targets[k]]
-            local = se2.between(poses[target.reference], pose)
-            found = compare(target, Surface(target.elements), moved, local)
-            agreeing, contradicting = agreeing + found.agreeing, contradicting + found.contradicting
+    for target in (segments[k] for k in others):
+        found = compare(target, Surface(target.elements), moved, se2.between(poses[target.reference], pose))
+        agreeing, contradicting = agreeing + found.agreeing, contradicting + found.contradicting
     return contradicting / max(MIN_MATCHED, agreeing + contradicting)

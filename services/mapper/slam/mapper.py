@@ -42,11 +42,13 @@ class Mapper:
         self._front_end = FrontEnd(laser)
         self._back_end = BackEnd(laser)
         self._origin = np.zeros(3)  # of the front end's frame, in map
-        self._pieces = {0}  # whose place in the map is known
+        self._pieces = {0}  # whose place in the map is known, or follows from a link that no update has taken back
 
     def add(self, stamp: float, ranges: Array, odom: Array | None = None) -> Place:
         """The place in map of a scan ``ranges`` (B,) m at ``stamp`` s, with or without odometry (3,)."""
         place = self._front_end.add(stamp, ranges, odom)
+        if place.linked and place.piece - 1 in self._pieces:
+            self._pieces.add(place.piece)
         turn = se2.rotation(float(self._origin[2]))
         pose = se2.compose(self._origin, place.pose)
         matched = place.matched and place.piece in self._pieces
@@ -82,7 +84,11 @@ class Mapper:
         placed = np.flatnonzero(np.isfinite(grown.poses[:, 0]))
         last = self._front_end.poses[self._front_end.keys[placed[-1]]]
         self._origin = se2.compose(grown.poses[placed[-1]], se2.inverse(last))
-        self._pieces = set(self._front_end.key_scans().pieces[placed].tolist())
+        scans = self._front_end.key_scans()
+        self._pieces = set(scans.pieces[placed].tolist())
+        for link in scans.links:
+            if link.second >= len(grown.poses) and scans.pieces[link.first] in self._pieces:
+                self._pieces.add(int(scans.pieces[link.second]))
 
     def trajectory(self) -> tuple[Array, Array]:
         """Stamps (N,) in s and poses (N, 3) in map of all scans whose place is known."""

@@ -16,6 +16,7 @@ from services.mapper.slam.elements import Elements, concatenate
 from services.mapper.slam.registration import MATCHED_M, Surface
 
 KEY_SCANS_PER_SEGMENT = 8
+PERSON_M, GAP_M = 0.7, 0.3  # size of the largest moving thing, and between its parts
 PASSED_M = 0.3  # behind an element, along its normal, from where a beam counts as having passed through it
 
 
@@ -103,7 +104,7 @@ class Agreement:
 
     matched: int  # elements of the second segment that match
     agreeing: int  # elements of both that match
-    contradicting: int  # elements of both in places through which the other one saw
+    contradicting: int  # elements of both, of larger things than a person, in places through which the other one saw
 
     @property
     def share(self) -> float:
@@ -117,7 +118,19 @@ def compare(first: Segment, surface: Surface, second: Segment, pose: Array) -> A
     second_matches = surface.partner_distances(placed) < MATCHED_M
     first_matches = Surface(placed).partner_distances(first.elements) < MATCHED_M
     first_in_second = first.elements.transformed(se2.inverse(pose))
-    contradicting = first.scans.see_through(placed.select(~second_matches)).sum()
-    contradicting += second.scans.see_through(first_in_second.select(~first_matches)).sum()
+    contradicting = _count_contradicting(first.scans, placed.select(~second_matches))
+    contradicting += _count_contradicting(second.scans, first_in_second.select(~first_matches))
     matched = int(second_matches.sum())
-    return Agreement(matched, matched + int(first_matches.sum()), int(contradicting))
+    return Agreement(matched, matched + int(first_matches.sum()), contradicting)
+
+
+def _count_contradicting(scans: PosedScans, elements: Elements) -> int:
+    """Number of elements through which scans saw, in connected lines, beam by beam, longer than a person is wide."""
+    points = elements.points[scans.see_through(elements)]
+    if len(points) == 0:
+        return 0
+    group = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(points, axis=0).T) > GAP_M)])
+    first = points[np.searchsorted(group, group)]
+    extent = np.zeros(group[-1] + 1)
+    np.maximum.at(extent, group, np.hypot(*(points - first).T))
+    return int((extent[group] > PERSON_M).sum())
