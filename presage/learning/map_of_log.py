@@ -18,7 +18,7 @@ from common.geometry.tum import write_tum
 from common.geometry.world import World, load_world
 from presage.learning.map_picture import draw_map
 from presage.learning.placement import place
-from presage.learning.train_drive import TrainDriveOptions, drive_of, split, train_on_drive
+from presage.learning.train_drive import TrainDriveOptions, drive_of, enough_scans, split, train_on_drive
 from presage.logs.log import Reading
 from presage.logs.scan_files import Scans, read_scans
 from presage.terminal.output import make_folder
@@ -29,7 +29,6 @@ from services.mapper.slam.grid import grid_of_scans
 from services.mapper.slam.trajectory import build_trajectory, distribute_corrections
 
 MIN_SCANS = 2
-SIMULATED_SCANS = 2000  # in the rough map, for the model where the drive saw nothing
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,8 @@ def map_command(options: MapOptions, console: Console, progress: Console) -> Pat
         soft_wrap=True,
     )
     if options.models is not None:
-        samples = SIMULATED_SCANS if options.refine else 0
+        # In the rough map, for the model where the drive saw nothing
+        samples = 0 if rough is None else enough_scans(rough)
         training = TrainDriveOptions(options.log, str(path), options.models, samples, former=former)
         train_on_drive(training, drive, console)
     return path

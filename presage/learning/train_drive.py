@@ -33,6 +33,7 @@ from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.generative_models import RayCaster
 from services.estimator.shared.model_folder import training_folder
 
+MIN_SCANS_OF_MAP, SCANS_PER_M2 = 500, 4  # simulated for a field; each of a map's cells is met by about 100 beams
 MARGIN_M = 1.0  # around the ends of the beams; the world of a drive without a map is a rectangle
 
 
@@ -151,6 +152,11 @@ def rectangle(drive: ReferenceDrive, log: Path) -> World:
     corners = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
     name = re.sub(r"[^\w.-]", "-", log.stem) or "drive"
     return World(name=name, boundary=[(round(float(x), 3), round(float(y), 3)) for x, y in corners])
+
+
+def enough_scans(world: World) -> int:
+    """Number of simulated scans without noise from which the field of a map is learned, by its free area."""
+    return max(MIN_SCANS_OF_MAP, round(SCANS_PER_M2 * world.free_area))
 
 
 def simulated_beams(world: World, drive: ReferenceDrive, samples: int, seed: int) -> Beams:
