@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -103,8 +104,7 @@ def drive_of(scans: Scans, log: Path) -> ReferenceDrive:
         )
     if scans.stamps is None:
         raise UserError(f"{log}: no stamps, but they are needed to compute the velocity of the robot")
-    latest = np.maximum.accumulate(scans.stamps)  # stamps begin again where a simulation was restarted
-    use = np.flatnonzero(np.isfinite(scans.truth).all(axis=1) & (scans.stamps == latest))
+    use = usable_scans(scans.stamps, scans.truth)
     if not is_surface(scans.ranges[use]).any():
         raise UserError(f"{log}: no beam of the scans with a reference pose hit a surface")
     odom = None if scans.odom is None or not np.isfinite(scans.odom[use]).all() else scans.odom
@@ -119,6 +119,12 @@ def drive_of(scans: Scans, log: Path) -> ReferenceDrive:
     )
     drive = whole.part(use)
     return replace(drive, ranges=_corrected_ranges(drive, scans.time_increment)) if scans.time_increment else drive
+
+
+def usable_scans(stamps: Array, poses: Array) -> npt.NDArray[np.intp]:
+    """Numbers (K,) of the scans of a drive that have a pose, of those in order of time."""
+    latest = np.maximum.accumulate(stamps)  # stamps begin again where a simulation was restarted
+    return np.flatnonzero(np.isfinite(poses).all(axis=1) & (stamps == latest))
 
 
 def _corrected_ranges(drive: ReferenceDrive, time_increment: float) -> Array:
