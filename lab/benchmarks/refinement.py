@@ -215,8 +215,19 @@ def table(rows: list[dict[str, Any]]) -> str:
             return "–"
         return "; ".join(millimetres(errors[f"{quantity}_{kind}_m"]) for kind in ("median", "rms"))
 
-    heads = ("world", "start", "rough map", "after the drive", "frame aligned", "at true poses", "ratio")
-    heads += ("rough walls", "walls", "trajectory RMS", "`tracking`")
+    heads = (
+        "world",
+        "start",
+        "rough map",
+        "after the drive",
+        "frame aligned",
+        "at true poses",
+        "ratio",
+        "rough walls",
+        "walls",
+        "trajectory RMS",
+        "`tracking`",
+    )
     cells = [
         [
             row["world"],

@@ -158,7 +158,7 @@ def _build_poses(
     used = usable_scans(stamps, built.poses)
     with Progress(*Progress.get_default_columns(), console=progress, transient=True) as bar:
         task = bar.add_task("refining the poses", total=1.0)
-        poses = built.poses.copy()
+        poses: Array = built.poses.copy()
         poses[used] = refine_poses(posed, lambda done: bar.update(task, completed=done))
     if rough is None:
         return poses
