@@ -19,9 +19,10 @@ from common.geometry.world import World, load_world
 from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import Scene
 from lab.benchmarks.mapping import alignment
+from lab.benchmarks.visits import PERIOD_S, drive_through_rooms, office_building
 from lab.experiments.results import markdown, millimetres, number
 from lab.experiments.trials import run_trials
-from lab.integrity.buildings import make_building
+from lab.integrity.buildings import Building, make_building
 from lab.integrity.cases import BEAMS, START_DEVIATION
 from lab.integrity.maps import noisy_grid
 from presage.learning.map_of_log import MapOptions, map_command
@@ -32,7 +33,6 @@ from services.estimator.factory import EstimatorOptions, Geometry, prepare
 from services.estimator.precise.learning import weights
 from services.estimator.shared.generative_models import GenerativeModel, RayCaster
 
-EVERY = 3  # scan of a drive is used, as of a scanner with 5 Hz
 TEST_SECONDS = 40.0  # length of the other drive
 WALLS_EVERY = 10  # scan of the drive that refines shows walls to compare
 GRID, PLAN, NOTHING = "grid", "floor plan", "nothing"  # a noisy grid of 5 cm cells, or the walls without furniture
@@ -71,15 +71,16 @@ def bench_refinement(
 
 def refine_and_test(job: RefinementJob) -> dict[str, Any]:
     """Errors of another drive and of the walls: in each rough map, in what a drive makes of it, and with true poses."""
+    building = office_building() if job.world == "office" else make_building(int(job.world))
     world, roughs = _world_and_rough_maps(job)
     out = Path(job.out) / job.world
     shutil.rmtree(out, ignore_errors=True)  # of an interrupted run
     out.mkdir()
     drive, test = (Scene.of(world, BEAMS, [job.seed, number]) for number in (DRIVE_SEED, TEST_SEED))
-    poses, log = drive.path(job.seconds)[::EVERY], out / "drive.npz"
+    poses, log = drive_for(drive, building, job.seconds), out / "drive.npz"
     reading = Reading(mount=np.array(drive.scanner.mount))
     _log_drive(drive, poses, log)
-    path = test.path(TEST_SECONDS)[::EVERY]
+    path = drive_for(test, building, TEST_SECONDS)
     check = Check(drive, poses[::WALLS_EVERY], test, path, test.clean(path))
     true = TrainDriveOptions(log, str(_write(out, world)), out / "true-poses", reading=reading)
     at_true_poses = check.learned(train_from_drive(true, QUIET), world, IN_MAP)
@@ -90,7 +91,7 @@ def refine_and_test(job: RefinementJob) -> dict[str, Any]:
         begin = time.perf_counter()
         map_command(MapOptions(log, made, reading=reading, refine=file, models=out), QUIET, QUIET)
         taken = time.perf_counter() - begin
-        placed, truths = _trajectory(made.with_suffix(".tum"), poses, drive.scanner.rate)
+        placed, truths = _trajectory(made.with_suffix(".tum"), poses)
         frame = alignment(placed, truths)
         aligned = np.hypot(*(se2.compose(frame, placed) - truths)[:, :2].T)
         row = {
@@ -148,7 +149,7 @@ class Check:
         estimator = prepare(options)(Geometry.of(scene.scanner))
         start = self.path[0] + START_DEVIATION * rng.standard_normal(3)
         estimator.restart(se2.compose(se2.inverse(frame), start), np.diag(START_DEVIATION**2))
-        scans = (scene.observe(ranges, k * EVERY / scene.scanner.rate) for k, ranges in enumerate(self.clean))
+        scans = (scene.observe(ranges, k * PERIOD_S) for k, ranges in enumerate(self.clean))
         found = [estimator.update(scan) for scan in scans]
         return np.array([each.pose for each in found]), np.array([each.state == "tracking" for each in found])
 
@@ -179,6 +180,14 @@ def _world_and_rough_maps(job: RefinementJob) -> tuple[World, dict[str, World | 
     return world, {**roughs, NOTHING: None}
 
 
+def drive_for(scene: Scene, building: Building, seconds: float) -> Array:
+    """Poses (N, 3), `PERIOD_S` apart, of a drive through all rooms, once or several times, until the time is up."""
+    count = round(seconds / PERIOD_S)
+    path = drive_through_rooms(scene, building, 1.0)
+    laps = [path, path[::-1]]  # forth and back
+    return np.concatenate([laps[k % 2] for k in range(1 + count // len(path))])[:count]
+
+
 def _log_drive(scene: Scene, poses: Array, log: Path) -> None:
     """Writes the scans of a drive with noise, and its true poses (N, 3)."""
     np.savez(
@@ -186,7 +195,7 @@ def _log_drive(scene: Scene, poses: Array, log: Path) -> None:
         ranges=np.array([scene.observe(clean, 0.0).ranges for clean in scene.clean(poses)]),
         angles=scene.scanner.angles(),
         range_max=np.array(scene.scanner.range_max),
-        stamps=np.arange(len(poses)) * EVERY / scene.scanner.rate,
+        stamps=np.arange(len(poses)) * PERIOD_S,
         reference=poses,
     )
 
@@ -200,11 +209,11 @@ def _write(folder: Path, world: World) -> Path:
     return path
 
 
-def _trajectory(tum: Path, poses: Array, rate: float) -> tuple[Array, Array]:
+def _trajectory(tum: Path, poses: Array) -> tuple[Array, Array]:
     """Poses (K, 3) of a trajectory in TUM format, and the true ones of the same scans, of those in ``poses`` (N, 3)."""
     rows = np.loadtxt(tum)
     placed = np.column_stack([rows[:, 1:3], 2 * np.arctan2(rows[:, 6], rows[:, 7])])
-    return placed, poses[np.round(rows[:, 0] * rate / EVERY).astype(int)]
+    return placed, poses[np.round(rows[:, 0] / PERIOD_S).astype(int)]
 
 
 def table(rows: list[dict[str, Any]]) -> str:

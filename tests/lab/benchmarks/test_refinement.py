@@ -9,7 +9,8 @@ from common.geometry import se2
 from common.geometry.world import World
 from lab.accuracy.scenes import Scene
 from lab.benchmarks.mapping import alignment
-from lab.benchmarks.refinement import wall_errors
+from lab.benchmarks.refinement import drive_for, wall_errors
+from lab.integrity.buildings import make_building
 from services.estimator.shared.generative_models import RayCaster
 
 
@@ -28,3 +29,10 @@ def test_walls_of_the_true_world_are_right():
     moved = wall_errors(model, poses, scene, np.array([0.01, 0.0, 0.0]))
     assert moved.max() == pytest.approx(0.01, abs=1e-6)
     assert 0.001 < moved.mean() < 0.009
+
+
+def test_drive_has_the_length_that_was_asked_for():
+    building = make_building(3)
+    path = drive_for(Scene.of(building.world, 50, 1), building, 600.0)
+    assert path.shape == (3000, 3)
+    assert np.hypot(*np.diff(path[:, :2], axis=0).T).max() < 0.5
