@@ -1,4 +1,4 @@
-"""`presage bench refinement`."""
+"""`presage bench refinement`: what one drive makes of a rough map, of a floor plan, and of nothing."""
 
 from __future__ import annotations
 
@@ -6,40 +6,46 @@ import shutil
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import yaml
 from rich.console import Console
-from rich.table import Table
 
+from common.geometry import se2
 from common.geometry.ros_map_writer import write_grid
 from common.geometry.se2 import Array
 from common.geometry.world import World, load_world
 from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import Scene
+from lab.benchmarks.mapping import alignment
+from lab.benchmarks.visits import PERIOD_S, drive_through_rooms, office_building
+from lab.experiments.results import markdown, millimetres, number
 from lab.experiments.trials import run_trials
-from lab.integrity.buildings import make_building
+from lab.integrity.buildings import Building, make_building
 from lab.integrity.cases import BEAMS, START_DEVIATION
 from lab.integrity.maps import noisy_grid
 from presage.learning.map_of_log import MapOptions, map_command
 from presage.learning.train_drive import TrainDriveOptions, train_from_drive
 from presage.logs.log import Reading
 from presage.terminal.output import check_file, make_folder, write_json
-from services.estimator.factory import EstimatorOptions, Factory, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, Geometry, prepare
+from services.estimator.precise.learning import weights
+from services.estimator.shared.generative_models import GenerativeModel, RayCaster
 
-EVERY = 3  # scan of the drive that refines is in its log, as of a scanner with 5 Hz
 TEST_SECONDS = 40.0  # length of the other drive
+WALLS_EVERY = 10  # scan of the drive that refines shows walls to compare
+GRID, PLAN, NOTHING = "grid", "floor plan", "nothing"  # a noisy grid of 5 cm cells, or the walls without furniture
 ROUGH_SEED, DRIVE_SEED, TEST_SEED = 5, 6, 7
+IN_MAP = np.zeros(3)  # the frame of a map that is the true world's
 QUIET = Console(quiet=True)
 
 
 @dataclass(frozen=True)
 class RefinementJob:
-    """One rough map and one drive that refines it."""
+    """One world, and one drive that makes or refines its maps."""
 
     world: str  # office, or the seed of a generated building
-    rough: Literal["grid", "floor plan"]  # a noisy grid of 5 cm cells, or the walls without furniture
     seed: int
     seconds: float  # length of the drive
     out: str  # folder of the maps, logs and models
@@ -54,104 +60,197 @@ def bench_refinement(
     """
     check_file(json_file, "--json")
     make_folder(out, "--out")
-    numbers = range(seed, seed + worlds)
-    jobs = [
-        RefinementJob("office", "grid", seed, seconds, str(out)),
-        *(RefinementJob(str(number), "grid", number, seconds, str(out)) for number in numbers),
-        *(RefinementJob(str(number), "floor plan", number, seconds, str(out)) for number in numbers),
-    ]
+    names = ["office", *map(str, range(seed, seed + worlds))]
+    jobs = [RefinementJob(name, seed, seconds, str(out)) for name in names]
     results = run_trials("refinement", refine_and_test, jobs, out, workers, console)
     rows = [row for result in results for row in result["rows"]]
-    _print(rows, console)
+    print(table(rows))
     write_json(json_file, {"rows": rows, "seconds": seconds, **provenance(seed)})
     return 0
 
 
 def refine_and_test(job: RefinementJob) -> dict[str, Any]:
-    """Errors of another drive in the rough map, in what `presage map --refine` makes of it, and with true poses."""
-    world, plan = _world_and_plan(job)
-    seed, out = job.seed, Path(job.out) / f"{job.world}-{job.rough}".replace(" ", "-")
+    """Errors of another drive and of the walls: in each rough map, in what a drive makes of it, and with true poses."""
+    building = office_building() if job.world == "office" else make_building(int(job.world))
+    world, roughs = _world_and_rough_maps(job)
+    out = Path(job.out) / job.world
     shutil.rmtree(out, ignore_errors=True)  # of an interrupted run
     out.mkdir()
-    rough = plan if job.rough == "floor plan" else noisy_grid(Scene.of(world, BEAMS, [seed, ROUGH_SEED]))
-    rough_file, log = _write(out, rough), out / f"{rough.name}.npz"
-    drive, test = (Scene.of(world, BEAMS, [seed, number]) for number in (DRIVE_SEED, TEST_SEED))
-    scanner = drive.scanner
-    poses, mount = drive.path(job.seconds)[::EVERY], np.array(scanner.mount)
-    ranges = np.array([drive.observe(clean, 0.0).ranges for clean in drive.clean(poses)])
-    stamps = np.arange(len(poses)) * EVERY / scanner.rate
-    angles, range_max = scanner.angles(), np.array(scanner.range_max)
-    np.savez(log, ranges=ranges, angles=angles, range_max=range_max, stamps=stamps, reference=poses)
-    reading, refined, true = Reading(mount=mount), out / f"{rough.name}-refined.yaml", out / "true-poses"
-    begin = time.perf_counter()
-    map_command(MapOptions(log, refined, reading=reading, refine=str(rough_file), models=out), QUIET, QUIET)
-    taken = time.perf_counter() - begin
-    train_from_drive(TrainDriveOptions(log, str(rough_file), true, reading=reading), QUIET)
-    factories = {
-        "rough map": EstimatorOptions(str(rough_file), model="exact"),
-        "refined": EstimatorOptions(str(refined), models=out),
-        "learned at true poses": EstimatorOptions(str(rough_file), models=true),
-    }
-    path = test.path(TEST_SECONDS)
-    clean = test.clean(path)
-    errors = np.hypot(*(_read_tum(refined.with_suffix(".tum")) - poses[:, :2]).T)
-    start = path[0] + START_DEVIATION * test.rng.standard_normal(3)
+    drive, test = (Scene.of(world, BEAMS, [job.seed, number]) for number in (DRIVE_SEED, TEST_SEED))
+    poses, log = drive_for(drive, building, job.seconds), out / "drive.npz"
+    reading = Reading(mount=np.array(drive.scanner.mount))
+    _log_drive(drive, poses, log)
+    path = drive_for(test, building, TEST_SECONDS)
+    check = Check(drive, poses[::WALLS_EVERY], test, path, test.clean(path))
+    true = TrainDriveOptions(log, str(_write(out, world)), out / "true-poses", reading=reading)
+    at_true_poses = check.learned(train_from_drive(true, QUIET), world, IN_MAP)
     rows = []
-    for name, options in factories.items():
-        found, tracking = _localise(prepare(options), test, clean, start)
-        error = np.hypot(*(found - path)[:, :2].T)
+    for start, rough in roughs.items():
+        file = "" if rough is None else str(_write(out, rough))
+        made = out / f"{start.replace(' ', '-')}-driven.yaml"
+        begin = time.perf_counter()
+        map_command(MapOptions(log, made, reading=reading, refine=file, models=out), QUIET, QUIET)
+        taken = time.perf_counter() - begin
+        placed, truths = _trajectory(made.with_suffix(".tum"), poses)
+        frame = alignment(placed, truths)
+        aligned = np.hypot(*(se2.compose(frame, placed) - truths)[:, :2].T)
         row = {
             "world": world.name,
-            "rough": job.rough,
-            "model": name,
-            "position_median_m": float(np.median(error)),
-            "position_rms_m": float(np.sqrt((error**2).mean())),
-            "position_max_m": float(error.max()),
-            "tracking": float(tracking.mean()),
+            "start": start,
+            "seconds": taken,
+            "placed": len(placed) / len(poses),
+            "trajectory_rms_m": float(np.sqrt((aligned**2).mean())),
+            "frame_error_m": None if rough is None else float(np.hypot(*(placed - truths)[:, :2].mean(axis=0))),
+            "rough": None if rough is None else check.rough(rough),
+            "after": check.learned(weights.path_of(out, made.stem), load_world(str(made)), frame),
+            "at_true_poses": at_true_poses,
         }
-        if name == "refined":
-            row |= {"trajectory_rms_m": float(np.sqrt((errors**2).mean())), "seconds": taken}
         rows.append(row)
     return {"rows": rows}
 
 
-def _world_and_plan(job: RefinementJob) -> tuple[World, World]:
-    """The world of a job, and its walls without furniture."""
-    if job.world == "office":
-        world = load_world("office")
-        return world, world
-    building = make_building(int(job.world))
-    plan = World(name=f"{building.name}-plan", boundary=list(building.boundary), obstacles=list(building.walls))
-    return building.world, plan
+@dataclass(frozen=True)
+class Check:
+    """Compares a model with the true world: its walls along one drive, and poses found in it on another one."""
+
+    drive: Scene
+    poses: Array  # (N, 3) base_link in the true world, on the drive from which maps are made
+    test: Scene
+    path: Array  # (M, 3) the same, on the other drive
+    clean: Array  # (M, B) m, the ranges there without noise
+
+    def rough(self, world: World) -> dict[str, float]:
+        """Errors in a map without learning, whose frame is that of the true world."""
+        return self._errors(RayCaster(world), EstimatorOptions(world, model="exact"), IN_MAP)
+
+    def learned(self, file: Path, world: World, frame: Array) -> dict[str, float]:
+        """Errors with the weights ``file`` of a map, whose ``frame`` (3,) is given in the true world."""
+        return self._errors(weights.load(file)[0], EstimatorOptions(world, model=str(file)), frame)
+
+    def _errors(self, model: GenerativeModel, options: EstimatorOptions, frame: Array) -> dict[str, float]:
+        found, tracking = self._localise(options, frame)
+        errors, in_frame = (np.hypot(*(poses - self.path)[:, :2].T) for poses in (se2.compose(frame, found), found))
+        walls = wall_errors(model, se2.compose(se2.inverse(frame), self.poses), self.drive, frame)
+        return {
+            "position_median_m": float(np.median(errors)),
+            "position_rms_m": float(np.sqrt((errors**2).mean())),
+            "position_max_m": float(errors.max()),
+            "position_in_frame_median_m": float(np.median(in_frame)),  # the map's frame taken for that of the world
+            "position_in_frame_rms_m": float(np.sqrt((in_frame**2).mean())),
+            "tracking": float(tracking.mean()),
+            "walls_median_m": float(np.median(walls)),
+            "walls_rms_m": float(np.sqrt((walls**2).mean())),
+        }
+
+    def _localise(self, options: EstimatorOptions, frame: Array) -> tuple[Array, Array]:
+        """Poses (M, 3) of the other drive's scans in the map, and whether they are reported as `tracking`."""
+        rng = np.random.default_rng(0)  # all models get the same scans
+        scene = Scene(self.test.world, self.test.scanner, rng)
+        estimator = prepare(options)(Geometry.of(scene.scanner))
+        start = self.path[0] + START_DEVIATION * rng.standard_normal(3)
+        estimator.restart(se2.compose(se2.inverse(frame), start), np.diag(START_DEVIATION**2))
+        scans = (scene.observe(ranges, k * PERIOD_S) for k, ranges in enumerate(self.clean))
+        found = [estimator.update(scan) for scan in scans]
+        return np.array([each.pose for each in found]), np.array([each.state == "tracking" for each in found])
 
 
-def _write(folder: Path, rough: World) -> Path:
+def wall_errors(model: GenerativeModel, poses: Array, scene: Scene, frame: Array) -> Array:
+    """Distances in m from the surfaces that a model predicts along the beams of a drive to those of the true world.
+
+    ``poses`` (N, 3) are those of base_link in the model's map, whose ``frame`` (3,) is given in the true world.
+    """
+    lasers, angles = se2.compose(poses, np.array(scene.scanner.mount)), scene.scanner.angles()
+    expected = model.expect(lasers, angles)
+    known = np.isfinite(expected.scale) & (expected.ranges < scene.scanner.range_max)
+    row, beam = np.nonzero(known)
+    directions = lasers[row, 2] + angles[beam]
+    unit = np.stack([np.cos(directions), np.sin(directions)], axis=-1)
+    ends = lasers[row, :2] + expected.ranges[known][:, None] * unit
+    return np.abs(scene.world.surface_distance(se2.transform(frame, ends)))
+
+
+def _world_and_rough_maps(job: RefinementJob) -> tuple[World, dict[str, World | None]]:
+    """The world of a job, and the maps with which its drive begins."""
+    building = None if job.world == "office" else make_building(int(job.world))
+    world = load_world("office") if building is None else building.world
+    roughs: dict[str, World | None] = {GRID: noisy_grid(Scene.of(world, BEAMS, [job.seed, ROUGH_SEED]))}
+    if building is not None:
+        boundary, walls = list(building.boundary), list(building.walls)
+        roughs[PLAN] = World(name=f"{building.name}-plan", boundary=boundary, obstacles=walls)
+    return world, {**roughs, NOTHING: None}
+
+
+def drive_for(scene: Scene, building: Building, seconds: float) -> Array:
+    """Poses (N, 3), `PERIOD_S` apart, of a drive through all rooms, once or several times, until the time is up."""
+    count = round(seconds / PERIOD_S)
+    path = drive_through_rooms(scene, building, 1.0)
+    laps = [path, path[::-1]]  # forth and back
+    return np.concatenate([laps[k % 2] for k in range(1 + count // len(path))])[:count]
+
+
+def _log_drive(scene: Scene, poses: Array, log: Path) -> None:
+    """Writes the scans of a drive with noise, and its true poses (N, 3)."""
+    np.savez(
+        log,
+        ranges=np.array([scene.observe(clean, 0.0).ranges for clean in scene.clean(poses)]),
+        angles=scene.scanner.angles(),
+        range_max=np.array(scene.scanner.range_max),
+        stamps=np.arange(len(poses)) * PERIOD_S,
+        reference=poses,
+    )
+
+
+def _write(folder: Path, world: World) -> Path:
     """Writes a map of the benchmark to a file."""
-    if rough.grid is not None:
-        return write_grid(folder, rough.name, rough.grid)
-    path = folder / f"{rough.name}.yaml"
-    path.write_text(yaml.safe_dump(rough.model_dump(mode="json", exclude_defaults=True)), encoding="utf-8")
+    if world.grid is not None:
+        return write_grid(folder, world.name, world.grid)
+    path = folder / f"{world.name}.yaml"
+    path.write_text(yaml.safe_dump(world.model_dump(mode="json", exclude_defaults=True)), encoding="utf-8")
     return path
 
 
-def _read_tum(path: Path) -> Array:
-    """Positions (N, 2) m of a trajectory in TUM format."""
-    return np.asarray(np.loadtxt(path)[:, 1:3])
+def _trajectory(tum: Path, poses: Array) -> tuple[Array, Array]:
+    """Poses (K, 3) of a trajectory in TUM format, and the true ones of the same scans, of those in ``poses`` (N, 3)."""
+    rows = np.loadtxt(tum)
+    placed = np.column_stack([rows[:, 1:3], 2 * np.arctan2(rows[:, 6], rows[:, 7])])
+    return placed, poses[np.round(rows[:, 0] / PERIOD_S).astype(int)]
 
 
-def _localise(factory: Factory, scene: Scene, clean: Array, start: Array) -> tuple[Array, Array]:
-    """Poses (N, 3) of a drive's scans, and whether they are reported as `tracking`."""
-    estimator = factory(Geometry.of(scene.scanner))
-    estimator.restart(start, np.diag(START_DEVIATION**2))
-    found = [estimator.update(scene.observe(ranges, k / scene.scanner.rate)) for k, ranges in enumerate(clean)]
-    return np.array([each.pose for each in found]), np.array([each.state == "tracking" for each in found])
+def table(rows: list[dict[str, Any]]) -> str:
+    """The Markdown table of docs/mapping.md, in mm: medians, and RMS after a semicolon."""
 
+    def pair(errors: dict[str, float] | None, quantity: str) -> str:
+        if errors is None:
+            return "–"
+        return "; ".join(millimetres(errors[f"{quantity}_{kind}_m"]) for kind in ("median", "rms"))
 
-def _print(rows: list[dict[str, Any]], console: Console) -> None:
-    table = Table(title="Localising another drive, position error in mm")
-    for title in ("world", "rough map", "model", "median", "RMS", "maximum", "tracking"):
-        table.add_column(title)
-    for row in rows:
-        numbers = [f"{row[name] * 1e3:.1f}" for name in ("position_median_m", "position_rms_m", "position_max_m")]
-        table.add_row(row["world"], row["rough"], row["model"], *numbers, f"{row['tracking']:.1%}")
-    console.print(table)
+    heads = (
+        "world",
+        "start",
+        "rough map",
+        "after the drive",
+        "frame aligned",
+        "at true poses",
+        "ratio",
+        "rough walls",
+        "walls",
+        "trajectory RMS",
+        "`tracking`",
+    )
+    cells = [
+        [
+            row["world"],
+            row["start"],
+            pair(row["rough"], "position"),
+            "–" if row["rough"] is None else pair(row["after"], "position_in_frame"),
+            pair(row["after"], "position"),
+            pair(row["at_true_poses"], "position"),
+            number(row["after"]["position_median_m"] / row["at_true_poses"]["position_median_m"], 2),
+            pair(row["rough"], "walls"),
+            pair(row["after"], "walls"),
+            millimetres(row["trajectory_rms_m"]),
+            f"{row['after']['tracking']:.1%}",
+        ]
+        for row in rows
+    ]
+    return markdown(heads, cells)

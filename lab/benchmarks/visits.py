@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from rich.console import Console
-from rich.table import Table
 
 from common.geometry import se2
 from common.geometry.se2 import Array
@@ -27,6 +26,7 @@ from lab.accuracy.furniture import Piece
 from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import ROBOT, Scene
 from lab.accuracy.tasks import is_at
+from lab.experiments.results import markdown, millimetres
 from lab.experiments.trials import run_trials
 from lab.integrity.buildings import Building, Room, make_building, random_place
 from lab.integrity.cases import BEAMS
@@ -84,7 +84,7 @@ def bench_visits(
     jobs = [VisitsJob(name, visits, scans, seed, str(out)) for name in names]
     results = run_trials("visits", run_visits, jobs, out, workers, console)
     rows = [row for result in results for row in result["rows"]]
-    _print(rows, console)
+    print(table(rows))
     write_json(json_file, {"rows": rows, "scans": scans, **provenance(seed)})
     return 0
 
@@ -262,46 +262,22 @@ def office_building() -> Building:
     return Building("office", tuple(world.boundary), tuple(walls), rooms, tuple(furniture))
 
 
-def summary(
-    rows: list[dict[str, Any]], visit: int | None, *, unchanged: bool = False
-) -> dict[str, tuple[float, float]]:
-    """Share of single scans found, and their median error in m, with each model at one visit or at all.
-
-    With ``unchanged``, only those in rooms that do not change.
-    """
-    result = {}
-    tested = [row for row in rows if PRESENT in row and visit in (None, row["visit"])]
-    for name in MODELS:
-        errors = [
-            error
-            for row in tested
-            for error, changed in zip(row[name], row["in_changed_room"], strict=True)
-            if not (unchanged and changed)
-        ]
-        found = [error for error in errors if error is not None]
-        result[name] = (len(found) / max(1, len(errors)), float(np.median(found)) if found else np.nan)
-    return result
+def table(rows: list[dict[str, Any]]) -> str:
+    """The Markdown table of docs/mapping.md: single scans found of all, and the median error of these in mm."""
+    tested = [row for row in rows if PRESENT in row]
+    cells = []
+    for title, visits in (("second", [row for row in tested if row["visit"] == 2]), ("all", tested)):
+        for rooms, changed in (("all", None), ("changing", True), ("unchanging", False)):
+            cells.append([title, rooms, *(_found(_errors(visits, name, changed)) for name in MODELS)])
+    return markdown(("visits", "rooms", *MODELS), cells)
 
 
-def _print(rows: list[dict[str, Any]], console: Console) -> None:
-    table = Table(title="Single scans found and their median error in mm; the same in unchanged rooms")
-    for title in ("visit", *MODELS, "update (s)", "trajectory RMS (mm)", "model (kB)"):
-        table.add_column(title)
-    visits = sorted({row["visit"] for row in rows if PRESENT in row})
-    for visit in [*visits, None]:
-        in_all_rooms, in_unchanged_rooms = summary(rows, visit), summary(rows, visit, unchanged=True)
-        updates = [row for row in rows if visit in (None, row["visit"])]
-        table.add_row(
-            "all" if visit is None else str(visit),
-            *(f"{_found(in_all_rooms[name])}; {_found(in_unchanged_rooms[name])}" for name in MODELS),
-            f"{max(row['update_s'] for row in updates):.0f}",
-            f"{max(row['trajectory_rms_m'] for row in updates) * 1e3:.1f}",
-            f"{max(row['model_bytes'] for row in updates) / 1e3:.0f}",
-        )
-    console.print(table)
+def _errors(rows: list[dict[str, Any]], model: str, changed: bool | None) -> list[float | None]:
+    """Errors in m of the single scans in rooms that change or do not change, or in all if ``changed`` is None."""
+    pairs = [pair for row in rows for pair in zip(row[model], row["in_changed_room"], strict=True)]
+    return [error for error, in_changed_room in pairs if changed in (None, in_changed_room)]
 
 
-def _found(share_and_error: tuple[float, float]) -> str:
-    """Share found, and median error in mm, as text."""
-    share, error = share_and_error
-    return f"{share:.0%}; {error * 1e3:.1f}"
+def _found(errors: list[float | None]) -> str:
+    found = [error for error in errors if error is not None]
+    return f"{len(found)}/{len(errors)}; {millimetres(float(np.median(found)) if found else None)}"

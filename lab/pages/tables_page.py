@@ -29,6 +29,8 @@ MODULES = {
     "real": "lab.real_logs.experiment",
     "integrity": "lab.integrity.report",
     "peers": "lab.peers.experiment",
+    "refinement": "lab.benchmarks.refinement",
+    "visits": "lab.benchmarks.visits",
 }
 TABLE_MARKS = re.compile(r"(<!-- table (?P<name>[\w/.-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -40,7 +42,7 @@ def table_of(name: str, folder: Path) -> str:
         raise UserError(f"no experiment {kind!r}: choose from {', '.join(MODULES)}")
     table: Callable[[Any], str] = import_module(MODULES[kind]).table
     result = results.read(folder / f"{name}.json")
-    if kind == "accuracy":
+    if "rows" in result:  # of a benchmark
         return table(result["rows"])
     return "\n\n".join([table(result["summary"]), *(f"{note[0].upper()}{note[1:]}" for note in result["notes"])])
 

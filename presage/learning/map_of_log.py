@@ -18,7 +18,8 @@ from common.geometry.tum import write_tum
 from common.geometry.world import World, load_world
 from presage.learning.map_picture import draw_map
 from presage.learning.placement import place
-from presage.learning.train_drive import TrainDriveOptions, drive_of, split, train_on_drive
+from presage.learning.pose_refinement import refine_poses
+from presage.learning.train_drive import TrainDriveOptions, drive_of, enough_scans, split, train_on_drive, usable_scans
 from presage.logs.log import Reading
 from presage.logs.scan_files import Scans, read_scans
 from presage.terminal.output import make_folder
@@ -29,7 +30,6 @@ from services.mapper.slam.grid import grid_of_scans
 from services.mapper.slam.trajectory import build_trajectory, distribute_corrections
 
 MIN_SCANS = 2
-SIMULATED_SCANS = 2000  # in the rough map, for the model where the drive saw nothing
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,8 @@ def map_command(options: MapOptions, console: Console, progress: Console) -> Pat
         soft_wrap=True,
     )
     if options.models is not None:
-        samples = SIMULATED_SCANS if options.refine else 0
+        # In the rough map, for the model where the drive saw nothing
+        samples = 0 if rough is None else enough_scans(rough)
         training = TrainDriveOptions(options.log, str(path), options.models, samples, former=former)
         train_on_drive(training, drive, console)
     return path
@@ -153,15 +154,21 @@ def _build_poses(
             "elsewhere in the map; the robot was carried off, or its view was blocked",
             soft_wrap=True,
         )
-    if rough is None:
-        return built.poses
     posed = drive_of(replace(scans, truth=built.poses), options.log)
-    keys = np.array([key for key in built.keys if stamps[key] in posed.stamps])
+    used = usable_scans(stamps, built.poses)
+    with Progress(*Progress.get_default_columns(), console=progress, transient=True) as bar:
+        task = bar.add_task("refining the poses", total=1.0)
+        poses: Array = built.poses.copy()
+        poses[used] = refine_poses(posed, lambda done: bar.update(task, completed=done))
+    if rough is None:
+        return poses
+    posed = replace(posed, poses=poses[used])
+    keys = np.intersect1d(built.keys, used)
     with working(f"finding the drive in {rough.name}", progress):
-        placement = place(rough, posed.part(np.flatnonzero(np.isin(posed.stamps, stamps[keys]))), former)
+        placement = place(rough, posed.part(np.searchsorted(used, keys)), former)
     console.print(
         f"{placement.found:.0%} of the key scans found in {rough.name}, with a median deviation of "
         f"{placement.deviation * 1e3:.0f} mm",
         soft_wrap=True,
     )
-    return distribute_corrections(built.poses, keys, placement.poses, np.zeros(len(keys), int))
+    return distribute_corrections(poses, keys, placement.poses, np.zeros(len(keys), int))

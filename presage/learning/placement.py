@@ -1,33 +1,40 @@
 """Places a drive in the frame of an existing map, in which an estimator finds its key scans.
 
 In a rough map each of these poses is wrong by some centimetres, because each wall is; of the whole drive, with all the
-walls that it saw, the median is wrong by a few millimetres.
+walls that it saw, the median is wrong by about a centimetre. In a grid, the surfaces then settle in the occupied cells.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.special import ndtr
 
 from common.errors import UserError
 from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.world import World
-from presage.learning.train_drive import simulated_beams
+from presage.learning.train_drive import enough_scans, simulated_beams
 from services.estimator.factory import EstimatorOptions, Geometry, prepare
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.precise.learning.field_learning import Recipe, learn_field
+from services.estimator.precise.learning.surfaces import Beams, SurfaceCells
 from services.estimator.shared.interface import Observation
 from services.mapper.slam.pose_graph import PoseLink, optimise
 
-SIMULATED_SCANS = 2000  # in the map
+MAX_KEYS = 60  # found in a rough map; for a rigid placement, more would not help
 SAME_M = 0.3  # poses found in the map that differ by less agree
 MIN_FOUND = 0.5  # share of the key scans that must agree
 # Standard deviations, m, m, rad: of the drive between two key scans, and of the poses found, because of model errors.
 DRIFT, MODEL = np.array([0.003, 0.003, 0.001]), np.array([0.002, 0.002, 0.001])
+# For surfaces in the cells of a grid
+EDGE_M = 0.005  # standard deviation of a surface's distance from the edge of its cell
+MISSING_SHARE = 0.1  # of the surfaces that the grid does not have
+CELL_M, MAX_ELEMENTS = 0.05, 3000  # the elements that stand for the surfaces
+FIRST_STEP_M, LAST_STEP_M = 0.008, 0.0005  # of the search
 
 
 @dataclass(frozen=True)
@@ -45,9 +52,12 @@ def place(world: World, keys: ReferenceDrive, model: Path | None = None) -> Plac
     The drive is moved as a whole. If the map has a ``model``, it is exact to some millimetres, and the drive is bent to
     it as well. Raises UserError if too few key scans are found in the map at places that agree.
     """
-    found, covariances = _localise(world, keys, model)
+    searched = np.arange(len(keys.poses))
+    if model is None:
+        searched = np.unique(np.linspace(0, len(keys.poses) - 1, MAX_KEYS).round().astype(int))
+    found, covariances = _localise(world, keys.part(searched), model)
     middle = np.array([*keys.poses[:, :2].mean(axis=0), 0.0])  # turned about it, a drive hardly moves
-    local = se2.between(middle, keys.poses)
+    local = se2.between(middle, keys.poses[searched])
     origins = se2.compose(found, se2.inverse(local))  # the middle in map, according to each key scan
     agreeing = [_distance(se2.compose(origin, local), found) < SAME_M for origin in origins]
     best = int(np.argmax([np.count_nonzero(each) for each in agreeing]))
@@ -57,10 +67,41 @@ def place(world: World, keys: ReferenceDrive, model: Path | None = None) -> Plac
             f"only {share:.0%} of the drive were found in the map {world.name}: is it a map of the same place?"
         )
     off = se2.between(origins[best], origins[agreeing[best]])
-    placed = se2.compose(se2.compose(origins[best], np.median(off, axis=0)), local)
+    origin = se2.compose(origins[best], np.median(off, axis=0))
+    placed = se2.compose(origin, se2.between(middle, keys.poses))
     if model is not None:
         placed = _bent(placed, found, covariances)
-    return Placement(placed, share, float(np.median(_distance(placed, found))))
+    elif world.grid is not None:
+        placed = moved_into_cells(world, replace(keys, poses=placed))
+    return Placement(placed, share, float(np.median(_distance(placed[searched], found))))
+
+
+def moved_into_cells(world: World, keys: ReferenceDrive) -> Array:
+    """Poses (N, 3) of key scans, moved as a whole so that the surfaces they saw lie in occupied cells of a grid.
+
+    A grid says that a surface is somewhere in a cell, equally likely everywhere; the estimator expects it at the edge.
+    """
+    cells = SurfaceCells.of(Beams.of(keys.poses, keys.mount, keys.angles, keys.ranges), CELL_M)
+    elements = np.stack([cells.mx[cells.is_surface], cells.my[cells.is_surface]], axis=-1) + cells.low
+    elements = elements[:: 1 + len(elements) // MAX_ELEMENTS]
+    middle = np.array([*elements.mean(axis=0), 0.0])
+    radius = float(np.hypot(*(elements - middle[:2]).T).mean())
+
+    def cost(move: Array) -> float:
+        inside = ndtr(-world.surface_distance(se2.transform(middle + move, elements - middle[:2])) / EDGE_M)
+        return -float(np.log(MISSING_SHARE + (1 - MISSING_SHARE) * inside).sum())
+
+    # Compass search (Kolda, Lewis & Torczon 2003)
+    move, lowest, step = np.zeros(3), cost(np.zeros(3)), FIRST_STEP_M
+    directions = np.concatenate([np.eye(3), -np.eye(3)]) / [1.0, 1.0, radius]
+    while step >= LAST_STEP_M:
+        costs = [cost(move + step * direction) for direction in directions]
+        best = int(np.argmin(costs))
+        if costs[best] < lowest:
+            move, lowest = move + step * directions[best], costs[best]
+        else:
+            step /= 2
+    return se2.compose(middle + move, se2.between(middle, keys.poses))
 
 
 def _bent(placed: Array, found: Array, covariances: Array) -> Array:
@@ -78,7 +119,7 @@ def _localise(world: World, keys: ReferenceDrive, model: Path | None) -> tuple[A
     if model is not None:
         options = EstimatorOptions(world, model=str(model))
     else:  # In a learned field, oblique walls are no staircases, which would bias the headings.
-        beams = simulated_beams(world, keys, SIMULATED_SCANS, seed=0)
+        beams = simulated_beams(world, keys, enough_scans(world), seed=0)
         options = EstimatorOptions(world, generative_model=FieldModel(learn_field(beams, Recipe(0.05))))
     estimator = prepare(options)(Geometry(keys.angles, keys.mount, keys.range_max))
     observations = [

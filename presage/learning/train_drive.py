@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -33,6 +34,7 @@ from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.generative_models import RayCaster
 from services.estimator.shared.model_folder import training_folder
 
+MIN_SCANS_OF_MAP, SCANS_PER_M2 = 500, 4  # simulated for a field; each of a map's cells is met by about 100 beams
 MARGIN_M = 1.0  # around the ends of the beams; the world of a drive without a map is a rectangle
 
 
@@ -102,8 +104,7 @@ def drive_of(scans: Scans, log: Path) -> ReferenceDrive:
         )
     if scans.stamps is None:
         raise UserError(f"{log}: no stamps, but they are needed to compute the velocity of the robot")
-    latest = np.maximum.accumulate(scans.stamps)  # stamps begin again where a simulation was restarted
-    use = np.flatnonzero(np.isfinite(scans.truth).all(axis=1) & (scans.stamps == latest))
+    use = usable_scans(scans.stamps, scans.truth)
     if not is_surface(scans.ranges[use]).any():
         raise UserError(f"{log}: no beam of the scans with a reference pose hit a surface")
     odom = None if scans.odom is None or not np.isfinite(scans.odom[use]).all() else scans.odom
@@ -118,6 +119,12 @@ def drive_of(scans: Scans, log: Path) -> ReferenceDrive:
     )
     drive = whole.part(use)
     return replace(drive, ranges=_corrected_ranges(drive, scans.time_increment)) if scans.time_increment else drive
+
+
+def usable_scans(stamps: Array, poses: Array) -> npt.NDArray[np.intp]:
+    """Numbers (K,) of the scans of a drive that have a pose, of those in order of time."""
+    latest = np.maximum.accumulate(stamps)  # stamps begin again where a simulation was restarted
+    return np.flatnonzero(np.isfinite(poses).all(axis=1) & (stamps == latest))
 
 
 def _corrected_ranges(drive: ReferenceDrive, time_increment: float) -> Array:
@@ -151,6 +158,11 @@ def rectangle(drive: ReferenceDrive, log: Path) -> World:
     corners = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
     name = re.sub(r"[^\w.-]", "-", log.stem) or "drive"
     return World(name=name, boundary=[(round(float(x), 3), round(float(y), 3)) for x, y in corners])
+
+
+def enough_scans(world: World) -> int:
+    """Number of simulated scans without noise from which the field of a map is learned, by its free area."""
+    return max(MIN_SCANS_OF_MAP, round(SCANS_PER_M2 * world.free_area))
 
 
 def simulated_beams(world: World, drive: ReferenceDrive, samples: int, seed: int) -> Beams:

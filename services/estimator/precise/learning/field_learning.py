@@ -136,17 +136,17 @@ def _descend(field: DistanceField, beams: Beams, sample: npt.NDArray[np.intp], r
 def _add_errors(field: DistanceField, beams: Beams, ended: Array, passed: Array, up: Array, norm: Array) -> None:
     """Adds to each node (ny * nx,) the beams that ended and passed there, their weighted errors and their weights."""
     traced = field.trace(np.column_stack([beams.starts, beams.directions]), np.zeros(1))
-    ranges, facing = traced.ranges[:, 0], traced.facing[:, 0]
+    ranges, facing, unit = traced.ranges[:, 0], traced.facing[:, 0], beams.unit()
     error = beams.ranges - ranges
     good = np.isfinite(ranges) & (np.abs(error) < MAX_ERROR_M) & (facing > MIN_FACING)
     behind = np.where(np.isfinite(ranges), error, 0.0) * facing  # m, perpendicular to the surface
     ny, nx = field.phi.shape
     for counts, which in ((ended, good), (passed, np.isfinite(ranges) & (behind > PASSED_DEPTH_M))):
-        where = (beams.starts[which] + ranges[which, None] * beams.unit()[which] - field.origin) / field.resolution
+        where = (beams.starts[which] + ranges[which, None] * unit[which] - field.origin) / field.resolution
         node = np.clip(np.round(where).astype(int), 0, [nx - 1, ny - 1])
         np.add(counts, np.bincount(node[:, 1] * nx + node[:, 0], minlength=ny * nx), out=counts)
     facing = facing[good]
-    where = (beams.starts[good] + ranges[good, None] * beams.unit()[good] - field.origin) / field.resolution
+    where = (beams.starts[good] + ranges[good, None] * unit[good] - field.origin) / field.resolution
     node = np.minimum(np.maximum(where.astype(int), 0), [nx - 2, ny - 2])
     u, v = (where - node).T
     for di, dj, w in ((0, 0, (1 - u) * (1 - v)), (0, 1, u * (1 - v)), (1, 0, (1 - u) * v), (1, 1, u * v)):

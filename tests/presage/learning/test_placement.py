@@ -1,0 +1,25 @@
+"""Placing a drive in a rough map."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from common.geometry.world import load_world
+from lab.accuracy.scenes import Scene
+from lab.integrity.maps import noisy_grid
+from presage.learning.placement import moved_into_cells
+from services.estimator.precise.learning.calibration import ReferenceDrive
+
+
+def test_surfaces_settle_in_the_cells_of_a_grid():
+    scene = Scene.of(load_world("office"), 311, 5)
+    rough = noisy_grid(scene)
+    poses, scanner = scene.poses(60), scene.scanner
+    ranges = np.array([scene.observe(clean, 0.0).ranges for clean in scene.clean(poses)])
+    off = np.array([0.02, -0.015, 0.0])
+    keys = ReferenceDrive(
+        np.arange(60.0), poses + off, ranges, scanner.angles(), np.array(scanner.mount), scanner.range_max
+    )
+    moved = moved_into_cells(rough, keys)
+    assert np.hypot(*(moved - poses)[:, :2].mean(axis=0)) == pytest.approx(0, abs=0.006)
