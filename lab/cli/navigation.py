@@ -27,6 +27,8 @@ def navigate(
     ] = "known",
     people: Annotated[int, typer.Option(min=0, max=100, help="Number of walking people; the map lacks them.")] = 0,
     estimator: Annotated[str, typer.Option(help="precise or particle-filter.")] = "precise",
+    prior: Annotated[str, typer.Option(help="motion or odometry: source of the motion between scans.")] = "motion",
+    slip: Annotated[float, typer.Option(min=0, max=0.5, help="Mean share of its motion that a wheel loses.")] = 0.0,
     epistemic: Annotated[bool, typer.Option(help="Policies are also judged by the information that they gain.")] = True,
     sweep: Annotated[bool, typer.Option("--sweep", help="Scans are distorted by the robot's motion.")] = False,
     beams: Annotated[int, typer.Option(min=2, max=MAX_BEAMS, help="Number of beams.")] = 622,
@@ -43,7 +45,7 @@ def navigate(
     Examples: `presage experiment navigation --trials 2`;
     `presage experiment navigation --worlds office --people 10`;
     `presage experiment navigation --worlds twins --start unknown --trials 50 --no-epistemic`;
-    `presage experiment navigation --worlds hall --max-range 4 --beams 271 --limit 60 --trials 50`;
+    `presage experiment navigation --worlds hall --max-range 4 --prior odometry --slip 0.05`;
     `presage experiment --seed 7 --out mine navigation --worlds my.yaml --drives differential`.
     """
     from lab.navigation import experiment as driving
@@ -55,6 +57,8 @@ def navigate(
         start=start,
         people=people,
         estimator=estimator,
+        prior=prior,
+        slip=slip,
         epistemic=epistemic,
         sweep=sweep,
         beams=beams,

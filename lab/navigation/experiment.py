@@ -72,6 +72,7 @@ class NavigationJob:
     prior: str = "motion"
     epistemic: bool = True
     sweep: bool = False  # whether motion distorts the scans
+    slip: float = 0.0  # mean share of its motion that a wheel loses
     beams: int = 622
     range_max: float = SCANNERS["tim571"].range_max  # m
     limit: float = 120.0  # s of simulated time
@@ -106,6 +107,7 @@ class NavigationJob:
             self.robot,
             trip.start,
             seed,
+            slip=self.slip,
             sweep=self.sweep,
             people=self.people,
             people_speed=self.people_speed,
@@ -148,6 +150,7 @@ def result_name(job: NavigationJob, worlds: Sequence[str], drives: Sequence[str]
         *([job.prior] if job.prior != NavigationJob.prior else []),
         *([] if job.epistemic else ["no-epistemic"]),
         *(["sweep"] if job.sweep else []),
+        *([f"slip{job.slip:g}"] if job.slip else []),
         *([f"beams{job.beams}"] if job.beams != NavigationJob.beams else []),
         *([f"range{job.range_max:g}"] if job.range_max != NavigationJob.range_max else []),
     ]

@@ -30,6 +30,7 @@ def describe(job: NavigationJob) -> str:
     parts += [f"prior {job.prior}"] if job.prior != "motion" else []
     parts += [] if job.epistemic else ["without the epistemic term"]
     parts += ["scans distorted by motion"] if job.sweep else []
+    parts += [f"{100 * job.slip:g} % wheel slip"] if job.slip else []
     parts += [f"range {job.range_max:g} m"] if job.range_max != type(job).range_max else []
     return ", ".join(parts)
 
