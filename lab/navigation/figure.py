@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from lab.navigation.experiment import NavigationJob
 
 Rows = Sequence[dict[str, Any]]
+TITLE_WIDTH = 70  # characters above each column
 LINES = ("-", "--", ":", "-.")
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 
@@ -49,7 +51,7 @@ def draw(by_group: Mapping[str, Rows], worlds: Mapping[str, str], title: str) ->
         for row in range(rows_of_maps)
     ]
     figure = drawing.empty_figure(6.6 * columns, 6.2 * sum(heights) + 0.5 * rows_of_maps + 3.4)
-    figure.suptitle(title, fontsize=11)
+    figure.suptitle(textwrap.fill(title, TITLE_WIDTH * columns), fontsize=11)
     grid = figure.add_gridspec(rows_of_maps + 1, 2 * columns, height_ratios=[*(6.2 * h + 0.5 for h in heights), 2.6])
     for number, (group, rows) in enumerate(by_group.items()):
         row, column = divmod(number, columns)
