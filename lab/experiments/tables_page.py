@@ -35,7 +35,8 @@ COMPARED = {
         "navigation-hall-holonomic-odometry-slip0.05-beams271-range4",
         "navigation-hall-holonomic-odometry-no-epistemic-slip0.05-beams271-range4",
     ),
-    "twins": ("navigation-twins-holonomic-unknown", "navigation-twins-holonomic-unknown-no-epistemic"),
+    "twins": ("navigation-twins-unknown", "navigation-twins-unknown-no-epistemic"),
+    "look-alike": ("navigation-look-alike-unknown", "navigation-look-alike-unknown-no-epistemic"),
 }
 TABLE_MARKS = re.compile(r"(<!-- table (?P<name>[\w/.-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
+import shapely.affinity
 
 from common.geometry.shapes import Box, Obstacle
 from common.geometry.world import World, load_world
@@ -14,6 +17,8 @@ from lab.integrity.buildings import make_building
 
 TRIPS_PER_WORLD = 5  # before the next generated world
 SEEDS_PER_RUN = 1000  # generated worlds of one run; the next seed of a run has other worlds
+OTHER_BUILDINGS = 100_000_000  # added to a seed for another building
+MIN_DIFFERENCE_M2 = 0.05
 Rectangle = tuple[float, float, float, float]  # x0, y0, x1, y1 in m
 
 
@@ -64,9 +69,20 @@ def _at_wall(side: int, along: float, size: float, depth: float, hall: tuple[flo
     return Obstacle(box=Box(center=center, size=extent))
 
 
+def make_look_alike(seed: int) -> World:
+    """A building with identical rooms, whose corridor differs after a half turn, so that a robot can find its place."""
+    worlds = (make_building(seed + attempt * OTHER_BUILDINGS, "symmetric").world for attempt in itertools.count())
+    return next(world for world in worlds if _differs_when_turned(world))
+
+
+def _differs_when_turned(world: World) -> bool:
+    turned = shapely.affinity.rotate(world.free_space, 180, origin=tuple(world.center()))
+    return bool(shapely.area(shapely.symmetric_difference(world.free_space, turned)) > MIN_DIFFERENCE_M2)
+
+
 GENERATED: dict[str, Callable[[int], World]] = {
     "hall": make_hall,
-    "look-alike": lambda seed: make_building(seed, "symmetric").world,
+    "look-alike": make_look_alike,
 }
 
 
