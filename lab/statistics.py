@@ -34,6 +34,11 @@ def bootstrap_interval(groups: Sequence[Array], statistic: Callable[[Array], flo
     return [float(bound) for bound in np.quantile(found, (0.025, 0.975))]
 
 
+def median(values: Array) -> float:
+    """The median of the values."""
+    return float(np.median(values))
+
+
 def root_mean_square(values: Array) -> float:
     """The root of the mean of the squared values."""
     return float(np.sqrt(np.mean(np.square(values))))

@@ -19,7 +19,7 @@ from common.versions import commit, versions
 from lab.accuracy import tasks
 from lab.accuracy.contenders import CONTENDERS, Place
 from lab.accuracy.scenes import TWINS, Scene
-from lab.statistics import bootstrap_interval, root_mean_square, wilson_interval
+from lab.statistics import bootstrap_interval, median, root_mean_square, wilson_interval
 from lab.workers import pool
 from services.estimator.factory import Geometry
 from services.estimator.precise.field import FieldModel
@@ -137,7 +137,7 @@ def _row(job: AccuracyJob, world: str, task: str, outcome: tasks.TaskOutcome) ->
         "found_share_95": wilson_interval(outcome.found, outcome.total) if outcome.independent else None,
         "tracking_but_wrong_share_95": wilson_interval(outcome.wrong, outcome.total) if outcome.independent else None,
         "position_error_median_m": float(np.median(position)) if count else None,
-        "position_error_median_95_m": bootstrap_interval(groups, lambda values: float(np.median(values))),
+        "position_error_median_95_m": bootstrap_interval(groups, median),
         "position_error_rms_m": rms,
         "position_error_rms_95_m": bootstrap_interval(groups, root_mean_square),
         "position_error_p95_m": float(np.quantile(position, 0.95)) if count else None,

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from common.limits import MAX_BEAMS
 from lab.cli.options import Trials, show, worker_count
 from presage.terminal.options import console
 
@@ -16,15 +17,23 @@ if TYPE_CHECKING:
 def navigate(
     context: typer.Context,
     trials: Trials = 100,
-    worlds: Annotated[str, typer.Option(help="Comma-separated names or files.")] = "maze,office",
+    worlds: Annotated[
+        str,
+        typer.Option(help="Comma-separated names or files; hall and look-alike are generated, one for five trials."),
+    ] = "maze,office",
     drives: Annotated[str, typer.Option(help="Comma-separated: holonomic, differential.")] = "holonomic,differential",
     start: Annotated[
         str, typer.Option(help="known or unknown: whether the estimator is given the start pose.")
     ] = "known",
     people: Annotated[int, typer.Option(min=0, max=100, help="Number of walking people; the map lacks them.")] = 0,
     estimator: Annotated[str, typer.Option(help="precise or particle-filter.")] = "precise",
+    prior: Annotated[str, typer.Option(help="motion or odometry: source of the motion between scans.")] = "motion",
+    slip: Annotated[float, typer.Option(min=0, max=0.5, help="Mean share of its motion that a wheel loses.")] = 0.0,
     epistemic: Annotated[bool, typer.Option(help="Policies are also judged by the information that they gain.")] = True,
     sweep: Annotated[bool, typer.Option("--sweep", help="Scans are distorted by the robot's motion.")] = False,
+    beams: Annotated[int, typer.Option(min=2, max=MAX_BEAMS, help="Number of beams.")] = 622,
+    max_range: Annotated[float, typer.Option(min=0.1, max=100, help="Range of the scanner in m.")] = 25.0,
+    limit: Annotated[float, typer.Option(min=1, help="Simulated time in s after which a trial ends.")] = 120.0,
 ) -> None:
     """Navigation between random places, around walls and people.
 
@@ -36,13 +45,25 @@ def navigate(
     Examples: `presage experiment navigation --trials 2`;
     `presage experiment navigation --worlds office --people 10`;
     `presage experiment navigation --worlds twins --start unknown --trials 50 --no-epistemic`;
+    `presage experiment navigation --worlds hall --max-range 4 --prior odometry --slip 0.05`;
     `presage experiment --seed 7 --out mine navigation --worlds my.yaml --drives differential`.
     """
     from lab.navigation import experiment as driving
 
     seed, out = context.obj
     job = driving.NavigationJob(
-        0, seed, start=start, people=people, estimator=estimator, epistemic=epistemic, sweep=sweep
+        0,
+        seed,
+        start=start,
+        people=people,
+        estimator=estimator,
+        prior=prior,
+        slip=slip,
+        epistemic=epistemic,
+        sweep=sweep,
+        beams=beams,
+        range_max=max_range,
+        limit=limit,
     )
     world_names, drive_names = (
         tuple(part.strip() for part in text.split(",") if part.strip()) for text in (worlds, drives)

@@ -18,8 +18,8 @@ import numpy as np
 from common.bus.bus import open_bus, wait_until
 from common.errors import UserError
 from common.geometry.se2 import Array
-from common.messages.definitions import Belief, Goal, Health, Pose, Preference, Stamped, Status, Truth
-from common.messages.topics import BELIEF, GOAL, HEALTH, PREFERENCE, STATUS, TRUTH
+from common.messages.definitions import Belief, Goal, Health, Pose, Stamped, Status, Truth
+from common.messages.topics import BELIEF, GOAL, HEALTH, STATUS, TRUTH
 from lab.experiments.journeys import ARRIVAL_DISTANCE, Journey
 from lab.workers import THREAD_COUNT_VARIABLES
 from presage.live.bus_watch import Watch
@@ -60,9 +60,7 @@ class RunTrace:
     truths: list[Truth] = field(default_factory=list)
     beliefs: list[Belief] = field(default_factory=list)
     statuses: dict[int, Status] = field(default_factory=dict)  # the last status of each stamp (ns)
-    plans: list[int] = field(
-        default_factory=list
-    )  # stamps (ns) at which the controller published a new goal preference
+    plans: list[int] = field(default_factory=list)  # stamps (ns) of new cost fields, if the run records them
     health: Health | None = None  # the controller's last health message
     ended_ns: int | None = None  # stamp at which the run ended, before `scans_after_end`; None if it was aborted
     failure: str = ""  # why the run was aborted; empty if it was not
@@ -122,7 +120,7 @@ def run(params: LockstepRun, stack: Stack) -> RunTrace:
     (x, y), yaw = params.journey.start, float(np.rad2deg(params.yaw))
     pose, world, seed = f"{x!r},{y!r},{yaw!r}", ("--world", params.world), ("--seed", str(params.seed))
     with open_bus(stack.link()) as bus:
-        watch = Watch(bus, TRUTH, BELIEF, STATUS, *((PREFERENCE, HEALTH) if params.ends_with_status else ()))
+        watch = Watch(bus, TRUTH, BELIEF, STATUS, *((HEALTH,) if params.ends_with_status else ()))
         start_pose = ("--initial-pose", pose) if params.start_known else ()
         stack.start("controller", *world, *params.controller, "--belief-timeout", "60")
         stack.start("estimator", *world, *seed, *start_pose, *params.estimator)
@@ -208,8 +206,6 @@ def _append(message: Stamped, trace: RunTrace, end: int | None) -> None:
         trace.beliefs.append(message)
     elif isinstance(message, Status):
         trace.statuses[message.stamp_ns] = message
-    elif isinstance(message, Preference):
-        trace.plans.append(message.stamp_ns)
     elif isinstance(message, Health) and message.service == "controller":
         trace.health = message
 

@@ -29,7 +29,8 @@ from lab.experiments.journeys import Journey
 from lab.experiments.lockstep import LockstepRun, RunTrace, session
 from lab.experiments.lockstep import run as run_in_lockstep
 from lab.experiments.trials import run_trials
-from lab.navigation.experiment import DRIVES, SCANS_TO_STAND, WORLDS, columns
+from lab.navigation.experiment import DRIVES, WORLDS, columns
+from lab.navigation.in_process import SCANS_TO_STAND
 from lab.navigation.shortest_path import MAX_DRAWS, Trip, draw_trip, load_shortest_paths
 from lab.statistics import wilson_interval
 from presage.plotting import style as drawing

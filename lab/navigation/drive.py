@@ -18,6 +18,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import shapely
 
 from common.geometry.se2 import Array
@@ -32,6 +33,14 @@ from services.simulator.people import PERSON_RADIUS_M as PERSON_RADIUS
 MIN_MOVING_SPEED = 0.01  # m/s
 MAX_REACHED_DISTANCE = GOAL_TOLERANCE_M  # m; if the robot stands farther from the goal, a reported arrival is wrong
 MAX_EVENTS = 200  # stored per trial
+LOCALISATION = (
+    "tracking_s",
+    "untracked_s",
+    "longest_untracked_s",
+    "error_median_m",
+    "error_max_m",
+    "claimed_error_max_m",
+)
 
 
 def measure(trace: RunTrace, trip: Trip, world: World, robot: Robot) -> dict[str, Any]:
@@ -133,16 +142,26 @@ def _localisation(trace: RunTrace) -> dict[str, Any]:
     count = min(len(trace.truths), len(trace.beliefs))  # an aborted run may lack the last belief
     tracking = np.array([belief.state == "tracking" for belief in trace.beliefs[:count]], bool)
     if not tracking.any():
-        return dict.fromkeys(("tracking_s", "untracked_s", "error_median_m", "error_max_m", "claimed_error_max_m"))
+        return dict.fromkeys(LOCALISATION)
     first = int(np.argmax(tracking))
     error = np.hypot(*(trace.believed()[first:count] - trace.path()[first:count])[:, :2].T)
     return {
         "tracking_s": trace.truths[first].stamp_ns * 1e-9,
         "untracked_s": float(np.mean(~tracking[first:])) * (_seconds(trace) - trace.truths[first].stamp_ns * 1e-9),
+        "longest_untracked_s": _longest_untracked(trace, tracking),
         "error_median_m": float(np.median(error)),
         "error_max_m": float(error.max()),
         "claimed_error_max_m": float(error[tracking[first:]].max()),
     }
+
+
+def _longest_untracked(trace: RunTrace, tracking: npt.NDArray[np.bool_]) -> float:
+    """Longest time in s without a belief in state `tracking`; 0 if all beliefs are in it."""
+    stamps = np.array([truth.stamp_ns for truth in trace.truths[: len(tracking)]]) * 1e-9
+    known = np.concatenate([stamps[:1], stamps[tracking], stamps[-1:]])
+    gaps = np.diff(known)
+    period = stamps[1] - stamps[0] if len(stamps) > 1 else 0.0
+    return float(np.max(gaps[gaps > 1.5 * period], initial=0.0))
 
 
 def _times(trace: RunTrace) -> dict[str, Any]:

@@ -1,8 +1,8 @@
 """`presage experiment navigation`.
 
-The real processes (router, simulator, estimator, controller) run in lockstep over zenoh. A trial ends when the
-controller reports that the goal is reached or refused, or at the time limit. It counts as reached only if the robot
-truly is at the goal. A trial number always has the same start, goal and heading, whatever the drive and the options.
+Simulator, estimator and controller run in lockstep in one process. A trial ends when the controller reports that the
+goal is reached or refused, or at the time limit. It counts as reached only if the robot truly is at the goal. A trial
+number always has the same world, start, goal and heading, whatever the drive and the options.
 """
 
 from __future__ import annotations
@@ -10,24 +10,26 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from rich.console import Console
 
 from common.errors import UserError
-from common.geometry.world import load_world
 from common.messages.definitions import GOAL_TOLERANCE_M
 from common.robot.base import Robot
-from common.robot.scanner import SCANNERS
+from common.robot.scanner import SCANNERS, Scanner
 from lab.experiments import results
-from lab.experiments.journeys import Journey
-from lab.experiments.lockstep import LockstepRun, session
-from lab.experiments.lockstep import run as run_in_lockstep
 from lab.experiments.trials import run_trials
 from lab.navigation import figure as driving_figure
 from lab.navigation.drive import MAX_REACHED_DISTANCE, measure
-from lab.navigation.shortest_path import MIN_TRIP_LENGTH, START_GOAL_MARGIN, WALL_GAP, draw_trip, load_shortest_paths
+from lab.navigation.in_process import NavigationRun
+from lab.navigation.in_process import run as run_in_process
+from lab.navigation.shortest_path import START_GOAL_MARGIN, WALL_GAP, Trip, draw_trip, load_shortest_paths
+from lab.navigation.worlds import GENERATED, seed_of, world_of
+from lab.statistics import bootstrap_interval, median, wilson_interval
+from services.estimator.factory import EstimatorOptions, Name
+from services.simulator.simulation import Setup
 
 EXPERIMENT_ID = 7  # part of the random seeds
 WORLDS, DRIVES = ("maze", "office"), ("holonomic", "differential")
@@ -37,7 +39,6 @@ OPTION_VALUES = {
     "estimator": ("precise", "particle-filter"),
     "prior": ("motion", "odometry"),
 }
-SCANS_TO_STAND = 15  # 1 s; when the goal is reached, the robot is about to stop
 WORST_TRIALS = 5  # trials named in the summary
 QUANTITIES = {  # statistics over the trials that reached the goal; the other trials are listed under `worst`
     "path_over_shortest": ("median", "max"),
@@ -52,6 +53,7 @@ QUANTITIES = {  # statistics over the trials that reached the goal; the other tr
     "replans": ("median", "max"),
 }
 STATISTICS: dict[str, Callable[[Any], Any]] = {"median": np.median, "max": np.max, "min": np.min}
+BOOTSTRAPPED = ("path_over_shortest", "time_over_bound")  # whose medians get an interval
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,9 @@ class NavigationJob:
     prior: str = "motion"
     epistemic: bool = True
     sweep: bool = False  # whether motion distorts the scans
+    slip: float = 0.0  # mean share of its motion that a wheel loses
     beams: int = 622
+    range_max: float = SCANNERS["tim571"].range_max  # m
     limit: float = 120.0  # s of simulated time
 
     @property
@@ -77,31 +81,47 @@ class NavigationJob:
         """Name of the trial's group in the table, by world and drive."""
         return f"{Path(self.world).stem}, {self.drive}"
 
-    def lockstep_run(self, journey: Journey, yaw: float) -> LockstepRun:
-        """Parameters for `lockstep.run`."""
-        epistemic_option = "--epistemic" if self.epistemic else "--no-epistemic"
-        people = ("--people", str(self.people), "--people-speed", repr(self.people_speed)) if self.people else ()
-        return LockstepRun(
-            journey,
-            yaw,
-            self.world,
-            self.beams,
-            (self.seed * 100_003 + self.index) % 2**31,
-            ("--estimator", self.estimator, "--prior", self.prior),
-            round(self.limit * SCANNERS["tim571"].rate),
-            controller=("--preset", "geodesic", "--drive", self.drive, epistemic_option),
-            simulator=("--drive", self.drive, *people),
+    @property
+    def world_seed(self) -> int:
+        """Seed of the trial's world, if it is generated."""
+        return seed_of(self.world, self.seed, self.index)
+
+    @property
+    def robot(self) -> Robot:
+        """The robot."""
+        return Robot.model_validate({"drive": self.drive})
+
+    def trip(self) -> Trip:
+        """Start and goal."""
+        rng = np.random.default_rng((self.seed, EXPERIMENT_ID, self.index))
+        return draw_trip(self.world, rng, self.robot, self.world_seed)
+
+    def navigation_run(self, trip: Trip) -> NavigationRun:
+        """Parameters of the drive. In a generated world the estimator predicts scans by casting rays in it."""
+        world, seed = world_of(self.world, self.world_seed), (self.seed * 100_003 + self.index) % 2**31
+        scanner = {**SCANNERS["tim571"].with_beams(self.beams).model_dump(), "range_max": self.range_max}
+        setup = Setup(
+            world,
+            Scanner.model_validate(scanner),
+            self.robot,
+            trip.start,
+            seed,
+            slip=self.slip,
             sweep=self.sweep,
-            start_known=self.start == "known",
-            ends_with_status=True,
-            scans_after_end=SCANS_TO_STAND,
+            people=self.people,
+            people_speed=self.people_speed,
         )
+        start = np.array(trip.start) if self.start == "known" else None
+        model = "exact" if self.world in GENERATED else "learned"
+        estimator = EstimatorOptions(world, cast("Name", self.estimator), model, seed=seed, initial_pose=start)
+        limit = round(self.limit * setup.scanner.rate)
+        return NavigationRun(setup, estimator, trip.goal, self.prior == "odometry", self.epistemic, limit)
 
 
 def check(job: NavigationJob, worlds: Sequence[str], drives: Sequence[str]) -> None:
     """Checks the options before anything runs. Raises UserError for unknown or repeated values."""
     for world in worlds:
-        load_world(world)
+        world_of(world)
     given = {"drives": drives, "start": (job.start,), "estimator": (job.estimator,), "prior": (job.prior,)}
     for option, values in given.items():
         for value in values:
@@ -129,19 +149,19 @@ def result_name(job: NavigationJob, worlds: Sequence[str], drives: Sequence[str]
         *([job.prior] if job.prior != NavigationJob.prior else []),
         *([] if job.epistemic else ["no-epistemic"]),
         *(["sweep"] if job.sweep else []),
+        *([f"slip{job.slip:g}"] if job.slip else []),
         *([f"beams{job.beams}"] if job.beams != NavigationJob.beams else []),
+        *([f"range{job.range_max:g}"] if job.range_max != NavigationJob.range_max else []),
     ]
     return "-".join(["navigation", *parts])
 
 
 def trial(job: NavigationJob) -> dict[str, Any]:
     """Runs one drive. Returns its statistics."""
-    robot = Robot.model_validate({"drive": job.drive})
-    trip = draw_trip(job.world, np.random.default_rng((job.seed, EXPERIMENT_ID, job.index)), robot)
-    with session() as stack:
-        trace = run_in_lockstep(job.lockstep_run(Journey(trip.start[:2], trip.goal), trip.start[2]), stack)
-    world, _ = load_shortest_paths(job.world, robot.radius)
-    identity = {"group": job.group, "trial": job.index, **asdict(trip)}
+    trip, robot = job.trip(), job.robot
+    trace = run_in_process(job.navigation_run(trip))
+    world, _ = load_shortest_paths(job.world, robot.radius, job.world_seed)
+    identity = {"group": job.group, "trial": job.index, "world_seed": job.world_seed, **asdict(trip)}
     return identity | measure(trace, trip, world, robot)
 
 
@@ -151,6 +171,7 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     counted = {
         "trials": len(rows),
         "reached": len(reached),
+        "reached_share_95": wilson_interval(len(reached), len(rows)),
         **{
             f"trials_{outcome.replace(' ', '_')}": sum(row["outcome"] == outcome for row in rows)
             for outcome in ("claimed elsewhere", "refused", "too late", "failed")
@@ -163,6 +184,10 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     for quantity, statistics in QUANTITIES.items():
         for statistic in statistics:
             counted[f"{statistic}_{quantity}"] = _statistic(reached, quantity, statistic)
+    for quantity in BOOTSTRAPPED:
+        counted[f"median_{quantity}_95"] = bootstrap_interval([np.array([row[quantity]]) for row in reached], median)
+    for statistic in ("median", "max"):  # of all trials
+        counted[f"{statistic}_longest_untracked_s"] = _statistic(rows, "longest_untracked_s", statistic)
     for quantity in ("clearance_m", "clearance_to_people_m"):
         counted[f"min_{quantity}"] = _statistic(rows, quantity, "min")
     counted["median_step_mean_ms"] = _statistic(rows, "step_mean_ms", "median")
@@ -232,7 +257,6 @@ def run(
         "trials": trials,
         "tolerance_m": GOAL_TOLERANCE_M,
         "truly_m": MAX_REACHED_DISTANCE,
-        "apart_m": MIN_TRIP_LENGTH,
         "spare_m": START_GOAL_MARGIN,
         "gap_m": WALL_GAP,
         "robot": Robot().model_dump(exclude={"drive"}),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -9,14 +10,17 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from common.geometry.world import World, load_world
+from common.geometry.world import World
 from lab.experiments import results
+from lab.navigation.worlds import world_of
+from lab.statistics import wilson_interval
 from presage.plotting import style as drawing
 
 if TYPE_CHECKING:
     from lab.navigation.experiment import NavigationJob
 
 Rows = Sequence[dict[str, Any]]
+TITLE_WIDTH = 70  # characters above each column
 LINES = ("-", "--", ":", "-.")
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 
@@ -28,21 +32,26 @@ def describe(job: NavigationJob) -> str:
     parts += [f"prior {job.prior}"] if job.prior != "motion" else []
     parts += [] if job.epistemic else ["without the epistemic term"]
     parts += ["scans distorted by motion"] if job.sweep else []
+    parts += [f"{100 * job.slip:g} % wheel slip"] if job.slip else []
+    parts += [f"range {job.range_max:g} m"] if job.range_max != type(job).range_max else []
     return ", ".join(parts)
 
 
 def draw(by_group: Mapping[str, Rows], worlds: Mapping[str, str], title: str) -> Figure:
-    """A map with the paths for each world and drive; below, the distributions of the path and time ratios."""
+    """A map with the paths for each world and drive; below, the distributions of the path and time ratios.
+
+    Of generated worlds, only the first is shown.
+    """
     count = len(by_group)
     columns = min(2, count)
     rows_of_maps = -(-count // columns)
-    world_of_group = {group: load_world(world) for group, world in worlds.items()}
+    world_of_group = {group: world_of(world, by_group[group][0]["world_seed"]) for group, world in worlds.items()}
     heights = [
         max(_height(world_of_group[group]) for group in list(world_of_group)[row * columns :][:columns])
         for row in range(rows_of_maps)
     ]
     figure = drawing.empty_figure(6.6 * columns, 6.2 * sum(heights) + 0.5 * rows_of_maps + 3.4)
-    figure.suptitle(title, fontsize=11)
+    figure.suptitle(textwrap.fill(title, TITLE_WIDTH * columns), fontsize=11)
     grid = figure.add_gridspec(rows_of_maps + 1, 2 * columns, height_ratios=[*(6.2 * h + 0.5 for h in heights), 2.6])
     for number, (group, rows) in enumerate(by_group.items()):
         row, column = divmod(number, columns)
@@ -72,6 +81,8 @@ def _height(world: World) -> float:
 def _map(axes: Axes, world: World, group: str, rows: Rows) -> None:
     drawing.world_map(axes, world)
     for row in rows:
+        if row["world_seed"] != rows[0]["world_seed"]:
+            continue
         colour = drawing.GOAL if row["reached"] else drawing.PREDICTED
         above = 3 if row["reached"] else 4
         axes.plot(row["x_m"], row["y_m"], color=colour, linewidth=0.7, alpha=0.8, zorder=above)
@@ -103,9 +114,13 @@ def _distribution(axes: Axes, by_group: Mapping[str, Rows], quantity: str, label
 
 
 def table(summary: dict[str, dict[str, Any]]) -> str:
-    """The Markdown table of docs/navigation.md. Pairs are median; maximum, of the step time mean; maximum."""
+    """The Markdown table of docs/navigation.md. Pairs are median; maximum, of the step time mean; maximum.
+
+    Brackets are 95 % intervals.
+    """
     number, mm = results.number, results.millimetres
     people = any(row["min_clearance_to_people_m"] is not None for row in summary.values())
+    uncertain = any((row.get("median_longest_untracked_s") or 0) > 0 for row in summary.values())
     measured_left = all("median_left_m" in row for row in summary.values())  # not in results before November 2026
     heads = [
         "world, drive",
@@ -115,6 +130,7 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
         "path / shortest",
         "time / least",
         *(["distance left (mm)"] if measured_left else []),
+        *(["longest untracked (s)"] if uncertain else []),
         "gap (m)",
         *(["to people (m)"] if people else []),
         "error (mm)",
@@ -123,12 +139,13 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
     rows = [
         [
             name,
-            f"{row['reached']}/{row['trials']}",
+            f"{row['reached']}/{row['trials']} ({_percent(wilson_interval(row['reached'], row['trials']))})",
             str(row["trials_claimed_elsewhere"]),
             f"{row['trials_with_contact_moving']}; {row['trials_with_contact_standing']}",
-            f"{number(row['median_path_over_shortest'])}; {number(row['max_path_over_shortest'])}",
-            f"{number(row['median_time_over_bound'])}; {number(row['max_time_over_bound'])}",
+            _median_and_max(row, "path_over_shortest"),
+            _median_and_max(row, "time_over_bound"),
             *([f"{mm(row['median_left_m'])}; {mm(row['max_left_m'])}"] if measured_left else []),
+            *([_median_and_max(row, "longest_untracked_s", 1)] if uncertain else []),
             number(row["min_clearance_m"]),
             *([number(row["min_clearance_to_people_m"])] if people else []),
             f"{mm(row['median_error_median_m'])}; {mm(row['max_error_max_m'])}",
@@ -143,3 +160,14 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
         if each["outcome"] != "reached" or "touched" in each["why"]
     ]
     return "\n\n".join([results.markdown(heads, rows), *(["\n".join(bad)] if bad else [])])
+
+
+def _median_and_max(row: Mapping[str, Any], quantity: str, digits: int = 3) -> str:
+    interval = row.get(f"median_{quantity}_95")
+    within = "" if interval is None else f" ({' to '.join(results.number(each, digits) for each in interval)})"
+    median, most = (results.number(row.get(f"{statistic}_{quantity}"), digits) for statistic in ("median", "max"))
+    return f"{median}{within}; {most}"
+
+
+def _percent(interval: Sequence[float]) -> str:
+    return f"{100 * interval[0]:.0f} to {100 * interval[1]:.0f} %"

@@ -18,17 +18,14 @@ from scipy.sparse.csgraph import dijkstra
 
 from common.errors import UserError
 from common.geometry.se2 import Array
-from common.geometry.world import World, load_world
+from common.geometry.world import World
 from common.robot.base import Robot
+from lab.navigation.worlds import RULES, TripRule, world_of
 
 ARC_TOLERANCE = 1e-3  # m, error of the polygons that replace arcs
 WALL_GAP = 0.03  # m between the footprint and the walls along the shortest path
 START_GOAL_MARGIN = 0.05  # m between the footprint and the walls at start and goal
-MIN_TRIP_LENGTH = 2.0  # m along the shortest path
 MAX_DRAWS = 500
-# Worlds in which starts and goals are drawn only inside these rectangles: x0, y0, x1, y1 in m. In the corridor of
-# `twins` a scan identifies the place, so a robot with a goal there would localise on the way.
-ROOMS = {"twins": ((0.0, 0.0, 5.9, 4.4), (6.1, 0.0, 12.0, 4.4))}
 
 
 class ShortestPaths:
@@ -120,10 +117,10 @@ def length(path: Array) -> float:
 
 
 @functools.lru_cache(maxsize=8)
-def load_shortest_paths(world: str, radius: float = Robot().radius) -> tuple[World, ShortestPaths]:
-    """Loads a world and prepares its shortest paths with `WALL_GAP`; cached in each process."""
-    loaded = load_world(world)
-    return loaded, ShortestPaths(loaded, radius + WALL_GAP)
+def load_shortest_paths(name: str, radius: float = Robot().radius, seed: int = 0) -> tuple[World, ShortestPaths]:
+    """Loads a world, or generates that of a seed, and prepares its shortest paths with `WALL_GAP`; cached."""
+    world = world_of(name, seed)
+    return world, ShortestPaths(world, radius + WALL_GAP)
 
 
 @dataclass(frozen=True)
@@ -136,27 +133,24 @@ class Trip:
     redrawn: int = 0  # rejected pairs, too close together or without a path
 
 
-def draw_trip(world: str, rng: np.random.Generator, robot: Robot, apart: float = MIN_TRIP_LENGTH) -> Trip:
+def draw_trip(name: str, rng: np.random.Generator, robot: Robot, seed: int = 0) -> Trip:
     """Draws start and goal uniformly from free space with `START_GOAL_MARGIN`, and a uniform start heading.
 
-    The shortest path between them has at least ``apart`` m. Coordinates are rounded to millimetres and the heading to
-    1e-4 rad. Raises UserError if no such pair is found.
+    They follow the world's rule in `RULES`. Coordinates are rounded to millimetres and the heading to 1e-4 rad. Raises
+    UserError if no such pair is found.
     """
-    loaded, paths = load_shortest_paths(world, robot.radius)
-    rooms = ROOMS.get(world)
+    world, paths = load_shortest_paths(name, robot.radius, seed)
+    rule = RULES.get(name, TripRule())
     for redrawn in range(MAX_DRAWS):
-        start, goal = np.round(loaded.sample_free(2, rng, robot.radius + START_GOAL_MARGIN), 3)
-        if rooms and not all(any(_inside(place, room) for room in rooms) for place in (start, goal)):
+        start, goal = np.round(world.sample_free(2, rng, robot.radius + START_GOAL_MARGIN), 3)
+        if not rule.allows(world, [start, goal]):
             continue
         path = paths.path(start, goal)
-        if len(path) and length(path) >= apart:
+        if len(path) and length(path) >= rule.min_length:
             heading = round(float(rng.uniform(-np.pi, np.pi)), 4)
             there = float(goal[0]), float(goal[1])
             corners = tuple((float(x), float(y)) for x, y in np.round(path, 4))
             return Trip((float(start[0]), float(start[1]), heading), there, corners, redrawn)
-    raise UserError(f"world {loaded.name!r}: no two places {apart:g} m apart between which the robot could drive")
-
-
-def _inside(place: Array, room: tuple[float, float, float, float]) -> bool:
-    x0, y0, x1, y1 = room
-    return bool(x0 <= place[0] <= x1 and y0 <= place[1] <= y1)
+    raise UserError(
+        f"world {world.name!r}: no two places {rule.min_length:g} m apart between which the robot could drive"
+    )

@@ -32,6 +32,15 @@ MODULES = {
     "refinement": "lab.benchmarks.refinement",
     "visits": "lab.benchmarks.visits",
 }
+# Results with and without the terms of information, in one table.
+COMPARED = {
+    "hall": (
+        "navigation-hall-holonomic-odometry-slip0.05-beams271-range4",
+        "navigation-hall-holonomic-odometry-no-epistemic-slip0.05-beams271-range4",
+    ),
+    "twins": ("navigation-twins-unknown", "navigation-twins-unknown-no-epistemic"),
+    "look-alike": ("navigation-look-alike-unknown", "navigation-look-alike-unknown-no-epistemic"),
+}
 TABLE_MARKS = re.compile(r"(<!-- table (?P<name>[\w/.-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -47,11 +56,25 @@ def table_of(name: str, folder: Path) -> str:
     return "\n\n".join([table(result["summary"]), *(f"{note[0].upper()}{note[1:]}" for note in result["notes"])])
 
 
+def comparison(name: str, folder: Path) -> str:
+    """Table of the two results of `COMPARED`."""
+    summary = {
+        f"{group}, {arm}": row
+        for arm, result in zip(("with", "without"), COMPARED[name], strict=True)
+        for group, row in results.read(folder / f"{result}.json")["summary"].items()
+    }
+    table: Callable[[Any], str] = import_module(MODULES["navigation"]).table
+    return table(dict(sorted(summary.items())))
+
+
 def fill_tables(page: str, folder: Path) -> str:
     """Returns the page with every marked table replaced by the current results, without the notes below it."""
 
     def rows(name: str) -> str:
-        table = TABLES[name](folder) if name in TABLES else table_of(name, folder)
+        if name in COMPARED:
+            table = comparison(name, folder)
+        else:
+            table = TABLES[name](folder) if name in TABLES else table_of(name, folder)
         lines = [line for line in table.splitlines() if line.startswith("|") or not line]
         return "\n".join(lines).strip() + "\n"
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from lab.experiments import results
 from lab.experiments.trials import run_trials
 from lab.integrity.models import field_file
 from lab.peers.scans import BUILDING, DRIVES, PLACES, PosedScans, map_file, read_posed_scans
-from lab.statistics import bootstrap_interval, root_mean_square, wilson_interval
+from lab.statistics import bootstrap_interval, median, root_mean_square, wilson_interval
 from presage.learning.train_drive import TrainDriveOptions, card_of, rectangle
 from services.estimator.factory import EstimatorOptions, Factory, Geometry, prepare
 from services.estimator.precise.learning import weights
@@ -189,7 +189,6 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     errors, every = counted(converged, "error_m"), counted(rows, "error_m")
     wrong = [np.array(row["tracking"]) & (np.array(row["error_m"]) > CONVERGED_M) for row in rows]
     pooled = np.concatenate(errors) if errors else np.full(1, np.nan)
-    median: Callable[[Array], float] = lambda values: float(np.median(values))  # noqa: E731
     return {
         "trials": len(rows),
         "converged": len(converged),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.statistics import bootstrap_interval, root_mean_square, wilson_interval
+from lab.statistics import bootstrap_interval, median, root_mean_square, wilson_interval
 
 
 def test_shares():
@@ -23,3 +23,12 @@ def test_errors():
     alike = bootstrap_interval([np.full(20, value) for value in values[:20]], root_mean_square)
     assert np.ptp(alike) > 2 * np.ptp(alone)
     assert bootstrap_interval([values], root_mean_square) is None
+
+
+def test_interval_of_a_median():
+    rng = np.random.default_rng(0)
+    covered = 0
+    for _ in range(100):
+        low, high = bootstrap_interval(list(rng.exponential(size=(41, 1))), median)
+        covered += low <= np.log(2) <= high
+    assert 88 <= covered <= 99

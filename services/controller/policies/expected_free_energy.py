@@ -24,8 +24,9 @@ NATS_PER_METRE = 0.02  # of -ln p(s) per metre to go: 10 m of driving cost as mu
 POLICY_PRECISION = 5000.0  # a policy that ends 1 cm nearer to the goal is e times as probable
 # Resolution of the pose at which information counts: half of what the estimator calls localised, 0.2 m and 5 degrees.
 RESOLUTION = np.diag([0.1, 0.1, np.deg2rad(2.5)]) ** 2
-# Covariance that a metre without scans adds to the pose, m², m², rad².
-MOTION_NOISE = np.diag([0.05, 0.05, 0.05]) ** 2
+# Standard deviation, in m and rad, that a metre without scans adds to a position and a heading. It is as far as the
+# robot could have got, which is what an estimator without odometry assumes.
+DRIFT_PER_METRE = 1.0
 OUTLIERS = 0.25  # the share of beams that the estimator's likelihood expects to end early
 ARRIVAL_ERROR_M = 0.05  # the robot does not stop exactly at the place for which a scan is predicted
 INDEPENDENT_SECTORS = 8  # a person, or an edge off its place, spoils a sector of the scan rather than one beam
@@ -79,14 +80,6 @@ def remaining_entropy(covariance: Array, information: Array) -> Array:
     ``covariance`` (..., 3, 3) is that of the pose before. The result is 0 for a pose known better than the resolution.
     """
     return np.asarray(np.linalg.slogdet(np.eye(3) + _relative_covariance(covariance, information))[1] / 2)
-
-
-def information_loss(information: Array) -> Array:
-    """Information (...,) in nats about the pose that a metre loses where its scans have an ``information`` (..., 3, 3).
-
-    It is the slope of `remaining_entropy` at a pose that is known, an upper bound for every other.
-    """
-    return np.asarray(np.trace(_relative_covariance(MOTION_NOISE, information), axis1=-2, axis2=-1) / 2)
 
 
 def _relative_covariance(covariance: Array, information: Array) -> Array:

@@ -79,6 +79,11 @@ class FreeSpaceGraph:
         self._extra_cost_per_metre = cost
         self._update_weights(np.ones(self.grid.cells, bool))
 
+    @property
+    def lengths(self) -> csr_matrix:
+        """Lengths (cells, cells) in m of the edges, without temporary obstacles."""
+        return csr_matrix((self._length, self._graph.indices, self._graph.indptr), shape=self._graph.shape, copy=True)
+
     def _update_weights(self, changed: npt.NDArray[np.bool_]) -> None:
         """Recompute the weights of all edges of the ``changed`` cells (cells,) bool."""
         clearance, cost = self.clearance.ravel(), self.cost_per_metre.ravel()

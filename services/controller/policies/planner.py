@@ -134,9 +134,8 @@ class GeodesicPolicy:
         """Compute from the first scan how much information a scan gives in each place; metres with little cost more."""
         if not self.epistemic or self._information is not None:
             return
-        self._information = ScanInformation.of(self.free, self.robot.radius, scan, 1 / (STEP_S * self.robot.max_speed))
-        grid, cost = self._information.grid, self._information.metre_cost / efe.NATS_PER_METRE
-        self.graph.set_extra_cost_per_metre(grid.interpolate(cost, self.free.grid.centres()))
+        self._information = ScanInformation.of(self.graph, scan, 1 / (STEP_S * self.robot.max_speed))
+        self.graph.set_extra_cost_per_metre(self._information.ambiguity.ravel() / efe.NATS_PER_METRE)
 
     def observe(self, scan: Scan, belief: Belief) -> None:
         """Update the scanner's field of view, and while tracking the obstacles and the component of the graph."""

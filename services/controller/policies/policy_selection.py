@@ -128,14 +128,11 @@ class PoseBelief:
         metres = np.full(points.shape[:2], 1.0)  # that each point stands for
         metres[:, -len(LINE_SAMPLES) :] *= onwards[:, None] / len(LINE_SAMPLES)
         metres[:, : -len(LINE_SAMPLES)] *= length[:, None] / (points.shape[1] - len(LINE_SAMPLES))
-        ambiguity = np.sum(metres * self.scans.grid.interpolate(self.scans.ambiguity, points), axis=1)
-        loss = metres * self.scans.grid.interpolate(self.scans.loss, points)
-        information_at_ends = self.scans.matrix[self.scans.grid.cell_of(se2.transform(self.pose, ends))]
-        information = information_at_ends * seconds / motion.STEP_S
-        predicted = self.covariance + efe.MOTION_NOISE * length[:, None, None]
+        ambiguity = np.sum(metres * self.scans.free_grid.interpolate(self.scans.ambiguity, points), axis=1)
+        information = self.scans.matrix[self.scans.grid.cell_of(se2.transform(self.pose, ends))]
+        information = information * seconds / motion.STEP_S
         before = efe.remaining_entropy(self.covariance, np.zeros((3, 3)))
-        gain = before - efe.remaining_entropy(predicted, information)
-        return ambiguity, gain - np.sum(loss[:, -len(LINE_SAMPLES) :], axis=1)
+        return ambiguity, before - efe.remaining_entropy(self.covariance, information)
 
 
 @dataclass(frozen=True)

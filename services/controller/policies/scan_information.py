@@ -1,8 +1,12 @@
-"""The expected information of a scan about the pose, over the whole map.
+"""The expected information of a scan about the pose over the whole map, and how well the pose is known there.
 
 A beam along u that hits a surface with normal n measures n·x, because its range changes by -n/(n·u) per metre of x. Its
 precision along n is 1 / ((sigma n·u)² + MAP_ERROR_M²): an error of the map displaces the surface along its normal. The
 information of a scan is the sum over its beams (Censi 2007). Beams without a return count as without information.
+
+A robot at a place p knows its pose by the scans there, or by those at another place q and dead reckoning from there.
+If the scans on the way at q leave the standard deviation s(q), that at p is the least of s(q) plus the drift from q to
+p, over all q. This is a shortest path.
 """
 
 from __future__ import annotations
@@ -12,6 +16,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
+from scipy.sparse import csr_matrix, vstack
+from scipy.sparse.csgraph import dijkstra
 
 from services.controller.policies import expected_free_energy as efe
 from services.controller.policies.free_space import Grid
@@ -20,6 +26,7 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.messages.definitions import Scan
     from services.controller.policies.free_space import FreeSpace
+    from services.controller.policies.geodesic_field import FreeSpaceGraph
 
 CELL_M = 0.5
 MAX_CELLS = 10_000  # a map that would need more gets larger cells, so that the first scan takes about a second at most
@@ -28,47 +35,70 @@ DEFAULT_SIGMA_M = 0.02  # of a range, if the scanner does not state it
 MAP_ERROR_M = 0.01  # of a surface along its normal
 MIN_INCIDENCE = 0.05  # cosine of the angle between beam and normal, below which the first order no longer holds
 MAX_RAY_STEPS = 60
+UNKNOWN_VARIANCE = 1e4  # m² and rad², of a pose of which scans tell nothing
 
 
 @dataclass(frozen=True)
 class ScanInformation:
-    """Expected information of one scan in each cell of a coarse grid, on average over the headings."""
+    """Expected information of scans, and the ambiguity of the pose that they leave."""
 
-    grid: Grid
-    matrix: Array  # (cells, 3, 3) information about x, y, yaw in map: 1/m², 1/m, 1/rad²
-    ambiguity: Array  # (rows, columns) nats per metre, expected entropy of what a scan says about the pose
-    loss: Array  # (rows, columns) nats per metre, information about the pose that motion loses and scans do not regain
+    grid: Grid  # coarse
+    matrix: Array  # (cells of grid, 3, 3) of one scan about x, y, yaw in map, averaged over headings: 1/m², 1/m, 1/rad²
+    free_grid: Grid  # fine
+    ambiguity: Array  # (rows, columns of free_grid) nats per metre
 
     @classmethod
-    def of(cls, free: FreeSpace, radius: float, scan: Scan, scans_per_metre: float) -> ScanInformation:
-        """The expected information of scans like ``scan``, of which only the scanner matters.
+    def of(cls, graph: FreeSpaceGraph, scan: Scan, scans_per_metre: float) -> ScanInformation:
+        """The expected information of scans like ``scan``, of which only the scanner matters."""
+        grid = _coarse_grid(graph.grid)
+        matrix = _information(graph.free, _places_with_room(graph.free, grid, graph.radius), scan)
+        return cls(grid, matrix, graph.grid, _ambiguity(graph, grid, scans_per_metre * matrix))
 
-        A cell stands for the place nearest to its centre where a robot with this ``radius`` m has room. Scans a metre
-        apart count as independent, so the ambiguity is that of one scan per metre.
-        """
-        grid = _coarse_grid(free.grid)
-        places = _places_with_room(free, grid, radius)
-        angle = np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS
-        ray = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        start = np.broadcast_to(places[:, None], (grid.cells, DIRECTIONS, 2))
-        distance = ray_lengths(free, start, np.broadcast_to(ray, start.shape), scan.range_max)
-        hit = np.isfinite(distance)
-        distance = np.where(hit, distance, 0.0)[..., None]
-        normal = free.normal_at(start + np.maximum(distance - free.grid.resolution, 0.0) * ray)
-        lever = distance[..., 0] * np.sum(normal * np.stack([-ray[:, 1], ray[:, 0]], axis=-1), axis=-1)
-        measured = np.concatenate([normal, lever[..., None]], axis=-1)
-        incidence = np.maximum(np.abs(np.sum(normal * ray, axis=-1)), MIN_INCIDENCE)
-        sigma = np.hypot(scan.sigma or DEFAULT_SIGMA_M, scan.sigma_relative * distance[..., 0])
-        variance = (sigma * incidence) ** 2 + MAP_ERROR_M**2
-        precision = np.where(hit, len(scan.ranges) / DIRECTIONS / variance, 0.0)
-        matrix = np.einsum("cd,cdi,cdj->cij", precision, measured, measured)
-        ambiguity = efe.remaining_entropy(efe.RESOLUTION, matrix).reshape(grid.shape)
-        return cls(grid, matrix, ambiguity, efe.information_loss(scans_per_metre * matrix).reshape(grid.shape))
 
-    @property
-    def metre_cost(self) -> Array:
-        """Nats (rows, columns) that a metre costs in each cell."""
-        return self.ambiguity + self.loss
+def _information(free: FreeSpace, places: Array, scan: Scan) -> Array:
+    """Expected information (N, 3, 3) of one scan from ``places`` (N, 2) m."""
+    angle = np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS
+    ray = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    start = np.broadcast_to(places[:, None], (len(places), DIRECTIONS, 2))
+    distance = ray_lengths(free, start, np.broadcast_to(ray, start.shape), scan.range_max)
+    hit = np.isfinite(distance)
+    distance = np.where(hit, distance, 0.0)[..., None]
+    normal = free.normal_at(start + np.maximum(distance - free.grid.resolution, 0.0) * ray)
+    lever = distance[..., 0] * np.sum(normal * np.stack([-ray[:, 1], ray[:, 0]], axis=-1), axis=-1)
+    measured = np.concatenate([normal, lever[..., None]], axis=-1)
+    incidence = np.maximum(np.abs(np.sum(normal * ray, axis=-1)), MIN_INCIDENCE)
+    sigma = np.hypot(scan.sigma or DEFAULT_SIGMA_M, scan.sigma_relative * distance[..., 0])
+    variance = (sigma * incidence) ** 2 + MAP_ERROR_M**2
+    precision = np.where(hit, len(scan.ranges) / DIRECTIONS / variance, 0.0)
+    return np.asarray(np.einsum("cd,cdi,cdj->cij", precision, measured, measured))
+
+
+def _ambiguity(graph: FreeSpaceGraph, grid: Grid, information: Array) -> Array:
+    """Entropy (rows, columns) in nats of the pose beyond `efe.RESOLUTION` in each cell of a graph.
+
+    ``information`` (cells of the coarse ``grid``, 3, 3) is that of the scans of a metre. The directions in which the
+    position is known better and worse, and the heading, are treated separately.
+    """
+    left = np.linalg.inv(information + np.eye(3) / UNKNOWN_VARIANCE)
+    of_a_metre = np.column_stack([np.linalg.eigvalsh(left[:, :2, :2]), left[:, 2, 2]])
+    drift = efe.DRIFT_PER_METRE**2
+    balance = (np.sqrt(drift**2 + 4 * drift * of_a_metre) - drift) / 2  # variance where drift and scans balance
+    entropy = np.zeros(graph.grid.cells)
+    for variance, resolution in zip(balance.T, np.diag(efe.RESOLUTION), strict=True):
+        deviation = grid.interpolate(np.sqrt(variance).reshape(grid.shape), graph.grid.centres())
+        deviation = efe.DRIFT_PER_METRE * _least_on_the_way(graph, deviation / efe.DRIFT_PER_METRE)
+        entropy += np.log1p(deviation**2 / resolution) / 2
+    return entropy.reshape(graph.grid.shape)
+
+
+def _least_on_the_way(graph: FreeSpaceGraph, metres: Array) -> Array:
+    """The least of ``metres`` (cells,) at any cell plus the length of the way from there, for each cell of a graph."""
+    # An additional node is as far from each cell as these metres. Edges of length 0 would be none.
+    additional = csr_matrix(np.append(np.maximum(metres, 1e-9), 0.0))
+    lengths = graph.lengths
+    lengths.resize((len(metres), len(metres) + 1))
+    found = dijkstra(vstack([lengths, additional], format="csr"), indices=len(metres))
+    return np.asarray(np.minimum(metres, found[:-1]))  # cells that are not free have no edges
 
 
 def _coarse_grid(grid: Grid) -> Grid:

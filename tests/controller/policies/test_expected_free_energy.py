@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from scipy.sparse.csgraph import dijkstra
 
 from common.geometry import se2
 from common.robot.base import Robot
@@ -13,9 +14,16 @@ from common.robot.scanner import SCANNERS
 from services.controller.policies import expected_free_energy as efe
 from services.controller.policies.active_localisation import CandidateMotions, VisitedPlaces, drive_energy
 from services.controller.policies.expected_free_energy import entropy, place_information
-from services.controller.policies.free_space import FreeSpace
+from services.controller.policies.free_space import FreeSpace, Grid
+from services.controller.policies.geodesic_field import FreeSpaceGraph
 from services.controller.policies.paper_action import ActionParameters, action_gradient
-from services.controller.policies.scan_information import DIRECTIONS, MAP_ERROR_M, ScanInformation
+from services.controller.policies.scan_information import (
+    DIRECTIONS,
+    MAP_ERROR_M,
+    UNKNOWN_VARIANCE,
+    ScanInformation,
+    _ambiguity,
+)
 from tests.controller.driving import box, room, scan, shipped
 
 R = 25.0
@@ -181,15 +189,6 @@ def test_pose_information(deviation, noise):
     assert gain == pytest.approx(mutual, abs=0.01)
 
 
-def test_information_loss():
-    """It is the slope of the entropy that motion adds, and an upper bound."""
-    information, step = np.array([np.zeros((3, 3)), np.diag([400.0, 0, 50])]), 1e-6
-    # Scans over a part of a metre tell as much per metre of motion as those over the whole.
-    slope = efe.remaining_entropy(step * efe.MOTION_NOISE, information / step) / step
-    assert efe.information_loss(information) == pytest.approx(slope, rel=1e-4)
-    assert (efe.remaining_entropy(efe.MOTION_NOISE, information) < efe.information_loss(information)).all()
-
-
 def test_expected_square():
     rng = np.random.default_rng(3)
     for value, deviation in [(0.5, 0.0), (0.5, 0.1), (-0.2, 0.3), (0.9, 0.5)]:
@@ -201,7 +200,7 @@ def test_information_of_scans():
     """In the middle of a room, against finite differences of exact ranges; and without a wall in range."""
     hall, step = room(8, 6), 1e-5
     observed = scan(0, [4.0, 3.0, 0.0], hall)
-    found = ScanInformation.of(FreeSpace.of(hall), 0.27, observed, 15.0)
+    found = information_of(hall, observed)
     pose = np.array([4.25, 3.25, 0.0])  # the centre of a cell
     (cell,) = found.grid.cell_of(pose[None, :2])
     angles = np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS
@@ -214,8 +213,47 @@ def test_information_of_scans():
     variance = 0.02**2 + (MAP_ERROR_M / incidence) ** 2
     exact = len(observed.ranges) / DIRECTIONS * np.einsum("b,bi,bj->ij", 1 / variance, J, J)
     np.testing.assert_allclose(found.matrix[cell], exact, rtol=0.15, atol=0.03 * exact.max())
-    short = ScanInformation.of(FreeSpace.of(hall), 0.27, observed.model_copy(update={"range_max": 1.0}), 15.0)
+    short = information_of(hall, observed.model_copy(update={"range_max": 1.0}))
     assert short.matrix[cell] == pytest.approx(0)
-    assert short.metre_cost.ravel()[cell] > 100 * found.metre_cost.ravel()[cell]
-    block = FreeSpace.of(room(8, 6, box(4, 3, 1.2, 1.2)))  # no scan is possible from the cells inside
-    assert ScanInformation.of(block, 0.27, observed, 15.0).metre_cost.max() < 3 * found.metre_cost.max()
+    block = information_of(room(8, 6, box(4, 3, 1.2, 1.2)), observed)  # no scan is possible from the cells inside
+    assert block.ambiguity.max() < 0.01
+
+
+def information_of(world, observed):
+    return ScanInformation.of(FreeSpaceGraph(FreeSpace.of(world), 0.27), observed, 15.0)
+
+
+def test_ambiguity_of_the_pose():
+    """Against the least over all places that a scan may have fixed the pose at, by enumeration; in two rooms."""
+    world = room(8, 6, box(4, 2.5, 0.2, 5))  # the way round the wall leads past y = 5
+    graph = FreeSpaceGraph(FreeSpace.of(world, 0.2), 0.27)
+    grid = Grid((0.0, 0.0), 1.0, (6, 8))
+    rng, count = np.random.default_rng(1), grid.cells
+    information = np.zeros((count, 3, 3))
+    for cell in rng.choice(count, 6, replace=False):
+        factor = rng.standard_normal((3, 5)) * np.array([30.0, 30.0, 60.0])[:, None]
+        information[cell] = factor @ factor.T
+    left = np.linalg.inv(information + np.eye(3) / UNKNOWN_VARIANCE)
+    of_a_metre = np.column_stack([np.linalg.eigvalsh(left[:, :2, :2]), left[:, 2, 2]])
+    expected = np.zeros(graph.grid.cells)
+    centres = graph.grid.centres()
+    distances = dijkstra(graph.lengths)
+    for variance, resolution in zip(of_a_metre.T, np.diag(efe.RESOLUTION), strict=True):
+        staying = np.zeros(count)
+        for k in range(count):  # a metre of drift, then the scans of a metre, until it stays the same
+            for _ in range(2000):
+                staying[k] = 1 / (1 / (staying[k] + efe.DRIFT_PER_METRE**2) + 1 / variance[k])
+        start = grid.interpolate(np.sqrt(staying).reshape(grid.shape), centres)
+        deviation = np.minimum(start, (start[:, None] + efe.DRIFT_PER_METRE * distances).min(axis=0))
+        expected += np.log(np.sqrt(1 + deviation**2 / resolution))
+    found = _ambiguity(graph, grid, information).ravel()
+    assert np.ptp(found) > 1
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
+
+
+def test_out_of_sight():
+    """In a hall with a range of 2 m, a metre costs more the farther the walls are out of sight; near them, little."""
+    hall = room(12, 9, *(box(x, y, 0.5, 0.6) for x in range(1, 12, 2) for y in (0.3, 8.7)))
+    short = information_of(hall, scan(0, [6.0, 1.5, 0.0], hall).model_copy(update={"range_max": 2.0}))
+    near, edge, middle = short.free_grid.interpolate(short.ambiguity, np.array([[6.0, 1.3], [6.0, 3.4], [6.0, 4.5]]))
+    assert near < 0.01 < edge < middle
