@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from services.estimator.shared.generative_models import GenerativeModel
     from services.estimator.shared.interface import Observation, Posterior
 
-NICENESS = 19  # of the process that learns: it uses what computing time the other services leave
+NICENESS = 10  # of the process that learns: the other services come first, but it never starves
 
 
 @dataclass(frozen=True)
