@@ -57,6 +57,7 @@ ALSO_SHELL = {
     "services/recorder/replaying/replay.py",
     "services/recorder/files/chunks.py",
     "services/recorder/files/index.py",
+    "services/estimator/learner.py",  # learns in a process of its own
     "services/recorder/files/parts.py",
     "services/recorder/files/writer.py",
     "services/bridge_ros2/ros_session.py",

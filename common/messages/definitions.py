@@ -19,6 +19,7 @@ from common.messages.pose import Pose as Pose  # noqa: PLC0414 - most modules im
 from common.messages.pose import Twist as Twist  # noqa: PLC0414
 from common.messages.wire import (
     Beams,
+    Bytes,
     Costs,
     Count,
     Finite,
@@ -131,6 +132,7 @@ class Belief(Stamped):
     protection: Floats | None = None  # (3,) m along x and y of base_link, and rad: errors to be exceeded
     # once in 10^4 scans; nil if the estimator states none
     estimator: Name = ""
+    field_version: Count = 0  # of the field that was learned while driving, see `field`; 0 is the original model
     frame_id: Name = "map"
 
     @model_validator(mode="after")
@@ -162,6 +164,17 @@ class Map(Stamped):
     grid: OccupancyGrid  # free, occupied and unknown cells
     poses: Poses  # (K, 3) base_link in map, of the key scans in order of time
     closures: Points = np.zeros((0, 2), np.float32)  # (2 C, 2) m in map, the two ends of each loop closure
+    frame_id: Name = "map"
+
+
+class LearnedField(Stamped):
+    """A part of the distance field that the estimator has learned while driving, and uses for scans after the stamp."""
+
+    version: Count  # from 1; all parts of a version have the same
+    base: Name = ""  # SHA-256 of the original model's weights, hexadecimal; empty if it has none
+    part: Annotated[int, Field(ge=0, lt=1000)] = 0
+    parts: Annotated[int, Field(ge=1, le=1000)] = 1
+    data: Bytes  # all parts joined are the field's arrays in the format safetensors, compressed by zlib
     frame_id: Name = "map"
 
 

@@ -147,6 +147,19 @@ class SaveMapReply(Reply):
     file: Text = ""  # path of NAME.yaml on the mapper's machine
 
 
+class SaveModelRequest(Request):
+    """Write the model learned while driving as NAME-precise.safetensors, with its card NAME-precise.json."""
+
+    name: Name  # letters, digits, - and _
+
+
+class SaveModelReply(Reply):
+    """The model that was written."""
+
+    file: Text = ""  # path of NAME-precise.safetensors on the estimator's machine
+    version: Count = 0
+
+
 class ConfigReply(Reply):
     """Effective configuration and versions of a service."""
 

@@ -75,6 +75,14 @@ BELIEF = Topic(
 )
 PREDICTION = Topic("prediction", m.Prediction, "estimator", 15, "newest", about="the scan predicted for the belief")
 MAP = Topic("map", m.Map, "mapper", 0, "newest", about="the map so far, on change and every 5 s")
+FIELD = Topic(
+    "field",
+    m.LearnedField,
+    "estimator",
+    0,
+    "all",
+    about="what the estimator learned while driving, on change and every 30 s",
+)
 CMD_VEL = Topic("cmd_vel", m.CmdVel, "controller", 15, "newest", about="velocity command")
 GOAL = Topic(
     "goal",
@@ -125,6 +133,7 @@ TOPICS: tuple[Topic, ...] = (
     BELIEF,
     PREDICTION,
     MAP,
+    FIELD,
     GOAL,
     DRIVE,
     CMD_VEL,
@@ -174,6 +183,9 @@ PREDICT = Query(
     about="predict scans from given poses",
 )
 SAVE_MAP = Query("save_map", r.SaveMapRequest, r.SaveMapReply, "mapper", about="write the map into files")
+SAVE_MODEL = Query(
+    "save_model", r.SaveModelRequest, r.SaveModelReply, "estimator", about="write what was learned while driving"
+)
 CONFIG = Query(
     "config",
     r.Request,
@@ -200,6 +212,7 @@ QUERIES: tuple[Query, ...] = (
     MODEL,
     PREDICT,
     SAVE_MAP,
+    SAVE_MODEL,
     CONFIG,
 )
 

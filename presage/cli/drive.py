@@ -1,4 +1,4 @@
-"""`presage goal`, `explore`, `teleport` and `relocalise`."""
+"""`presage goal`, `explore`, `teleport`, `relocalise`, `save-map` and `save-model`."""
 
 from __future__ import annotations
 
@@ -151,6 +151,23 @@ def save_map(
     Example: `presage save-map my-floor`.
     """
     from presage.live.commands import save_map as run
+
+    run(chosen_link(context), name, console)
+
+
+@app.command("save-model", rich_help_panel="Drive", short_help="Save the model that is learned while driving.")
+def save_model(
+    context: typer.Context,
+    name: Annotated[str, typer.Argument(help="Name of the model: letters, digits, - and _.")],
+) -> None:
+    """Save what the estimator of `presage up --learn` has learned, as NAME-precise.safetensors with a card, .json.
+
+    The estimator writes into its own folder (its setting `saved_models`), by default the one where the session was
+    started.
+
+    Example: `presage save-model monday`, then `presage up --world my.yaml --model monday-precise.safetensors`.
+    """
+    from presage.live.commands import save_model as run
 
     run(chosen_link(context), name, console)
 

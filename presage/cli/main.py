@@ -86,6 +86,9 @@ def up(
     mapping: Annotated[
         bool, typer.Option("--mapping", help="Map an unknown building by driving through it by hand (docs/mapping.md).")
     ] = False,
+    learn: Annotated[
+        bool, typer.Option("--learn", help="Improve the model while driving, and follow changes (docs/mapping.md).")
+    ] = False,
     port: Annotated[
         int,
         typer.Option(min=0, max=65535, help="TCP port of the router on 127.0.0.1. 0 chooses a free port."),
@@ -106,7 +109,7 @@ def up(
 
     Examples: `presage up`, then in another terminal `presage goal 15 1.5 --wait`;
     `presage up --world office --people 10 --record recordings --seed 7`; `presage up --estimator particle-filter`;
-    `presage up --world office --mapping`;
+    `presage up --world office --mapping`; `presage up --world rough.yaml --model exact --learn`;
     `presage up --robots 3`, then `presage --robot robot-2 goal 15 1.5`; `presage up --config turtlebot.yaml`.
     """
     from presage.session.up import UpOptions, run_up
@@ -122,7 +125,7 @@ def up(
         world,
         drive,
         simulator=arguments(scanner=scanner, people=people, seed=seed),
-        estimator=arguments(estimator=estimator, **model_setting(model)),
+        estimator=arguments(estimator=estimator, learn="refine" if learn else None, **model_setting(model)),
         robots=robots,
         record=record,
         port=port,

@@ -26,9 +26,10 @@ from common.versions import commit, versions
 from presage.learning.drive_figure import draw_learned
 from presage.logs.log import Reading
 from presage.logs.scan_files import Scans, read_scans
+from services.estimator.factory import Geometry
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.calibration import ReferenceDrive
-from services.estimator.precise.learning.drive_learning import MIN_SCANS, Learned, learn_drive
+from services.estimator.precise.learning.drive_learning import MIN_SCANS, Learned, learn_drive, replay
 from services.estimator.precise.learning.field_learning import Recipe
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.generative_models import RayCaster
@@ -175,31 +176,14 @@ def simulated_beams(world: World, drive: ReferenceDrive, samples: int, seed: int
 
 def replayed_beams(former: Path, drive: ReferenceDrive, samples: int, seed: int) -> Beams:
     """Scans of the drive's scanner as a former model predicts them, at random places that it knows."""
-    rng = np.random.default_rng(seed)
     model, seeds, _ = weights.load(former)
-    lasers = np.column_stack([rng.choice(seeds.places, samples), rng.uniform(-np.pi, np.pi, samples)])
-    expected = model.expect(lasers, drive.angles)
-    known = np.isfinite(expected.scale) & (expected.ranges < drive.range_max)
-    return Beams.of(lasers, np.zeros(3), drive.angles, np.where(known, expected.ranges, -np.inf))
+    return replay(model, seeds.places, drive, samples, seed)
 
 
 def scanner_of(drive: ReferenceDrive, sigma: float, name: str) -> Scanner:
     """The scanner of a drive, for the model card; ``sigma`` is its range noise in m."""
-    angles = drive.angles
-    fov = float(abs(angles[-1] - angles[0]))
-    x, y, yaw = map(float, drive.mount)
-    return Scanner(
-        name=name,
-        beams=len(angles),
-        fov=min(fov, 2 * np.pi),
-        rate=float(1 / np.median(np.diff(drive.stamps))),
-        range_min=0.0,
-        range_max=drive.range_max,
-        sigma=sigma,
-        mount=(x, y, yaw),
-        first=float(-angles[0] if angles[-1] < angles[0] else angles[0]),
-        upside_down=bool(angles[-1] < angles[0]),
-    )
+    rate = float(1 / np.median(np.diff(drive.stamps)))
+    return Geometry(drive.angles, drive.mount, drive.range_max, sigma).scanner(name, rate)
 
 
 def card_of(

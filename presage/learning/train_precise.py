@@ -77,7 +77,7 @@ def train_precise(options: TrainPreciseOptions, link: Link, console: Console) ->
     console.print(
         f"{path}: {path.stat().st_size / 1e6:.2f} MB, trained in {card.learning_s:.0f} s; range error median "
         f"{card.test_range_error_median_m * 1e3:.2f} mm, {card.test_share_above_5_cm:.2%} above 5 cm; "
-        f"position error from scans without noise {card.test_position_error_rms_m * 1e3:.2f} mm RMS"
+        f"position error from scans without noise {(card.test_position_error_rms_m or 0.0) * 1e3:.2f} mm RMS"
     )
     return path
 

@@ -1,4 +1,4 @@
-"""goal, teleport, relocalise, save-map, topics, hz and echo."""
+"""goal, teleport, relocalise, save-map, save-model, topics, hz and echo."""
 
 from __future__ import annotations
 
@@ -16,8 +16,16 @@ from common.bus.bus import Link, wait_until
 from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
 from common.messages.definitions import Goal, Pose, Status
-from common.messages.requests import LocaliseRequest, PoseRequest, Reply, SaveMapReply, SaveMapRequest
-from common.messages.topics import GOAL, LOCALISE, QUERIES, SAVE_MAP, STATUS, TELEPORT, TOPICS, Topic
+from common.messages.requests import (
+    LocaliseRequest,
+    PoseRequest,
+    Reply,
+    SaveMapReply,
+    SaveMapRequest,
+    SaveModelReply,
+    SaveModelRequest,
+)
+from common.messages.topics import GOAL, LOCALISE, QUERIES, SAVE_MAP, SAVE_MODEL, STATUS, TELEPORT, TOPICS, Topic
 from common.messages.wire import DecodeError, Message
 from presage.live.bus_watch import Watch, session
 
@@ -233,3 +241,13 @@ def save_map(link: Link, name: str, console: Console) -> None:
         raise UserError(f"not saved: {reply.reason}")
     console.print(f"saved: {reply.file}. Before `presage up --world`, learn its model:", soft_wrap=True)
     console.print(f"presage train --world {reply.file}", soft_wrap=True)
+
+
+def save_model(link: Link, name: str, console: Console) -> None:
+    """Has the estimator write what it learned while driving; raises UserError with the reason if it cannot."""
+    with session(link) as bus:
+        reply = bus.ask(SAVE_MODEL, SaveModelRequest(name=name), SaveModelReply, SAVE_TIMEOUT_S)
+    if not reply.ok:
+        raise UserError(f"not saved: {reply.reason}")
+    console.print(f"saved version {reply.version}: {reply.file}. Use it with the same world:", soft_wrap=True)
+    console.print(f"presage up --world ... --model {reply.file}", soft_wrap=True)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable
 
 from rich.console import Console
 
 from common.errors import UserError
 from common.messages.definitions import Belief, CmdVel, Scan, Stamped
-from common.messages.topics import BELIEF, CMD_VEL, DRIVE, GOAL, ODOM, SCAN, STATUS, Topic
+from common.messages.topics import BELIEF, CMD_VEL, DRIVE, FIELD, GOAL, ODOM, SCAN, STATUS, Topic
 from common.messages.wire import DecodeError
 from presage.replay.comparison import ReplayOutcome
 from presage.replay.goal_times import GoalTimes
@@ -40,6 +40,7 @@ class ScanFeed:
         # each goal is sent where it was recorded.
         self._goal_times: Counter[int | None] | None = None
         self._pending_goals: list[bytes] = []
+        self._fields: defaultdict[int, list[bytes]] = defaultdict(list)  # learned while driving, by stamp
         self._answers = 0  # beliefs
 
     def run(self, console: Console) -> None:
@@ -49,6 +50,9 @@ class ScanFeed:
         )
         if CMD_VEL in self.outputs:
             self._place_goals()
+        for _, message, raw in self.recording.messages(FIELD):
+            if raw.key == FIELD.key(self.services.robot):
+                self._fields[message.stamp_ns].append(raw.payload)
         self._send_goals(None)
         raws = progress(
             self.recording.payloads(self.topics.keys()),
@@ -86,6 +90,8 @@ class ScanFeed:
     def _send_scan(self, scan: Scan, payload: bytes) -> None:
         self.outcome.given += 1
         self._add(self.services.send(SCAN, payload))
+        for field in self._fields.pop(scan.stamp_ns, ()):  # used for the scans after it
+            self._add(self.services.send(FIELD, field))
         self._send_goals(scan.stamp_ns)
 
     def _place_goals(self) -> None:

@@ -124,6 +124,8 @@ def build_services(recording: Recording, names: tuple[str, ...], folder: Path, n
         values: dict[str, Any] = recorded.values
         notes += recorded.notes
         if name == "estimator":
+            if values.get("learn") == "refine":  # what it learned was recorded
+                values = {**values, "learn": "follow"}
             unpacked = estimator_settings(recording, folder, values, weights="log" not in recording.metadata)
             notes += unpacked.notes
             settings = settings_with(EstimatorSettings, unpacked.values)

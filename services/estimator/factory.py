@@ -26,6 +26,7 @@ from services.estimator.precise.gauss_newton import Optimiser
 from services.estimator.precise.global_seeds import SEED_SPACING_M, Seeds, thin_places
 from services.estimator.precise.learning import weights
 from services.estimator.precise.likelihood import Likelihood
+from services.estimator.precise.motion_model import MotionNoise
 from services.estimator.precise.settings import Settings
 from services.estimator.shared.generative_models import GenerativeModel, RayCaster, map_error
 from services.estimator.shared.interface import Estimator, Observation
@@ -99,6 +100,24 @@ class Geometry:
     def upside_down(self) -> Geometry:
         """The geometry of the scanner mounted upside down (a roll of 180 deg), which reverses the order of beams."""
         return replace(self, angles=-self.angles)
+
+    def scanner(self, name: str, rate: float = 1 / MotionNoise.period) -> Scanner:
+        """A scanner with this geometry, for the model card; ``rate`` is in Hz."""
+        angles = self.angles
+        x, y, yaw = map(float, self.mount)
+        return Scanner(
+            name=name,
+            beams=len(angles),
+            fov=min(float(abs(angles[-1] - angles[0])), 2 * np.pi),
+            rate=rate,
+            range_min=0.0,
+            range_max=self.range_max,
+            sigma=self.sigma,
+            sigma_relative=self.sigma_relative,
+            mount=(x, y, yaw),
+            first=float(-angles[0] if angles[-1] < angles[0] else angles[0]),
+            upside_down=bool(angles[-1] < angles[0]),
+        )
 
     def likelihood(self, sigma: float | None = None) -> Likelihood:
         """The likelihood with noise ``sigma`` m, by default the noise that the scans state, or `DEFAULT_SIGMA_M`."""

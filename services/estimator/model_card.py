@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,9 +13,14 @@ import numpy as np
 from common.errors import UserError
 from common.geometry.world import World, load_world
 from common.messages.requests import ModelReply
-from services.estimator.factory import EstimatorOptions, field_path
+from common.versions import commit, versions
+from services.estimator.factory import EstimatorOptions, Geometry, field_path
 from services.estimator.precise.learning import weights as precise_weights
+from services.estimator.precise.learning.drive_learning import HELD_OUT_EVERY
+from services.estimator.precise.learning.live_learning import RECIPE, Version
 from services.estimator.shared.model_folder import find_folder
+
+MODEL_NAME = r"[A-Za-z0-9_-]{1,64}"
 
 
 @dataclass(frozen=True)
@@ -67,6 +73,46 @@ def model_in_use(options: EstimatorOptions, beams: int | None) -> ModelInUse:
         path = paper_weights.nearest(options.models or find_folder(world.name, "paper"), world.name, "paper", beams)
         return _learned(options.estimator, world, path, path.name)
     return ModelInUse(options.estimator, world)
+
+
+def save_learned(folder: Path, name: str, original: ModelInUse, version: Version, geometry: Geometry) -> Path:
+    """Writes a version of the model that was learned while driving; returns its path. Raises UserError if that fails.
+
+    Its calibration is that of the original model, if that has one.
+    """
+    if re.fullmatch(MODEL_NAME, name) is None:
+        raise UserError(f"name {name!r}: give up to 64 letters, digits, - and _")
+    path, field, errors = precise_weights.path_of(folder.resolve(), name), version.model.field, version.errors
+    if path.exists():
+        raise UserError(f"{path} exists already: choose another name")
+    former = precise_weights.FieldCard.model_validate_json(original.card) if original.card else None
+    card = precise_weights.FieldCard(
+        world=original.world,
+        scanner=geometry.scanner("learned while driving") if former is None else former.scanner,
+        samples=version.key_scans,
+        seed=RECIPE.seed,
+        resolution=field.resolution,
+        origin=field.origin,
+        sweeps=RECIPE.sweeps,
+        ripple=version.model.ripple,
+        inflation=1.0 if former is None else former.inflation,
+        test_samples=version.key_scans // HELD_OUT_EVERY,
+        test_range_error_median_m=float(np.median(errors)),
+        test_range_error_mean_m=float(errors.mean()),
+        test_share_above_5_cm=float((errors > 0.05).mean()),
+        test_position_error_rms_m=None,
+        learning_s=0.0,
+        source=f"{version.key_scans} key scans while driving; elsewhere {original.file or 'the map'}",
+        calibration=None if former is None else former.calibration,
+        commit=commit(),
+        command=f"presage save-model {name}",
+        versions=versions(),
+    )
+    try:
+        precise_weights.write(path, version.model, version.seeds, card)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written ({error.strerror}): choose a folder with --saved-models") from None
+    return path
 
 
 def _learned(estimator: str, world: World, path: Path, file: str) -> ModelInUse:

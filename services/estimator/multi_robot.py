@@ -94,6 +94,8 @@ class FleetService(Service):
     def __init__(self, settings: EstimatorSettings) -> None:
         """Raises UserError if a setting is only for one robot."""
         super().__init__(settings)
+        if settings.learn != "none":
+            raise UserError("--learn is for one robot: leave it out, or leave out --robots")
         if settings.initial_pose:
             raise UserError("--initial-pose is for one robot: with --robots, set each pose with `presage relocalise`")
 

@@ -8,17 +8,39 @@ import numpy as np
 
 from common.errors import UserError
 from common.geometry.pose_text import start_of_text
-from common.messages.definitions import Belief, CmdVel, Goal, Hypothesis, Odom, Pose, Prediction, Scan, Stamped
-from common.messages.requests import LocaliseRequest, ModelReply, ModelRequest, PredictRequest, Reply, Request
+from common.messages.definitions import (
+    Belief,
+    CmdVel,
+    Goal,
+    Hypothesis,
+    LearnedField,
+    Odom,
+    Pose,
+    Prediction,
+    Scan,
+    Stamped,
+)
+from common.messages.requests import (
+    LocaliseRequest,
+    ModelReply,
+    ModelRequest,
+    PredictRequest,
+    Reply,
+    Request,
+    SaveModelReply,
+    SaveModelRequest,
+)
 from common.messages.topics import (
     BELIEF,
     CMD_VEL,
+    FIELD,
     GOAL,
     LOCALISE,
     MODEL,
     ODOM,
     PREDICT,
     PREDICTION,
+    SAVE_MODEL,
     SCAN,
     STATUS,
     Query,
@@ -28,11 +50,18 @@ from common.robot.ranges import ranges_for_localisation
 from common.runtime.odometry_sync import OdometrySync, ScanWithOdometry
 from common.runtime.service import Service
 from services.estimator.factory import EstimatorOptions, Factory, Geometry, prepare
-from services.estimator.model_card import ModelInUse, model_in_use
+from services.estimator.field_exchange import FieldAssembler, messages_of
+from services.estimator.learner import LearnedVersion, Learner
+from services.estimator.model_card import ModelInUse, model_in_use, save_learned
 from services.estimator.paper.perception import Descent
+from services.estimator.precise.estimator import PreciseEstimator
+from services.estimator.precise.learning import weights
+from services.estimator.precise.learning.live_learning import mean_error
 from services.estimator.prediction_query import answer_prediction
 from services.estimator.settings import EstimatorSettings
 from services.estimator.shared.interface import Estimator, Observation, Posterior
+
+FIELD_PERIOD_NS = 30_000_000_000  # after which the learned field is published again, for recordings that begin later
 
 
 def estimator_options(settings: EstimatorSettings) -> EstimatorOptions:
@@ -76,7 +105,7 @@ class EstimatorService(Service):
     single: ClassVar[bool] = True
     serves_latched: ClassVar[tuple[Topic, ...]] = (GOAL, STATUS)
     inputs: ClassVar[tuple[Topic, ...]] = (SCAN, GOAL)
-    queries: ClassVar[tuple[Query, ...]] = (LOCALISE, MODEL, PREDICT)
+    queries: ClassVar[tuple[Query, ...]] = (LOCALISE, MODEL, PREDICT, SAVE_MODEL)
 
     def __init__(self, settings: EstimatorSettings, models: Models | None = None) -> None:
         """``models`` are shared by several robots; by default they are loaded in `open`.
@@ -85,7 +114,8 @@ class EstimatorService(Service):
         """
         super().__init__(settings)
         motion_inputs = {"odometry": (ODOM,), "command": (CMD_VEL,)}.get(settings.prior, ())
-        self.inputs = (SCAN, GOAL, *motion_inputs)  # type: ignore[misc]
+        followed = (FIELD,) if settings.learn == "follow" else ()
+        self.inputs = (SCAN, GOAL, *motion_inputs, *followed)  # type: ignore[misc]
         self.models = models
         self.geometry: Geometry | None = None
         self.estimator: Estimator | None = None
@@ -94,10 +124,17 @@ class EstimatorService(Service):
         self.odometry_sync = OdometrySync()  # used if the prior is odometry
         self.command: CmdVel | None = None
         self.last: tuple[int, Belief, Prediction] | None = None  # stamp in ns and results of the latest scan
+        self.field_version = 0  # of the field learned while driving; 0 is the original model
+        self._learner: Learner | None = None
+        self._learned: LearnedVersion | None = None  # in use
+        self._field_ns = 0  # stamp with which it was published last
+        self._assembler = FieldAssembler()
 
     def open(self) -> None:
         """Loads the models, so that missing weights are an error now and not at the first scan."""
         settings = self.settings
+        if settings.learn != "none" and settings.estimator != "precise":
+            raise UserError(f"--learn {settings.learn}: only estimator precise learns, not {settings.estimator}")
         if self.models is None:
             self.log.info("loading the world", world=settings.world)
             self.models = Models(settings)
@@ -110,6 +147,8 @@ class EstimatorService(Service):
             self.goal = None if message.cancel or message.explore else message
         elif isinstance(message, CmdVel):
             self.command = message
+        elif isinstance(message, LearnedField):
+            self._follow(message)
         elif isinstance(message, Odom):
             self._update_all(self.odometry_sync.add_odometry(message))
         elif isinstance(message, Scan):
@@ -117,11 +156,11 @@ class EstimatorService(Service):
             self._update_all(self.odometry_sync.add_scan(message) if wait else [(message, None)])
 
     def on_request(self, query: Query, request: Request) -> Reply:
-        """Answers a request to localise again, to predict scans, or to describe the model."""
+        """Answers a request to localise again, to predict scans, or to describe or save the model."""
         if isinstance(request, ModelRequest):
-            if isinstance(self.model, str):
-                return ModelReply(ok=False, reason=self.model)
-            return self.model.reply(weights=request.weights)
+            return self._describe_model(request)
+        if isinstance(request, SaveModelRequest):
+            return self._save_model(request.name)
         if self.estimator is None or self.geometry is None:
             return query.reply(ok=False, reason="no scan has come yet")
         if isinstance(request, PredictRequest):
@@ -130,7 +169,14 @@ class EstimatorService(Service):
             return super().on_request(query, request)
         start = None if request.pose is None else request.pose.array()
         self.estimator.restart(start if start is None or request.heading_known else start[:2])
+        if self._learner is not None:
+            self._learner.keys.forget_unverified()
         return Reply()
+
+    def _describe_model(self, request: ModelRequest) -> ModelReply:
+        if isinstance(self.model, str):
+            return ModelReply(ok=False, reason=self.model)
+        return self.model.reply(weights=request.weights)
 
     def _update_all(self, scans: list[ScanWithOdometry]) -> None:
         for scan, odom in scans:
@@ -141,11 +187,69 @@ class EstimatorService(Service):
 
     def update_estimator(self, scan: Scan, estimator: Estimator, observation: Observation) -> None:
         """Updates the estimator and publishes the posterior."""
-        self.publish_posterior(scan, estimator.update(observation), estimator.name)
+        posterior = estimator.update(observation)
+        self.publish_posterior(scan, posterior, estimator.name)
+        if self._learner is not None and isinstance(estimator, PreciseEstimator):
+            self._learner.add(posterior, observation, estimator.model)
+            if posterior.state == "tracking":
+                self._use_what_was_learned(self._learner, estimator, scan.stamp_ns)
+            if self._learned is not None and not 0 <= scan.stamp_ns - self._field_ns < FIELD_PERIOD_NS:
+                self._publish_field(self._learned, scan.stamp_ns)
+            self.counters["field_version"] = self.field_version
+            self.counters["key_scans"] = len(self._learner.keys)
+            self.counters["key_scans_dropped"] = self._learner.keys.dropped_total
+
+    def _use_what_was_learned(self, learner: Learner, estimator: PreciseEstimator, stamp_ns: int) -> None:
+        """Uses a version that was learned from now on, and publishes it."""
+        if (learned := learner.take()) is None:
+            return
+        estimator.use_model(learned.version.model, learned.version.seeds)
+        self._learned, self.field_version = learned, self.field_version + 1
+        self.log.info(
+            "learned",
+            version=self.field_version,
+            key_scans=learned.version.key_scans,
+            range_error_mm=round(mean_error(learned.version.errors) * 1e3, 2),
+            before_mm=round(mean_error(learned.version.former_errors) * 1e3, 2),
+        )
+        self._publish_field(learned, stamp_ns)
+
+    def _publish_field(self, learned: LearnedVersion, stamp_ns: int) -> None:
+        self._field_ns = stamp_ns
+        for message in messages_of(learned.data, self.field_version, self._base(), stamp_ns):
+            self.publish(FIELD, message)
+
+    def _base(self) -> str:
+        """SHA-256 of the original model's weights; empty if it has none."""
+        return "" if isinstance(self.model, str) else self.model.sha256
+
+    def _follow(self, message: LearnedField) -> None:
+        """Uses the field that another estimator has learned from the same model."""
+        data = self._assembler.add(message)
+        if data is None or message.version == self.field_version or not isinstance(self.estimator, PreciseEstimator):
+            return
+        if message.base != self._base():
+            self.counters["other_fields"] += 1  # learned from another model
+            return
+        self.estimator.use_model(*weights.decode(data))
+        self.field_version = message.version
+
+    def _save_model(self, name: str) -> SaveModelReply:
+        if self._learned is None or self.geometry is None or isinstance(self.model, str):
+            raise UserError("nothing was learned yet: start with `presage up --learn`, and drive for a minute")
+        path = save_learned(self.settings.saved_models, name, self.model, self._learned.version, self.geometry)
+        self.log.info("model saved", file=str(path), version=self.field_version)
+        return SaveModelReply(file=str(path), version=self.field_version)
+
+    def close(self) -> None:
+        """Ends the process that learns."""
+        if self._learner is not None:
+            self._learner.close()
 
     def publish_posterior(self, scan: Scan, posterior: Posterior, estimator: str) -> None:
         """Publishes the belief and the prediction after a scan."""
-        belief, prediction = belief_message(scan, posterior, estimator), prediction_message(scan, posterior)
+        belief = belief_message(scan, posterior, estimator, self.field_version)
+        prediction = prediction_message(scan, posterior)
         self.last = (scan.stamp_ns, belief, prediction)
         self._publish(belief, prediction)
 
@@ -167,6 +271,7 @@ class EstimatorService(Service):
                 if self.geometry is not None:
                     self.log.warning("the scanner or its mount has changed: localisation starts again")
                 self.estimator, self.geometry = estimator, geometry
+                self._start_learning(geometry)
                 if paper:  # its weights depend on the number of beams
                     self.model = self.models.describe(len(geometry.angles))
         except UserError as error:
@@ -177,6 +282,13 @@ class EstimatorService(Service):
             return None
         self.note = ""
         return self.estimator
+
+    def _start_learning(self, geometry: Geometry) -> None:
+        """Starts to learn with the original model, if the settings say so."""
+        self.close()
+        self.field_version, self._learned = 0, None
+        if self.settings.learn == "refine" and isinstance(self.estimator, PreciseEstimator):
+            self._learner = Learner(self.estimator, geometry)
 
     def _observation(self, scan: Scan, odom: Odom | None) -> Observation:
         prior = self.settings.prior
@@ -195,7 +307,7 @@ class EstimatorService(Service):
         )
 
 
-def belief_message(scan: Scan, posterior: Posterior, estimator: str) -> Belief:
+def belief_message(scan: Scan, posterior: Posterior, estimator: str, field_version: int = 0) -> Belief:
     """The posterior after a scan as a message."""
     return Belief(
         stamp_ns=scan.stamp_ns,
@@ -214,6 +326,7 @@ def belief_message(scan: Scan, posterior: Posterior, estimator: str) -> Belief:
         probability=posterior.probability,
         protection=None if posterior.protection is None else posterior.protection.astype(np.float32),
         estimator=estimator,
+        field_version=field_version,
     )
 
 

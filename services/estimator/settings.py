@@ -23,6 +23,7 @@ class EstimatorSettings(ServiceSettings):
       python -m services.estimator --estimator particle-filter        another estimator, on the same topics
       python -m services.estimator --world office --model exact       cast rays in the world itself, without learning
       python -m services.estimator --world my.yaml --models trained   your world, with weights from folder trained
+      python -m services.estimator --world my.yaml --learn refine     improve them while driving
       python -m services.estimator --initial-pose 3,1.5,90            start from a known pose (m, m, deg)
       python -m services.estimator --robots robot-1,robot-2           one process for several robots
       python -m services.estimator --robots 'robot-*' --max-robots 20 one process for every such robot, at most 20
@@ -31,7 +32,7 @@ class EstimatorSettings(ServiceSettings):
     """
 
     service: ClassVar[str] = "estimator"
-    private: ClassVar[frozenset[str]] = frozenset({"max_robots", "forget"})
+    private: ClassVar[frozenset[str]] = frozenset({"max_robots", "forget", "saved_models"})
 
     robots: Annotated[
         str,
@@ -58,6 +59,14 @@ class EstimatorSettings(ServiceSettings):
     ] = "precise"
     model: Annotated[str, Field(description="model of precise: learned, exact, or a file of weights")] = "learned"
     models: Annotated[Path | None, Field(description="folder of weights; defaults to the shipped ones")] = None
+    learn: Annotated[
+        Literal["none", "refine", "follow"],
+        Field(
+            description="refine: precise improves the model while it is tracking; follow: uses what another estimator "
+            "publishes on `field`, as in a replay"
+        ),
+    ] = "none"
+    saved_models: Annotated[Path, Field(description="folder into which `presage save-model` writes")] = Path()
     prior: Annotated[
         Literal["motion", "odometry", "command"],
         Field(

@@ -132,6 +132,10 @@ class PreciseEstimator:
         self._old_beams = np.zeros(0, np.bool_)  # that end at surfaces seen before
         self._log_change = 0.0  # nats, log probability of what has changed since the scan before
 
+    def use_model(self, model: GenerativeModel, seeds: Seeds) -> None:
+        """Replaces the model by another one in the same frame, between two scans. The belief stays."""
+        self.model, self.seeds = model, seeds
+
     def update(self, observation: Observation) -> Posterior:
         """Returns the posterior after one more scan."""
         posterior = self.track(observation)

@@ -109,6 +109,7 @@ def belief_of(belief: Belief | None) -> Json | None:
         "protection": None if belief.protection is None else belief.protection.tolist(),
         "hypotheses": [{**pose_of(h.pose), "weight": h.weight, "cov": _flat(h.covariance)} for h in belief.hypotheses],
         "estimator": belief.estimator,
+        "field_version": belief.field_version,
     }
 
 

@@ -28,6 +28,7 @@ from services.estimator.precise.learning.field_learning import (
 )
 from services.estimator.precise.learning.surfaces import Beams, SurfaceCells, field_of_surfaces
 from services.estimator.precise.noise import estimate_noise
+from services.estimator.shared.generative_models import GenerativeModel
 
 HELD_OUT_EVERY = 5  # every fifth scan is held out, to measure the precision
 MIN_SCANS = 50
@@ -81,7 +82,7 @@ def learn_drive(
     final = replace(final, scales=scales, ripple=trial.ripple)
     visited = se2.compose(drive.poses, drive.mount)[:, :2]
     if simulated is not None:  # rooms that the drive did not enter, perhaps because a door was closed
-        visited = np.concatenate([visited, _free_places(final, np.unique(simulated.starts, axis=0))])
+        visited = np.concatenate([visited, free_places(final, np.unique(simulated.starts, axis=0))])
     places = seed_places(final.field, visited, final.seen)
     report("learned", 1.0)
     return Learned(final, places, calibration, np.abs(held_out.ranges[both] - expected.ranges[both]))
@@ -96,13 +97,18 @@ def _learn_model(
         beams = measured.joined(still_valid(measured, simulated, recipe.resolution))
     elif simulated is not None:
         beams = measured.joined(_outside_of(measured, simulated))
+    return learn_model(beams, recipe, report)
+
+
+def learn_model(beams: Beams, recipe: Recipe, report: Callable[[float], None] = lambda _done: None) -> FieldModel:
+    """The model that predicts the beams; its scales are not learned."""
     field = learn_field(beams, recipe, lambda _, done: report(done))
     # Rounded to half precision, as the field will be stored and read.
     field = replace(field, phi=field.phi.astype(np.float16).astype(np.float32))
     return FieldModel(field, seen=seen_cells(beams))
 
 
-def _free_places(model: FieldModel, places: Array) -> Array:
+def free_places(model: FieldModel, places: Array) -> Array:
     """The places (N, 2) m in map that are in seen free space."""
     field, seen = model.field, model.seen
     column, row = np.round((places - field.origin) / field.resolution).astype(int).T
@@ -114,6 +120,15 @@ def _free_places(model: FieldModel, places: Array) -> Array:
 def _outside_of(measured: Beams, simulated: Beams) -> Beams:
     """The simulated beams that end where no measured beam has passed; a map's walls are as thick as its cells."""
     return simulated.part(~seen_cells(measured).contains(simulated.ends()))
+
+
+def replay(model: GenerativeModel, places: Array, drive: ReferenceDrive, samples: int, seed: int) -> Beams:
+    """Scans of the drive's scanner as a model predicts them, at random ``places`` of (S, 2) m that it knows."""
+    rng = np.random.default_rng(seed)
+    lasers = np.column_stack([rng.choice(places, samples), rng.uniform(-np.pi, np.pi, samples)])
+    expected = model.expect(lasers, drive.angles)
+    known = np.isfinite(expected.scale) & (expected.ranges < drive.range_max)
+    return Beams.of(lasers, np.zeros(3), drive.angles, np.where(known, expected.ranges, -np.inf))
 
 
 def still_valid(measured: Beams, replayed: Beams, h: float) -> Beams:

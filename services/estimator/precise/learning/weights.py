@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
 
 PRESET = "precise"
+MAX_DECODED_BYTES = 1 << 26  # of a field that was received; enough for 8 hectares
+Tensors = dict[str, np.ndarray[tuple[int, ...], np.dtype[np.generic]]]
 
 
 class FieldCard(BaseModel):
@@ -44,7 +47,8 @@ class FieldCard(BaseModel):
     test_range_error_median_m: float
     test_range_error_mean_m: float
     test_share_above_5_cm: float
-    test_position_error_rms_m: float  # of poses found from scans without noise, so caused by the model alone
+    # of poses found from scans without noise, so caused by the model alone; None if it was not measured
+    test_position_error_rms_m: float | None
     learning_s: float
     source: str = "simulated scans"
     calibration: Calibration | None = None  # on real scans; None if the estimator's defaults hold
@@ -64,27 +68,76 @@ def save(path: Path, model: FieldModel, places: Array, card: FieldCard) -> None:
 
     The field is stored in half precision, whose resolution is finest near zero, at surfaces.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     # Rounded as they will be stored and read.
     phi, places = model.field.phi.astype(np.float16), np.asarray(places, np.float32).astype(np.float64)
     field = replace(model.field, phi=phi.astype(np.float32)).with_solids(places)
-    seeds = Seeds.at(replace(model, field=field), places)
-    tensors: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.generic]]] = {
-        "phi": field.phi.astype(np.float16),
-        "scales": model.scales.astype(np.float32),
-        "places": places.astype(np.float32),
-        "panoramas_in_bytes": seeds.panoramas,
-    }
-    if model.seen is not None:
-        tensors |= {"seen": model.seen.cells.astype(np.uint8), "seen_origin": np.array(model.seen.origin)}
+    model = replace(model, field=field)
+    write(path, model, Seeds.at(model, places), card)
+
+
+def write(path: Path, model: FieldModel, seeds: Seeds, card: FieldCard) -> None:
+    """Writes a field whose solid parts are marked, the seeds of a search and the card, atomically."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(".partial")
-    data = safetensors.numpy.save(tensors)
+    data = safetensors.numpy.save({**_tensors(model, seeds.places), "panoramas_in_bytes": seeds.panoramas})
     partial.write_bytes(data)
     partial.chmod(0o644)
     partial.replace(path)
     card = card.model_copy(update={"weights_sha256": sha256(data)})
     partial.write_text(card.model_dump_json(indent=1) + "\n", encoding="utf-8")
     partial.replace(path.with_suffix(".json"))
+
+
+def encode(model: FieldModel, places: Array) -> bytes:
+    """The field, and the ``places`` (S, 2) m of the seeds of a search, as compressed bytes without a card."""
+    grid = {"grid": np.array([*model.field.origin, model.field.resolution, model.ripple])}
+    return zlib.compress(safetensors.numpy.save({**_tensors(model, places), **grid}))
+
+
+def decode(data: bytes) -> tuple[FieldModel, Seeds]:
+    """The model and the seeds from what `encode` returned. Raises ValueError if they are invalid or too large."""
+    try:
+        tensors = safetensors.numpy.load(zlib.decompressobj().decompress(data, MAX_DECODED_BYTES))
+        _check_arrays(tensors)
+        x, y, resolution, ripple = tensors["grid"].astype(float).tolist()
+    except (zlib.error, safetensors.SafetensorError, KeyError) as error:
+        raise ValueError(f"not a field: {error}") from None
+    if not (np.isfinite([x, y, resolution, ripple]).all() and resolution > 0):
+        raise ValueError("the grid of the field is not valid")
+    field = DistanceField(tensors["phi"].astype(np.float32), (x, y), resolution)
+    model = FieldModel(field, tensors["scales"].astype(np.float64), ripple, _seen(tensors))
+    return model, Seeds.at(model, tensors["places"].astype(np.float64))
+
+
+def _tensors(model: FieldModel, places: Array) -> Tensors:
+    tensors: Tensors = {
+        "phi": model.field.phi.astype(np.float16),
+        "scales": model.scales.astype(np.float32),
+        "places": places.astype(np.float32),
+    }
+    if model.seen is not None:
+        tensors |= {"seen": model.seen.cells.astype(np.uint8), "seen_origin": np.array(model.seen.origin)}
+    return tensors
+
+
+def _check_arrays(tensors: Tensors) -> None:
+    """Raises ValueError unless the arrays of a field have their shapes and are finite."""
+    phi, scales, places = (tensors[name] for name in ("phi", "scales", "places"))
+    panoramas = tensors.get("panoramas_in_bytes")
+    if (
+        phi.ndim != 2
+        or min(phi.shape) < 2
+        or scales.shape != (int(np.prod(CLASSES)),)
+        or places.shape[1:] != (2,)
+        or (panoramas is not None and panoramas.shape != (len(places), 2, PANORAMA_PHASES, RANKED_HEADINGS))
+    ):
+        raise ValueError("an array does not have the shape that a field needs")
+    if not all(np.isfinite(a).all() for a in (phi, scales, places)):
+        raise ValueError("the file contains numbers that are not finite")
+    if "seen" in tensors:
+        cells, origin = tensors["seen"], tensors.get("seen_origin", np.zeros(0))
+        if cells.ndim != 2 or origin.shape != (2,) or not np.isfinite(origin.astype(float)).all():
+            raise ValueError("the grid of seen cells does not have the expected shape")
 
 
 def load(path: Path) -> tuple[FieldModel, Seeds, FieldCard]:
@@ -104,21 +157,15 @@ def load(path: Path) -> tuple[FieldModel, Seeds, FieldCard]:
         raise UserError(
             f"weights {path}: this is not a file of field weights ({' '.join(str(error).split())[:200]})"
         ) from None
+    try:
+        _check_arrays(tensors)
+    except ValueError as error:
+        raise UserError(f"weights {path}: {error}") from None
     panoramas = tensors.get("panoramas_in_bytes")  # files written by older versions have none
-    if (
-        phi.ndim != 2
-        or min(phi.shape) < 2
-        or scales.shape != (int(np.prod(CLASSES)),)
-        or places.shape[1:] != (2,)
-        or (panoramas is not None and panoramas.shape != (len(places), 2, PANORAMA_PHASES, RANKED_HEADINGS))
-    ):
-        raise UserError(f"weights {path}: an array does not have the shape that a field needs")
-    if not all(np.isfinite(a).all() for a in (phi, scales, places)):
-        raise UserError(f"weights {path}: the file contains numbers that are not finite")
     field, places = DistanceField(phi.astype(np.float32), card.origin, card.resolution), places.astype(np.float64)
     if panoramas is None:
         field = field.with_solids(places)
-    model = FieldModel(field, scales.astype(np.float64), card.ripple, _seen(tensors, path))
+    model = FieldModel(field, scales.astype(np.float64), card.ripple, _seen(tensors))
     return model, Seeds.at(model, places) if panoramas is None else Seeds(places, panoramas), card
 
 
@@ -131,14 +178,11 @@ def _load_card(path: Path) -> FieldCard:
         raise UserError(f"model card {path.with_suffix('.json')}: {first_fault(error)}") from None
 
 
-def _seen(tensors: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.generic]]], path: Path) -> Seen | None:
+def _seen(tensors: Tensors) -> Seen | None:
     if "seen" not in tensors:
         return None
-    cells, origin = tensors["seen"], tensors.get("seen_origin", np.zeros(0))
-    if cells.ndim != 2 or origin.shape != (2,) or not np.isfinite(origin.astype(float)).all():
-        raise UserError(f"weights {path}: the grid of seen cells does not have the expected shape")
-    x, y = origin.astype(float)
-    return Seen(cells.astype(bool), (float(x), float(y)))
+    x, y = tensors["seen_origin"].astype(float).tolist()
+    return Seen(tensors["seen"].astype(bool), (x, y))
 
 
 def train_command(world: str, folder: Path = SHIPPED) -> str:

@@ -176,7 +176,8 @@ export function drawHeading(ctx, px, py, yaw, length) {
 /** What a belief amounts to, in a few words, after the probability that it is right. */
 export function describeBelief(belief) {
   const probability = belief.probability != null ? [percent(belief.probability)] : [];
-  return [...probability, describeState(belief)].filter(Boolean).join(", ");
+  const version = belief.field_version ? [`map v${belief.field_version}`] : [];
+  return [...probability, describeState(belief), ...version].filter(Boolean).join(", ");
 }
 
 /** Explains `describeBelief`. */
@@ -187,6 +188,7 @@ export function explainBelief(belief) {
     const [x, y, yaw] = belief.protection;
     lines.push(`Errors exceed ${metres(x)} along the robot, ${metres(y)} across it or ${degrees(yaw, 1)} in one of 10 000 scans each`);
   }
+  if (belief.field_version) lines.push(`Version ${belief.field_version} of the map, learned while driving`);
   return lines.filter(Boolean).join("\n");
 }
 

@@ -1,0 +1,104 @@
+"""Learns the field while driving, in a process of its own, so that tracking is not slowed."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from typing import TYPE_CHECKING
+
+from common.processes import end_with_parent
+from services.estimator.precise.learning import weights
+from services.estimator.precise.learning.key_scans import KeyScans
+from services.estimator.precise.learning.live_learning import Version, learn_version
+
+if TYPE_CHECKING:
+    from common.geometry.se2 import Array
+    from services.estimator.factory import Geometry
+    from services.estimator.precise.estimator import PreciseEstimator
+    from services.estimator.precise.learning.calibration import ReferenceDrive
+    from services.estimator.shared.generative_models import GenerativeModel
+    from services.estimator.shared.interface import Observation, Posterior
+
+NICENESS = 10  # of the process that learns: the other services come first, but it never starves
+
+
+@dataclass(frozen=True)
+class LearnedVersion:
+    """A version of the model, and the bytes from which another process decodes the same."""
+
+    version: Version
+    data: bytes
+
+
+class Learner:
+    """Collects key scans, and learns a version of the model whenever enough of them are new."""
+
+    def __init__(self, estimator: PreciseEstimator, geometry: Geometry) -> None:
+        """The model of the ``estimator`` is the original one."""
+        self.keys = KeyScans(geometry.angles, geometry.mount, geometry.range_max)
+        self._former, self._places = estimator.model, estimator.seeds.places
+        self._pool = ThreadPoolExecutor(1, "learner")
+        self._process: BaseProcess | None = None
+        self._closed = False
+        self._running: Future[LearnedVersion | None] | None = None
+
+    def add(self, posterior: Posterior, observation: Observation, present: GenerativeModel) -> None:
+        """Takes notice of a scan, and starts to learn if that is worthwhile; ``present`` is the model in use."""
+        self.keys.add(posterior, observation)
+        if self._running is None and (drive := self.keys.take_drive()) is not None:
+            self._running = self._pool.submit(self._learn, present, drive)
+
+    def take(self) -> LearnedVersion | None:
+        """The version that was learned since the last call, if any; raises RuntimeError if learning failed."""
+        if self._running is None or not self._running.done():
+            return None
+        done, self._running = self._running, None
+        return done.result()
+
+    def close(self) -> None:
+        """Ends the process."""
+        self._closed = True
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        if (process := self._process) is not None:
+            process.terminate()
+
+    def _learn(self, present: GenerativeModel, drive: ReferenceDrive) -> LearnedVersion | None:
+        # Forking would copy the locks of threads. `start` takes a while, as it sends the arguments to the new process.
+        context = multiprocessing.get_context("spawn")
+        receiver, sender = context.Pipe(duplex=False)
+        self._process = process = context.Process(
+            target=_learn_and_send, args=(sender, os.getpid(), self._former, self._places, present, drive), daemon=True
+        )
+        process.start()
+        sender.close()
+        if self._closed:
+            process.terminate()
+        try:
+            learned: LearnedVersion | None = receiver.recv()
+        except EOFError:
+            process.join()
+            raise RuntimeError(f"the process that learns ended with status {process.exitcode}") from None
+        process.join()
+        return learned
+
+
+def _learn_and_send(
+    sender: Connection,
+    parent: int,
+    former: GenerativeModel,
+    places: Array,
+    present: GenerativeModel,
+    drive: ReferenceDrive,
+) -> None:
+    end_with_parent(parent)
+    os.nice(NICENESS)
+    version, learned = learn_version(former, places, present, drive), None
+    if version is not None:
+        data = weights.encode(version.model, version.seeds.places)
+        model, seeds = weights.decode(data)
+        learned = LearnedVersion(replace(version, model=model, seeds=seeds), data)
+    sender.send(learned)

@@ -1,0 +1,149 @@
+"""Key scans: scans at trusted poses, from which the field is learned while driving.
+
+A scan is trusted while the estimator is `tracking` and its protection level is small. It counts only once the robot has
+driven on for `VERIFIED_AFTER_M` and was still tracked: a pose that turns out to be wrong before that leaves no trace.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from common.geometry import se2
+from common.robot.motion_distortion import beam_times, correct_beams, evenly_spaced
+from common.robot.scan_geometry import Sweep
+from services.estimator.precise.learning.calibration import ReferenceDrive
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from common.geometry.se2 import Array
+    from services.estimator.shared.interface import Observation, Posterior
+
+PLACE_M, HEADINGS = 0.5, 4  # one key scan is kept for each square of this size and each of these headings
+MAX_KEY_SCANS = 4000  # with 622 beams, 10 MB; if there are more, the squares become twice as large
+MIN_DISTANCE_M, MIN_TURN_RAD = 0.25, 0.35  # from one key scan to the next
+MAX_PROTECTION = np.array([0.2, 0.2, np.deg2rad(5)])  # m, m, rad: protection level of a trusted pose
+VERIFIED_AFTER_M = 5.0  # of driving: about a room
+MIN_KEY_SCANS, MIN_NEW, MIN_NEW_SHARE = 50, 20, 0.1  # from which it is worth to learn again
+MAX_GAP_S = 1.0  # without `tracking`; afterwards, the robot may be elsewhere
+# A pose jumps if it moves by more than this between two scans, beyond the speeds of any robot that is expected.
+JUMP_M, JUMP_RAD = 0.2, 0.2
+MAX_SPEED, MAX_TURN = 2.0, 3.0  # m/s, rad/s
+
+
+@dataclass(frozen=True)
+class KeyScan:
+    """A scan as if all its beams had been measured at its stamp."""
+
+    stamp: float  # s
+    pose: Array  # (3,) base_link in map
+    ranges: npt.NDArray[np.float32]  # (B,) m
+    path: float  # m that the robot had driven
+
+    def cell(self, size: float) -> tuple[int, int, int]:
+        """The square of ``size`` m and the heading in which it was taken."""
+        x, y, yaw = self.pose
+        return int(x // size), int(y // size), int(yaw // (2 * np.pi / HEADINGS))
+
+
+class KeyScans:
+    """Collects key scans of one scanner; the newest of each place and heading."""
+
+    def __init__(self, angles: Array, mount: Array, range_max: float) -> None:
+        """``angles`` (B,) rad are those of the scanner's beams, ``mount`` (3,) is the laser in base_link."""
+        self.angles, self.mount, self.range_max = angles, np.asarray(mount, float), range_max
+        self.verified: dict[tuple[int, int, int], KeyScan] = {}  # by cell
+        self.verified_total = 0  # so far
+        self.dropped_total = 0  # because the pose turned out to be wrong
+        self._unverified: deque[KeyScan] = deque()
+        self._taken_total = 0
+        self._size = PLACE_M
+        self._path = 0.0  # m
+        self._last: tuple[float, Array] | None = None  # stamp and pose of the last scan in `tracking`
+        self._last_key: Array | None = None  # (3,) pose
+
+    def __len__(self) -> int:
+        return len(self.verified)
+
+    def add(self, posterior: Posterior, observation: Observation) -> None:
+        """Takes notice of a scan and the posterior after it."""
+        stamp = observation.stamp
+        if stamp is None:
+            return
+        if self._last is not None and not 0 < stamp - self._last[0] <= MAX_GAP_S:
+            self.forget_unverified()
+        if posterior.state != "tracking":
+            return
+        pose, velocity = posterior.pose, None
+        if self._last is not None:
+            period, step = stamp - self._last[0], se2.between(self._last[1], pose)
+            distance = float(np.hypot(step[0], step[1]))
+            if distance > JUMP_M + MAX_SPEED * period or abs(step[2]) > JUMP_RAD + MAX_TURN * period:
+                self.forget_unverified()
+            else:
+                self._path += distance
+                velocity = step / period
+        self._last = stamp, pose
+        self._verify()
+        if velocity is not None and _is_trusted(posterior) and self._is_due(pose):
+            self._last_key = pose
+            ranges = self._corrected(observation, velocity).astype(np.float32)
+            self._unverified.append(KeyScan(stamp, pose, ranges, self._path))
+
+    def forget_unverified(self) -> None:
+        """Drops the scans since the pose was last verified, because it is not certain that the robot was there."""
+        self.dropped_total += len(self._unverified)
+        self._unverified.clear()
+        self._last = self._last_key = None
+
+    def take_drive(self) -> ReferenceDrive | None:
+        """The verified key scans, in order of time, if enough are new since the last time that they were returned."""
+        new = self.verified_total - self._taken_total
+        if len(self.verified) < MIN_KEY_SCANS or new < max(MIN_NEW, MIN_NEW_SHARE * len(self.verified)):
+            return None
+        self._taken_total = self.verified_total
+        keys = self._in_order()
+        return ReferenceDrive(
+            np.array([key.stamp for key in keys]),
+            np.array([key.pose for key in keys]),
+            np.array([key.ranges for key in keys]),
+            self.angles,
+            self.mount,
+            self.range_max,
+        )
+
+    def _in_order(self) -> list[KeyScan]:
+        return sorted(self.verified.values(), key=lambda key: key.stamp)
+
+    def _verify(self) -> None:
+        while self._unverified and self._unverified[0].path <= self._path - VERIFIED_AFTER_M:
+            key = self._unverified.popleft()
+            self.verified[key.cell(self._size)] = key
+            self.verified_total += 1
+        while len(self.verified) > MAX_KEY_SCANS:
+            self._size *= 2
+            self.verified = {key.cell(self._size): key for key in self._in_order()}
+
+    def _is_due(self, pose: Array) -> bool:
+        if self._last_key is None:
+            return True
+        off = se2.between(self._last_key, pose)
+        return bool(np.hypot(off[0], off[1]) >= MIN_DISTANCE_M or abs(off[2]) >= MIN_TURN_RAD)
+
+    def _corrected(self, observation: Observation, velocity: Array) -> Array:
+        """Ranges (B,) in m as if measured at the stamp, along the scanner's beams."""
+        ranges, angles = observation.ranges, observation.angles
+        if observation.time_increment:
+            times = beam_times(len(angles), observation.time_increment)
+            ranges, angles = correct_beams(ranges, angles, times[:, None] * velocity, self.mount)
+        if angles is self.angles or np.array_equal(angles, self.angles):
+            return ranges
+        return evenly_spaced(ranges, angles, Sweep.of_angles(self.angles), -np.inf)
+
+
+def _is_trusted(posterior: Posterior) -> bool:
+    return posterior.protection is not None and bool((posterior.protection <= MAX_PROTECTION).all())

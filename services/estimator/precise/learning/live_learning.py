@@ -1,0 +1,185 @@
+"""Learns the field while driving: a new version of a model, from key scans and from what the former model predicts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import ndimage
+
+from common.geometry import se2
+from services.estimator.precise.field import FieldModel
+from services.estimator.precise.gauss_newton import Prior, View
+from services.estimator.precise.global_seeds import Seeds
+from services.estimator.precise.learning.drive_learning import (
+    HELD_OUT_EVERY,
+    free_places,
+    learn_model,
+    replay,
+    still_valid,
+)
+from services.estimator.precise.learning.field_learning import (
+    MAX_ERROR_M,
+    Recipe,
+    learn_scales,
+    measure_ripple,
+    seed_places,
+    seen_cells,
+)
+from services.estimator.precise.learning.surfaces import Beams
+from services.estimator.precise.likelihood import Likelihood
+from services.estimator.precise.noise import estimate_noise
+from services.estimator.precise.precision import NORMAL_MAD
+
+if TYPE_CHECKING:
+    from common.geometry.se2 import Array
+    from services.estimator.precise.learning.calibration import ReferenceDrive
+    from services.estimator.shared.generative_models import GenerativeModel
+
+RECIPE = Recipe(resolution=0.05, sweeps=6, beams_per_sweep=500_000)
+MAX_REPLAYED_SCANS = 2000  # of the former model; not more than there are places
+PRECISE_M = 1e-3  # error of a former model whose replayed scans count as much as measured ones
+LASTING_S, LASTING_CELL_M = 3.0, 0.1  # a surface is learned if beams end near a cell of it this long after the first
+EPOCHS = 4  # parts of the key scans, of which each may contradict those before it
+ALIGNMENTS = 3  # times that the key scans are matched to the field learned from them
+ALIGNMENT_SCHEDULE_M = (0.02, 0.0, 0.0)  # added to the deviation of every beam, step by step
+FRAME_STEPS = 5  # of Gauss-Newton, with which the key scans are moved into the frame of the former model
+ALIGNMENT_DEVIATION = np.array([0.05, 0.05, 0.02])  # m, m, rad: of the poses of key scans, in a rough map
+
+
+@dataclass(frozen=True)
+class Version:
+    """A new version of a model."""
+
+    model: FieldModel
+    seeds: Seeds
+    key_scans: int  # from which it was learned
+    errors: Array  # (K,) m, of the ranges of held-out key scans
+    former_errors: Array  # (L,) m, the same with the model that was in use
+
+
+def learn_version(
+    former: GenerativeModel, places: Array, present: GenerativeModel, keys: ReferenceDrive, recipe: Recipe = RECIPE
+) -> Version | None:
+    """Learns a field from key scans and the ``former`` model, which knows the surroundings of ``places`` (S, 2) m.
+
+    Returns None if the model in use, ``present``, predicts the key scans as well.
+    """
+    tracked = lasting_surfaces(keys)
+    sigma = estimate_noise(tracked.ranges, tracked.angles)
+    error = _error_of(former, tracked, sigma)
+    replayed = replay(former, places, tracked, min(len(places), MAX_REPLAYED_SCANS), recipe.seed)
+    beside, elsewhere = _divided(replayed, tracked, error, recipe.seed)
+    aligned = tracked
+    for _ in range(ALIGNMENTS):
+        aligned = _aligned(_learn(aligned, beside, recipe, 1), aligned, tracked.poses, sigma)
+    aligned = in_frame_of(former, aligned)
+    numbers = np.arange(len(aligned.poses))
+    is_held_out = numbers % HELD_OUT_EVERY == HELD_OUT_EVERY // 2
+    held_out = aligned.part(is_held_out)
+    trial = _learn(aligned.part(~is_held_out), beside, recipe, EPOCHS)
+    errors, former_errors = range_errors(trial, held_out), range_errors(present, tracked.part(is_held_out))
+    if mean_error(errors) >= mean_error(former_errors):
+        return None
+    scales = learn_scales(trial.field, held_out.poses, held_out.mount, held_out.angles, held_out.ranges, sigma)
+    ripple = measure_ripple(trial.field, se2.compose(held_out.poses, held_out.mount), held_out.angles)
+    final = _learn(aligned, beside.joined(elsewhere), recipe, EPOCHS)
+    visited = se2.compose(aligned.poses, aligned.mount)[:, :2]
+    starts = seed_places(final.field, np.concatenate([visited, free_places(final, places)]), final.seen)
+    starts, scales = (values.astype(np.float32).astype(np.float64) for values in (starts, scales))  # as published
+    model = replace(final, field=final.field.with_solids(starts), scales=scales, ripple=ripple)
+    return Version(model, Seeds.at(model, starts), len(keys.poses), errors, former_errors)
+
+
+def lasting_surfaces(keys: ReferenceDrive) -> ReferenceDrive:
+    """The key scans without beams that end where none ended `LASTING_S` earlier or later, as at a person passing by.
+
+    What is there for longer and then gone is removed when the field is learned, because other beams pass through it.
+    """
+    row, column = np.nonzero(np.isfinite(keys.ranges) & (keys.ranges > 0))
+    if not len(row):
+        return keys
+    ends = Beams.of(keys.poses, keys.mount, keys.angles, keys.ranges).ends()
+    cell = tuple(np.floor((ends - ends.min(axis=0)) / LASTING_CELL_M).astype(int).T)
+    shape = tuple(int(each.max()) + 1 for each in cell)
+    first, last = np.full(shape, np.inf), np.full(shape, -np.inf)
+    np.minimum.at(first, cell, keys.stamps[row])
+    np.maximum.at(last, cell, keys.stamps[row])
+    lasting = ndimage.maximum_filter(last, 3) - ndimage.minimum_filter(first, 3) >= LASTING_S
+    ranges = keys.ranges.copy()
+    fleeting = ~lasting[cell]
+    ranges[row[fleeting], column[fleeting]] = -np.inf
+    return replace(keys, ranges=ranges)
+
+
+def mean_error(errors: Array) -> float:
+    """The mean of errors (K,) in m, of which larger ones than `MAX_ERROR_M`, at changed surroundings, count as that."""
+    return float(np.minimum(errors, MAX_ERROR_M).mean()) if len(errors) else MAX_ERROR_M
+
+
+def range_errors(model: GenerativeModel, keys: ReferenceDrive) -> Array:
+    """Errors (K,) in m of the ranges of key scans, where a surface is expected and was measured."""
+    expected = model.expect(se2.compose(keys.poses, keys.mount), keys.angles)
+    use = np.isfinite(keys.ranges) & np.isfinite(expected.ranges) & np.isfinite(expected.scale)
+    return np.asarray(np.abs(keys.ranges[use] - expected.ranges[use]))
+
+
+def _error_of(model: GenerativeModel, keys: ReferenceDrive, sigma: float) -> float:
+    """Standard deviation in m of the model's errors, beyond the scanner's noise ``sigma`` m."""
+    errors = range_errors(model, keys)
+    errors = errors[errors < MAX_ERROR_M]
+    variance = (NORMAL_MAD * float(np.median(errors))) ** 2 - sigma**2 if len(errors) else 0.0
+    return float(np.sqrt(max(variance, PRECISE_M**2)))
+
+
+def _divided(replayed: Beams, keys: ReferenceDrive, error: float, seed: int) -> tuple[Beams, Beams]:
+    """The beams replayed from a former model that end where key scans saw something, and all others.
+
+    If the model is rough, only few of the former are used: they all have the ``error`` of the model, in m, however many
+    they are, while that of measured beams averages out.
+    """
+    seen = seen_cells(Beams.of(keys.poses, keys.mount, keys.angles, keys.ranges)).contains(replayed.ends())
+    chosen = np.random.default_rng(seed).random(len(seen)) < (PRECISE_M / error) ** 2
+    return replayed.part(seen & chosen), replayed.part(~seen)
+
+
+def _learn(keys: ReferenceDrive, replayed: Beams, recipe: Recipe, epochs: int) -> FieldModel:
+    """The model of key scans in order of time, and of those older and replayed beams that they do not contradict."""
+    beams = replayed
+    for part in np.array_split(np.arange(len(keys.poses)), epochs):
+        measured = Beams.of(keys.poses[part], keys.mount, keys.angles, keys.ranges[part])
+        beams = measured.joined(still_valid(measured, beams, recipe.resolution))
+    return learn_model(beams, recipe)
+
+
+def _aligned(model: GenerativeModel, keys: ReferenceDrive, priors: Array, sigma: float) -> ReferenceDrive:
+    """The key scans at the poses where they fit the model best, near ``priors`` (N, 3)."""
+    information, likelihood = np.diag(ALIGNMENT_DEVIATION**-2.0)[None], Likelihood(sigma)
+    poses = []
+    for pose, prior, ranges in zip(keys.poses, priors, keys.ranges, strict=True):
+        view = View(model, likelihood, keys.mount, keys.angles, ranges.astype(float), keys.range_max)
+        poses.append(view.descend(pose[None], Prior(prior[None], information), ALIGNMENT_SCHEDULE_M)[0][0])
+    return replace(keys, poses=np.array(poses))
+
+
+def in_frame_of(former: GenerativeModel, keys: ReferenceDrive) -> ReferenceDrive:
+    """The key scans, moved together to where they fit the ``former`` model best.
+
+    Least squares of the distances of all beams' ends to the surfaces: errors of a rough map average out.
+    """
+    poses = keys.poses
+    middle = np.array([*poses[:, :2].mean(axis=0), 0.0])
+    for _ in range(FRAME_STEPS):
+        lasers = se2.compose(poses, keys.mount)
+        expected = former.expect(lasers, keys.angles)
+        by_x, by_y, by_yaw = np.moveaxis(expected.jacobian, -1, 0)
+        slope = np.hypot(by_x, by_y)  # of the range by the distance to the surface
+        with np.errstate(invalid="ignore", divide="ignore"):
+            distance = (keys.ranges - expected.ranges) / slope
+            used = (np.abs(distance) < MAX_ERROR_M) & np.isfinite(expected.scale)
+        x, y = ((lasers[:, axis] - middle[axis])[:, None] for axis in (0, 1))
+        J = np.stack([by_x, by_y, by_yaw - y * by_x + x * by_y], axis=-1)[used] / slope[used, None]
+        step = np.linalg.lstsq(J.T @ J, J.T @ distance[used])[0]
+        poses = se2.compose(middle + step, se2.between(middle, poses))
+    return replace(keys, poses=poses)

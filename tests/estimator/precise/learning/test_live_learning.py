@@ -1,0 +1,154 @@
+"""A new version of a model, from key scans of a drive."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from common.geometry import se2
+from common.geometry.world import World
+from lab.integrity.maps import grid_of
+from services.estimator.precise.field import FieldModel
+from services.estimator.precise.learning import weights
+from services.estimator.precise.learning.calibration import ReferenceDrive
+from services.estimator.precise.learning.field_learning import Recipe, learn_field
+from services.estimator.precise.learning.live_learning import (
+    in_frame_of,
+    lasting_surfaces,
+    learn_version,
+    mean_error,
+    range_errors,
+)
+from services.estimator.precise.learning.surfaces import Beams
+from services.estimator.shared.generative_models import RayCaster
+
+SHELL = {"name": "rooms", "boundary": [(0, 0), (8, 0), (8, 4), (0, 4)]}
+WALL = {"polygon": [(4, 0), (4.1, 0), (4.1, 2.8), (4, 2.8)]}  # between two rooms, with a door
+
+
+def rooms(*boxes):
+    return World(obstacles=[WALL, *({"box": {"center": at, "size": (0.6, 0.6)}} for at in boxes)], **SHELL)
+
+
+BEFORE, AFTER = rooms((2, 1), (6, 1)), rooms((1, 2.6), (6, 1))
+ANGLES, SIGMA = np.linspace(-np.pi, np.pi, 180, endpoint=False), 0.01
+RECIPE = Recipe(0.05, sweeps=4, beams_per_sweep=30_000)
+
+
+def drive(world, low, high, count, seed=0, people=()):
+    """Scans at true places between two corners. ``people`` are (place, first, last) of stamps."""
+    rng = np.random.default_rng(seed)
+    places = rng.uniform(low, high, (30 * count, 2))
+    places = places[(BEFORE.clearance(places) > 0.2) & (AFTER.clearance(places) > 0.2)][:count]
+    poses, stamps = np.column_stack([places, rng.uniform(-3, 3, count)]), 0.8 * np.arange(count)
+    ranges = []
+    for pose, stamp in zip(poses, stamps, strict=True):
+        there = [{"circle": {"center": at, "radius": 0.2}} for at, first, last in people if first <= stamp <= last]
+        now = World(obstacles=[*world.obstacles, *there], **SHELL)
+        ranges.append(now.ray_distances(pose[None], ANGLES)[0])
+    ranges = np.array(ranges) + SIGMA * rng.standard_normal((count, len(ANGLES)))
+    return ReferenceDrive(stamps, poses, ranges, ANGLES, np.zeros(3), 20.0)
+
+
+def beams(scans):
+    return Beams.of(scans.poses, scans.mount, scans.angles, scans.ranges)
+
+
+@pytest.fixture(scope="module")
+def former():
+    """A model of both rooms as they were, and the places that it knows."""
+    scans = drive(BEFORE, (0.3, 0.3), (7.7, 3.7), 400, 1)
+    model = FieldModel(learn_field(beams(scans), Recipe(0.05, sweeps=6, beams_per_sweep=200_000)))
+    return model, scans.poses[:150, :2]
+
+
+@pytest.fixture(scope="module")
+def version(former):
+    """A version from a drive in the west room, after the cupboard was moved."""
+    model, places = former
+    return learn_version(model, places, model, drive(AFTER, *WEST, 80), RECIPE)
+
+
+def error(model, world, low, high):
+    """Mean error in m of the ranges of noise-free scans between two corners."""
+    scans = drive(world, low, high, 60, 9)
+    exact = RayCaster(world).expect(scans.poses, ANGLES).ranges
+    return mean_error(range_errors(model, replace(scans, ranges=exact)))
+
+
+WEST, EAST = ((0.3, 0.3), (3.7, 3.7)), ((4.5, 0.3), (7.7, 3.7))
+
+
+def test_moved_cupboard(former, version):
+    """The field follows the cupboard in the west room, and stays as it was in the east room."""
+    model, _ = former
+    before, after = (error(each, AFTER, *WEST) for each in (model, version.model))
+    assert before > 0.01
+    assert after < 0.5 * before
+    assert after < 1.3 * error(model, BEFORE, *WEST) + 0.001
+    before, after = (error(each, AFTER, *EAST) for each in (model, version.model))
+    assert after < before + 0.0015
+    assert version.key_scans == 80
+    assert mean_error(version.errors) < mean_error(version.former_errors)
+    west = drive(AFTER, *WEST, 1).poses
+    assert np.hypot(*(version.seeds.places - west[0, :2]).T).min() < 0.4
+
+
+def test_poses_of_a_rough_map(former):
+    """Poses of a rough map are wrong by centimetres each; the field that they give together is not."""
+    scans, others = (drive(BEFORE, (0.3, 0.3), (7.7, 3.7), 120, seed) for seed in (0, 5))
+    off = np.random.default_rng(3).normal(0, 1, (2, 120, 3)) * (0.02, 0.02, 0.005)
+    rough = RayCaster(grid_of("rough", replace(others, poses=others.poses + off[0])))
+    version = learn_version(rough, former[1], rough, replace(scans, poses=scans.poses + off[1]), RECIPE)
+    assert error(version.model, BEFORE, *WEST) < 0.003
+
+
+def test_frame_of_the_former_model(former):
+    """Key scans that are consistent, but all off by the same, are moved back."""
+    scans = drive(BEFORE, (0.3, 0.3), (7.7, 3.7), 60)
+    moved = se2.compose(np.array([0.03, -0.02, 0.01]), scans.poses)
+    off = in_frame_of(former[0], replace(scans, poses=moved)).poses - scans.poses
+    assert np.abs(off[:, :2]).max() < 0.003
+    assert np.abs(se2.wrap(off[:, 2])).max() < 0.001
+
+
+def test_nothing_new(former):
+    """A model that predicts the scans as well as what could be learned from them stays."""
+    _, places = former
+    exact = RayCaster(BEFORE)
+    assert learn_version(exact, places, exact, drive(BEFORE, *WEST, 60), RECIPE) is None
+
+
+def test_people_leave_no_trace(former, version):
+    model, places = former
+    # Every 8 s somebody walks through the room, 0.8 m between two scans.
+    people = [((0.4 + 0.8 * (k % 10), 0.6 + 0.04 * k), 0.8 * k - 0.1, 0.8 * k + 0.1) for k in range(80) if k % 10 < 5]
+    scans, empty = drive(AFTER, *WEST, 80, people=people), drive(AFTER, *WEST, 80)
+    hit = scans.ranges < empty.ranges - 0.1
+    assert hit.mean() > 0.02
+    kept = lasting_surfaces(scans)
+    assert np.isfinite(kept.ranges[~hit]).mean() > 0.98
+    with_people = learn_version(model, places, model, scans, RECIPE).model
+    assert error(with_people, AFTER, *WEST) < error(version.model, AFTER, *WEST) + 0.002
+
+
+def test_somebody_who_stands_still_for_a_scan():
+    scans = drive(AFTER, *WEST, 30, people=[((1.5, 1.8), 7.9, 9.7)])
+    hit = scans.ranges < drive(AFTER, *WEST, 30).ranges - 0.1
+    kept = lasting_surfaces(scans)
+    assert np.isneginf(kept.ranges[hit]).mean() > 0.8
+
+
+def test_encoded_field(version):
+    data = weights.encode(version.model, version.seeds.places)
+    decoded, seeds = weights.decode(data)
+    assert np.array_equal(decoded.field.phi, version.model.field.phi)
+    assert np.array_equal(decoded.scales, version.model.scales)
+    assert np.array_equal(decoded.seen.cells, version.model.seen.cells)
+    assert (decoded.field.origin, decoded.ripple) == (version.model.field.origin, version.model.ripple)
+    assert np.array_equal(seeds.panoramas, version.seeds.panoramas)
+    for damaged in (b"", data[:-100], data[100:], weights.zlib.compress(b"no arrays")):
+        with pytest.raises(ValueError, match=r"field|array"):
+            weights.decode(damaged)

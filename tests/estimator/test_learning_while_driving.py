@@ -1,0 +1,172 @@
+"""The estimator learns while driving: kidnapping, the messages of the field, saving, and a replay of the session."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from common.bus.bus import wait_until
+from common.bus.inbox import Inbox
+from common.errors import UserError
+from common.geometry import se2
+from common.geometry.world import load_world
+from common.messages.definitions import Belief, LearnedField, Pose, Scan
+from common.messages.requests import SaveModelReply, SaveModelRequest
+from common.messages.topics import BELIEF, FIELD, SAVE_MODEL, SCAN
+from common.robot.scan_geometry import Sweep
+from lab.accuracy.scenes import Scene
+from services.estimator.factory import EstimatorOptions, Geometry, prepare
+from services.estimator.field_exchange import FieldAssembler, messages_of
+from services.estimator.precise.learning import weights
+from services.estimator.precise.learning.key_scans import KeyScans
+from services.estimator.service import EstimatorService
+from services.estimator.settings import EstimatorSettings
+from tests.conftest import WAIT_TIMEOUT_S, received_messages
+
+PERIOD_S, STEP_M, BEAMS = 0.5, 0.25, 120
+WORLD = """
+name: shifted
+boundary: [[-0.02, -0.02], [8.02, -0.02], [8.02, 5.02], [-0.02, 5.02]]
+obstacles:
+  - box: {center: [2, 1.5], size: [0.6, 0.9], yaw_deg: 20}
+  - circle: {center: [6, 3.5], radius: 0.4}
+  - box: {center: [2.7, 3.1], size: [1.4, 0.3], yaw_deg: 10}
+  - polygon: [[5.2, 0], [6.2, 0], [5.6, 0.5]]
+"""
+TRUE_WORLD = WORLD.replace("-0.02", "0").replace(".02", "").replace("shifted", "exact")
+
+
+@pytest.fixture
+def worlds(tmp_path):
+    """A rough map in a file, and the true world."""
+    for name, text in (("rough", WORLD), ("true", TRUE_WORLD)):
+        (tmp_path / f"{name}.yaml").write_text(text)
+    return tmp_path / "rough.yaml", load_world(str(tmp_path / "true.yaml"))
+
+
+def drive(world, metres):
+    """Poses and scans of a drive to and fro between corners of the room."""
+    scene = Scene.of(world, BEAMS, 5000)
+    corners = np.array([[1.0, 0.6], [4.5, 1.0], [7.2, 1.0], [4.5, 2.5], [7.2, 4.4], [4.5, 4.2], [0.8, 4.2], [1.0, 2.8]])
+    route = np.concatenate([corners] * 5)
+    legs = np.hypot(*np.diff(route, axis=0).T).cumsum()
+    at = np.arange(0.0, metres, STEP_M)
+    x, y = (np.interp(at, np.concatenate([[0.0], legs]), route[:, axis]) for axis in (0, 1))
+    poses = np.column_stack([x, y, se2.wrap(0.2 * at)])
+    return poses, [scene.observe(clean, 0.0).ranges for clean in scene.clean(poses)], scene.scanner
+
+
+def scan_message(scanner, k, ranges):
+    first, increment, _ = Sweep.of_angles(scanner.angles())
+    return Scan(
+        stamp_ns=round(PERIOD_S * 1e9) * (k + 1), angle_min=first, angle_increment=increment, range_min=0.05,
+        range_max=scanner.range_max, ranges=ranges, mount=Pose.of(np.array(scanner.mount)), sigma=scanner.sigma,
+    )  # fmt: skip
+
+
+class StoringService(EstimatorService):
+    """Stores messages instead of publishing them."""
+
+    def __init__(self, settings):
+        super().__init__(settings)
+        self.sent = []
+
+    def publish(self, topic, message):
+        self.sent.append(message)
+
+
+def test_kidnapping_while_learning():
+    """What the estimator saw while it took another place for its own is not learned."""
+    office = load_world("office")
+    scene = Scene.of(office, 180, 5000)
+    before, after = (
+        scene.path(25.0, start=np.array([2.0, 3.9, 0.0])),
+        scene.path(25.0, start=np.array([13.0, 4.0, 1.0])),
+    )
+    path, rate = np.concatenate([before, after]), scene.scanner.rate
+    estimator = prepare(EstimatorOptions(office, model="exact"))(Geometry.of(scene.scanner))
+    estimator.restart(path[0])
+    keys = KeyScans(scene.scanner.angles(), np.array(scene.scanner.mount), scene.scanner.range_max)
+    for k, clean in enumerate(scene.clean(path)):
+        observation = scene.observe(clean, k / rate)
+        keys.add(estimator.update(observation), observation)
+    assert keys.dropped_total > 0
+    assert len(keys) > 20
+    for key in keys.verified.values():
+        assert np.hypot(*(key.pose - path[round(key.stamp * rate)])[:2]) < 0.1
+
+
+def test_learn_save_and_follow(process, bus, worlds, tmp_path):
+    rough, true = worlds
+    poses, scans, scanner = drive(true, 45)
+    beliefs, fields, stored = Inbox(), Inbox(), []
+    bus.subscribe(BELIEF, beliefs, keep_all=True)
+    bus.subscribe(FIELD, fields, keep_all=True)
+    start = ",".join(map(str, (*poses[0, :2], np.rad2deg(poses[0, 2]))))
+    settings = {"world": str(rough), "model": "exact", "initial_pose": start}
+    options = [f"--{name.replace('_', '-')}={value}" for name, value in settings.items()]
+    running = process("estimator", *options, "--learn", "refine", "--saved-models", str(tmp_path / "saved"))
+    assert bus.wait_matching(SCAN, WAIT_TIMEOUT_S)
+    assert "nothing was learned" in bus.ask(SAVE_MODEL, SaveModelRequest(name="monday"), SaveModelReply).reason
+    sent = []
+
+    def send(k):
+        message = scan_message(scanner, len(sent), scans[k])
+        sent.append(message)
+        bus.put(SCAN, message.encode())
+        assert wait_until(lambda: any(collect(beliefs, Belief, message.stamp_ns)), WAIT_TIMEOUT_S)
+
+    def collect(inbox, kind, stamp_ns):
+        new = list(received_messages(inbox, kind))
+        stored.extend(new)
+        return (each for each in new if each.stamp_ns == stamp_ns)
+
+    for k in range(len(scans)):
+        send(k)
+    # The robot stands until a version is learned from the scans so far.
+    assert wait_until(lambda: send(len(scans) - 1) or stored[-1].field_version > 0, 120), running.output
+    assert {belief.state for belief in stored[-20:]} == {"tracking"}
+
+    parts = list(received_messages(fields, LearnedField))
+    assembler = FieldAssembler()
+    data = next(data for part in parts if (data := assembler.add(part)) is not None)
+    reply = bus.ask(SAVE_MODEL, SaveModelRequest(name="monday"), SaveModelReply)
+    assert reply.ok, reply.reason
+    assert reply.version == stored[-1].field_version
+    assert "exists already" in bus.ask(SAVE_MODEL, SaveModelRequest(name="monday"), SaveModelReply).reason
+    assert "letters" in bus.ask(SAVE_MODEL, SaveModelRequest(name="../monday"), SaveModelReply).reason
+    saved = tmp_path / "saved" / "monday-precise.safetensors"
+    model, _, card = weights.load(saved)
+    assert "key scans while driving" in card.source
+    if reply.version == 1:
+        assert np.array_equal(model.field.phi, weights.decode(data)[0].field.phi)
+
+    # Another estimator that follows the recorded messages has the same beliefs.
+    replayed = StoringService(EstimatorSettings(**settings, learn="follow"))
+    replayed.open()
+    for message in sent:
+        replayed.on_message(SCAN, message)
+        for part in parts:
+            if part.stamp_ns == message.stamp_ns:
+                replayed.on_message(FIELD, part)
+    again = {each.stamp_ns: each for each in replayed.sent if isinstance(each, Belief)}
+    assert len(again) == len(stored)
+    for belief in stored:
+        assert again[belief.stamp_ns].pose == belief.pose
+        assert again[belief.stamp_ns].field_version == belief.field_version
+
+
+def test_parts():
+    data = np.random.default_rng(0).bytes(1_300_000)
+    first, second = (messages_of(data, version, "base", version) for version in (1, 2))
+    assert len(first) == 3
+    assembler = FieldAssembler()
+    assert [assembler.add(part) for part in first] == [None, None, data]
+    assert assembler.add(second[0]) is assembler.add(second[2]) is None  # one is missing
+    assert [assembler.add(part) for part in (first[0], second[1], second[2])] == [None, None, None]
+    assert [assembler.add(part) for part in second][-1] == data
+
+
+def test_only_precise_learns():
+    with pytest.raises(UserError, match="only estimator precise learns"):
+        EstimatorService(EstimatorSettings(estimator="particle-filter", learn="refine")).open()
