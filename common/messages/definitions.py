@@ -172,8 +172,8 @@ class LearnedField(Stamped):
 
     version: Count  # from 1; all parts of a version have the same
     base: Name = ""  # SHA-256 of the original model's weights, hexadecimal; empty if it has none
-    part: Annotated[int, Field(ge=0, lt=1000)] = 0
-    parts: Annotated[int, Field(ge=1, le=1000)] = 1
+    part: Annotated[int, Field(ge=0, lt=1000)] = 0  # index of this part
+    parts: Annotated[int, Field(ge=1, le=1000)] = 1  # of this version
     data: Bytes  # all parts joined are the field's arrays in the format safetensors, compressed by zlib
     frame_id: Name = "map"
 

@@ -32,6 +32,7 @@ from common.messages.definitions import (
     Drive,
     Goal,
     Health,
+    LearnedField,
     Map,
     Odom,
     Plan,
@@ -129,6 +130,7 @@ class SessionConverter:
             Plan: self._plan,
             Preference: self._preference,
             Map: self._map,
+            LearnedField: self._learned_field,
         }
 
     def convert(self, topic: Topic, message: Stamped, raw: Raw) -> Iterator[FoxgloveMessage]:
@@ -214,6 +216,10 @@ class SessionConverter:
 
     def _map(self, grown: Map, ns: int, _: int) -> Iterator[tuple[str, Any]]:
         yield "/map", shapes.grown_map(grown, ns)
+
+    def _learned_field(self, field: LearnedField, _: int, logged: int) -> Iterator[tuple[str, Any]]:
+        text = f"uses version {field.version} of its field, learned while driving"
+        yield from self._log("estimator", str(field.version), text, logged, topic="field")
 
     def _status(self, status: Status, _: int, logged: int) -> Iterator[tuple[str, Any]]:
         yield "/status", numbers.of_status(status)

@@ -13,6 +13,7 @@ from common.messages.definitions import (
     Goal,
     Health,
     Hypothesis,
+    LearnedField,
     Map,
     Odom,
     Plan,
@@ -30,6 +31,7 @@ from common.messages.topics import (
     BELIEF,
     CMD_VEL,
     DRIVE,
+    FIELD,
     GOAL,
     HEALTH,
     MAP,
@@ -64,6 +66,7 @@ GROWN = Map(
     grid=OccupancyGrid.of(np.array([[FREE, OCCUPIED, UNKNOWN]], np.uint8), 0.05, (1.0, 2.0, 0.0)),
     poses=[(1, 1, 0)],
 )
+LEARNED = LearnedField(stamp_ns=GOAL_AT * PERIOD_NS, version=1, data=np.zeros(8, np.uint8))
 
 
 def true(i):
@@ -116,6 +119,7 @@ def events(robot="rob"):
             yield PLAN, PLAN.key(robot), PLANNED, at + BELIEVED_NS
             yield PREFERENCE, PREFERENCE.key(robot), PREFERRED, at + BELIEVED_NS
             yield MAP, MAP.key(robot), GROWN, at + BELIEVED_NS
+            yield FIELD, FIELD.key(robot), LEARNED, at + BELIEVED_NS
             yield DRIVE, DRIVE.key(robot), Drive(stamp_ns=stamp, twist=twist), at + BELIEVED_NS
         state, distance = ("navigating", 3.5) if i >= GOAL_AT else ("idle", None)
         status = Status(stamp_ns=stamp, seq=i, state=state, reason="on the way" * (i >= GOAL_AT), distance=distance)
