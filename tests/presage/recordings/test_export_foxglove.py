@@ -221,7 +221,7 @@ def test_log_lines(tmp_path):
         ("estimator", "uses version 1 of its field, learned while driving", 2),
         ("controller", "navigating: on the way", 2),
     ] + [("estimator", "no complaint any more", 2)] * (len(lines) - 7)
-    assert len(lines) == 7
+    assert len(lines) == 8
 
 
 def test_cancelled_goal(tmp_path):
