@@ -23,7 +23,6 @@ from services.estimator.shared.interface import Estimator, Observation, Posterio
 from services.mapper.slam.drive import Laser
 from services.mapper.slam.front_end import FrontEnd
 
-EXACT, TUNED, SIMULATED = "exact", "tuned", "simulator's"  # how noise and map are known
 NOISE_STEP_M = 0.1  # over which the noise of AMCL's motion model equals the learned one
 NOISE_STEP_RAD = 0.1
 NOMINAL_PERIOD_S = 1 / 15  # of scans without stamps
@@ -51,17 +50,10 @@ class Place:
 
 @dataclass(frozen=True)
 class Contender:
-    """An estimator, and what it is told or has learned."""
+    """An estimator that takes part in the comparison."""
 
     make: Callable[[Place], Estimator]
-    sigma: str  # how it knows the scanner's noise
-    drift: str  # how it knows the odometry's noise
-    map: str
-
-    @property
-    def learns(self) -> bool:
-        """Whether it uses what presage has learned of a place."""
-        return self.map != EXACT
+    learns: bool = False  # whether it uses what presage has learned of a place
 
 
 @dataclass(frozen=True)
@@ -90,7 +82,7 @@ class ScanMatchedOdometry:
         self.restart()
 
     def restart(self, pose: Array | None = None, covariance: Array | None = None) -> None:
-        """Starts both anew."""
+        """Restarts the front end and the estimator."""
         geometry = self._geometry
         self._front_end = FrontEnd(Laser(geometry.angles, geometry.mount, geometry.range_max))
         self._stamp = 0.0
@@ -173,14 +165,14 @@ def _correlative(place: Place) -> Estimator:
 
 
 CONTENDERS = {
-    "precise": Contender(_by_service("precise"), EXACT, SIMULATED, "learned from scans at exact poses"),
-    "precise-exact": Contender(_by_service("precise", "exact"), EXACT, SIMULATED, EXACT),
-    "particle-filter": Contender(_by_service("particle-filter"), TUNED, "AMCL's default", EXACT),
-    "amcl-defaults": Contender(_by_service("amcl-defaults"), "AMCL's default", "AMCL's default", EXACT),
-    "particle-filter-all-beams": Contender(_with_particles(), TUNED, SIMULATED, EXACT),
-    "particle-filter-no-recovery": Contender(_with_particles(**NO_RECOVERY), TUNED, SIMULATED, EXACT),
-    "particle-filter-learned-field": Contender(_on_learned_field, TUNED, SIMULATED, "presage's"),
-    "particle-filter-beam-model": Contender(_with_particles(**BEAM_MODEL), TUNED, SIMULATED, EXACT),
-    "particle-filter-scan-matching": Contender(_scan_matched, TUNED, SIMULATED, EXACT),
-    "correlative": Contender(_correlative, TUNED, "–", EXACT),
+    "precise": Contender(_by_service("precise"), learns=True),
+    "precise-exact": Contender(_by_service("precise", "exact")),
+    "particle-filter": Contender(_by_service("particle-filter")),
+    "amcl-defaults": Contender(_by_service("amcl-defaults")),
+    "particle-filter-all-beams": Contender(_with_particles()),
+    "particle-filter-no-recovery": Contender(_with_particles(**NO_RECOVERY)),
+    "particle-filter-learned-field": Contender(_on_learned_field, learns=True),
+    "particle-filter-beam-model": Contender(_with_particles(**BEAM_MODEL)),
+    "particle-filter-scan-matching": Contender(_scan_matched),
+    "correlative": Contender(_correlative),
 }

@@ -6,7 +6,7 @@ import numpy as np
 
 from common.messages.definitions import LearnedField
 
-PART_BYTES = 1 << 19  # of data; a payload may have twice as many
+PART_BYTES = 1 << 19  # of data in one message; the bus accepts payloads of twice this size
 
 
 def messages_of(data: bytes, version: int, base: str, stamp_ns: int) -> list[LearnedField]:

@@ -40,14 +40,14 @@ class Learner:
     def __init__(self, estimator: PreciseEstimator, geometry: Geometry) -> None:
         """The model of the ``estimator`` is the original one."""
         self.keys = KeyScans(geometry.angles, geometry.mount, geometry.range_max)
-        self._former, self._places = estimator.model, estimator.seeds.places
+        self._original, self._places = estimator.model, estimator.seeds.places
         self._pool = ThreadPoolExecutor(1, "learner")
         self._process: BaseProcess | None = None
         self._closed = False
         self._running: Future[LearnedVersion | None] | None = None
 
     def add(self, posterior: Posterior, observation: Observation, present: GenerativeModel) -> None:
-        """Takes notice of a scan, and starts to learn if that is worthwhile; ``present`` is the model in use."""
+        """Adds a scan, and starts learning if enough key scans are new; ``present`` is the model in use."""
         self.keys.add(posterior, observation)
         if self._running is None and (drive := self.keys.take_drive()) is not None:
             self._running = self._pool.submit(self._learn, present, drive)
@@ -70,10 +70,13 @@ class Learner:
         # Forking would copy the locks of threads. `start` takes a while, as it sends the arguments to the new process.
         context = multiprocessing.get_context("spawn")
         receiver, sender = context.Pipe(duplex=False)
-        self._process = process = context.Process(
-            target=_learn_and_send, args=(sender, os.getpid(), self._former, self._places, present, drive), daemon=True
+        process = context.Process(
+            target=_learn_and_send,
+            args=(sender, os.getpid(), self._original, self._places, present, drive),
+            daemon=True,
         )
         process.start()
+        self._process = process  # only now, because a process that has not started cannot be terminated
         sender.close()
         if self._closed:
             process.terminate()
@@ -89,14 +92,14 @@ class Learner:
 def _learn_and_send(
     sender: Connection,
     parent: int,
-    former: GenerativeModel,
+    original: GenerativeModel,
     places: Array,
     present: GenerativeModel,
     drive: ReferenceDrive,
 ) -> None:
     end_with_parent(parent)
     os.nice(NICENESS)
-    version, learned = learn_version(former, places, present, drive), None
+    version, learned = learn_version(original, places, present, drive), None
     if version is not None:
         data = weights.encode(version.model, version.seeds.places)
         model, seeds = weights.decode(data)

@@ -210,7 +210,7 @@ class EstimatorService(Service):
             version=self.field_version,
             key_scans=learned.version.key_scans,
             range_error_mm=round(mean_error(learned.version.errors) * 1e3, 2),
-            before_mm=round(mean_error(learned.version.former_errors) * 1e3, 2),
+            before_mm=round(mean_error(learned.version.present_errors) * 1e3, 2),
         )
         self._publish_field(learned, stamp_ns)
 

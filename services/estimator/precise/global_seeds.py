@@ -22,7 +22,7 @@ RANKED_HEADINGS, RANKED_BEAMS = 120, 72  # that are compared with the panorama o
 PANORAMA_PHASES = 3  # directions of a panorama for each of these headings
 PANORAMA_BINS = PANORAMA_PHASES * RANKED_HEADINGS
 RANGE_STEP_M = 0.1  # of a stored range; 0 is unknown
-MAX_RANGE_STEPS = 255  # of which a stored range has at most this many
+MAX_RANGE_STEPS = 255  # largest stored range, so that it fits a byte
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The error of the estimate, if what is taken for a surface of the map may be another one.
+"""Covariance and protection level of the pose, allowing for one mistaken surface.
 
 The inverse of the curvature presumes that every surface was recognised. But each may be another one than the map shows
 there, such as a cabinet before a wall, and then it has moved the estimate. As in satellite navigation, the pose is
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from services.estimator.precise.gauss_newton import View
     from services.estimator.precise.likelihood import Evidence
 
-EXCEEDED_SHARE = 1e-4  # of the scans, whose error may exceed the protection level
+EXCEEDED_SHARE = 1e-4  # probability that the error exceeds the protection level
 MISTAKEN_SURFACE = 0.01  # share of a scan's surfaces that are taken for a surface of the map and are another one
 BISECTIONS = 20  # of an interval of some metres, to micrometres
 

@@ -70,7 +70,7 @@ class KeyScans:
         return len(self.verified)
 
     def add(self, posterior: Posterior, observation: Observation) -> None:
-        """Takes notice of a scan and the posterior after it."""
+        """Processes a scan and the posterior after it; keeps the scan if it is due as a key scan."""
         stamp = observation.stamp
         if stamp is None:
             return

@@ -1,4 +1,4 @@
-"""Learns the field while driving: a new version of a model, from key scans and from what the former model predicts."""
+"""Learns a new version of the field while driving, from key scans and from what the original model predicts."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ if TYPE_CHECKING:
     from services.estimator.shared.generative_models import GenerativeModel
 
 RECIPE = Recipe(resolution=0.05, sweeps=6, beams_per_sweep=500_000)
-MAX_REPLAYED_SCANS = 2000  # of the former model; not more than there are places
-PRECISE_M = 1e-3  # error of a former model whose replayed scans count as much as measured ones
+MAX_REPLAYED_SCANS = 2000  # of the original model; not more than there are places
+PRECISE_M = 1e-3  # error of an original model whose replayed scans count as much as measured ones
 LASTING_S, LASTING_CELL_M = 3.0, 0.1  # a surface is learned if beams end near a cell of it this long after the first
 EPOCHS = 4  # parts of the key scans, of which each may contradict those before it
 ALIGNMENTS = 3  # times that the key scans are matched to the field learned from them
 ALIGNMENT_SCHEDULE_M = (0.02, 0.0, 0.0)  # added to the deviation of every beam, step by step
-FRAME_STEPS = 5  # of Gauss-Newton, with which the key scans are moved into the frame of the former model
+FRAME_STEPS = 5  # of Gauss-Newton, with which the key scans are moved into the frame of the original model
 ALIGNMENT_DEVIATION = np.array([0.05, 0.05, 0.02])  # m, m, rad: of the poses of key scans, in a rough map
 
 
@@ -56,31 +56,34 @@ class Version:
     seeds: Seeds
     key_scans: int  # from which it was learned
     errors: Array  # (K,) m, of the ranges of held-out key scans
-    former_errors: Array  # (L,) m, the same with the model that was in use
+    present_errors: Array  # (L,) m, the same with the model that was in use
 
 
 def learn_version(
-    former: GenerativeModel, places: Array, present: GenerativeModel, keys: ReferenceDrive, recipe: Recipe = RECIPE
+    original: GenerativeModel, places: Array, present: GenerativeModel, keys: ReferenceDrive, recipe: Recipe = RECIPE
 ) -> Version | None:
-    """Learns a field from key scans and the ``former`` model, which knows the surroundings of ``places`` (S, 2) m.
+    """Learns a field from key scans and the ``original`` model, which knows the surroundings of ``places`` (S, 2) m.
 
     Returns None if the model in use, ``present``, predicts the key scans as well.
     """
     tracked = lasting_surfaces(keys)
     sigma = estimate_noise(tracked.ranges, tracked.angles)
-    error = _error_of(former, tracked, sigma)
-    replayed = replay(former, places, tracked, min(len(places), MAX_REPLAYED_SCANS), recipe.seed)
+    error = _error_of(original, tracked, sigma)
+    replayed = replay(original, places, tracked, min(len(places), MAX_REPLAYED_SCANS), recipe.seed)
     beside, elsewhere = _divided(replayed, tracked, error, recipe.seed)
     aligned = tracked
     for _ in range(ALIGNMENTS):
         aligned = _aligned(_learn(aligned, beside, recipe, 1), aligned, tracked.poses, sigma)
-    aligned = in_frame_of(former, aligned)
+    aligned = in_frame_of(original, aligned)
     numbers = np.arange(len(aligned.poses))
     is_held_out = numbers % HELD_OUT_EVERY == HELD_OUT_EVERY // 2
     held_out = aligned.part(is_held_out)
     trial = _learn(aligned.part(~is_held_out), beside, recipe, EPOCHS)
-    errors, former_errors = range_errors(trial, held_out), range_errors(present, tracked.part(is_held_out))
-    if mean_error(errors) >= mean_error(former_errors):
+    unaligned = tracked.part(is_held_out)
+    errors, present_errors = (
+        range_errors(model, _aligned(model, unaligned, unaligned.poses, sigma)) for model in (trial, present)
+    )
+    if mean_error(errors) >= mean_error(present_errors):
         return None
     scales = learn_scales(trial.field, held_out.poses, held_out.mount, held_out.angles, held_out.ranges, sigma)
     ripple = measure_ripple(trial.field, se2.compose(held_out.poses, held_out.mount), held_out.angles)
@@ -89,7 +92,7 @@ def learn_version(
     starts = seed_places(final.field, np.concatenate([visited, free_places(final, places)]), final.seen)
     starts, scales = (values.astype(np.float32).astype(np.float64) for values in (starts, scales))  # as published
     model = replace(final, field=final.field.with_solids(starts), scales=scales, ripple=ripple)
-    return Version(model, Seeds.at(model, starts), len(keys.poses), errors, former_errors)
+    return Version(model, Seeds.at(model, starts), len(keys.poses), errors, present_errors)
 
 
 def lasting_surfaces(keys: ReferenceDrive) -> ReferenceDrive:
@@ -134,9 +137,9 @@ def _error_of(model: GenerativeModel, keys: ReferenceDrive, sigma: float) -> flo
 
 
 def _divided(replayed: Beams, keys: ReferenceDrive, error: float, seed: int) -> tuple[Beams, Beams]:
-    """The beams replayed from a former model that end where key scans saw something, and all others.
+    """The beams replayed from the original model that end where key scans saw something, and all others.
 
-    If the model is rough, only few of the former are used: they all have the ``error`` of the model, in m, however many
+    If the model is rough, only few of those are used: they all have the ``error`` of the model, in m, however many
     they are, while that of measured beams averages out.
     """
     seen = seen_cells(Beams.of(keys.poses, keys.mount, keys.angles, keys.ranges)).contains(replayed.ends())
@@ -163,8 +166,8 @@ def _aligned(model: GenerativeModel, keys: ReferenceDrive, priors: Array, sigma:
     return replace(keys, poses=np.array(poses))
 
 
-def in_frame_of(former: GenerativeModel, keys: ReferenceDrive) -> ReferenceDrive:
-    """The key scans, moved together to where they fit the ``former`` model best.
+def in_frame_of(original: GenerativeModel, keys: ReferenceDrive) -> ReferenceDrive:
+    """The key scans, moved together to where they fit the ``original`` model best.
 
     Least squares of the distances of all beams' ends to the surfaces: errors of a rough map average out.
     """
@@ -172,7 +175,7 @@ def in_frame_of(former: GenerativeModel, keys: ReferenceDrive) -> ReferenceDrive
     middle = np.array([*poses[:, :2].mean(axis=0), 0.0])
     for _ in range(FRAME_STEPS):
         lasers = se2.compose(poses, keys.mount)
-        expected = former.expect(lasers, keys.angles)
+        expected = original.expect(lasers, keys.angles)
         by_x, by_y, by_yaw = np.moveaxis(expected.jacobian, -1, 0)
         slope = np.hypot(by_x, by_y)  # of the range by the distance to the surface
         with np.errstate(invalid="ignore", divide="ignore"):

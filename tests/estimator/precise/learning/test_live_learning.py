@@ -91,7 +91,7 @@ def test_moved_cupboard(former, version):
     before, after = (error(each, AFTER, *EAST) for each in (model, version.model))
     assert after < before + 0.0015
     assert version.key_scans == 80
-    assert mean_error(version.errors) < mean_error(version.former_errors)
+    assert mean_error(version.errors) < mean_error(version.present_errors)
     west = drive(AFTER, *WEST, 1).poses
     assert np.hypot(*(version.seeds.places - west[0, :2]).T).min() < 0.4
 
