@@ -100,10 +100,9 @@ tables: install ## measure all tables of README and docs/ at this commit, and fi
 	$(BIN)/presage bench accuracy --estimators all --tasks standing,blocked,furnished,tracking,odometry --seed 2801 --seeds 5 --trials 10 --minutes 0.2 --json $(RESULTS)/accuracy-rivals.json
 	$(BIN)/presage experiment --out $(RESULTS) all
 	$(if $(PEERS),OMP_NUM_THREADS=1 PRESAGE_WORKERS=1 $(BIN)/presage experiment --seed 2801 --out $(RESULTS) peers '$(PEERS)')
-	$(BIN)/presage bench integrity --out experiments/integrity --worlds 10 --seed 2711 --model exact --seconds 10
+	$(BIN)/presage bench integrity --out experiments/integrity --worlds 3 --seed 2911 --model exact --seconds 10
 	$(BIN)/presage bench integrity --out experiments/integrity-long-corridor --worlds 20 --seed 2712 --model exact --seconds 10 --cases long-corridor --estimators precise
 	$(BIN)/presage bench integrity --out experiments/integrity-moved-50 --worlds 20 --seed 2611 --model exact --cases moved-50
-	$(BIN)/presage bench integrity --out experiments/integrity-single-scan-moved-50 --worlds 20 --seed 2611 --model exact --cases single-scan-moved-50 --estimators precise
 	for folder in experiments/integrity*; do cp $$folder/integrity.json $(RESULTS)/$${folder#*/}.json || exit 1; done
 	cp experiments/integrity/integrity.png $(RESULTS)/
 	for page in README.md docs/*.md; do $(BIN)/presage experiment --out $(RESULTS) tables --page $$page || exit 1; done
