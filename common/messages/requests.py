@@ -18,6 +18,8 @@ from common.messages.wire import Bytes, Count, Finite, Floats, Message, Name, No
 from common.robot.base import Robot
 from common.robot.scanner import Scanner
 
+FILE_NAME = r"[A-Za-z0-9_-]{1,64}"  # under which maps and models may be saved
+
 
 class Request(Message):
     """Base of all requests, and a request without parameters."""

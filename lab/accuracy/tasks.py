@@ -99,14 +99,29 @@ def standing(estimator: Estimator, scene: Scene, trials: int, progress: Progress
     poses = scene.poses(trials)
     limits = bound.position(bound.single(scene, poses))
     for pose, clean, limit in zip(progress(poses), scene.clean(poses), limits, strict=True):
-        estimator.restart()
-        for k in range(STANDING_SCANS):
-            first = k == 0
-            posterior = _timed_update(estimator, scene.observe(clean, k / scene.scanner.rate), one if first else many)
-            if first:
-                one.add(posterior, pose, limit)
-        many.add(posterior, pose, limit / np.sqrt(STANDING_SCANS))
+        _stand(estimator, scene, pose, clean, (one, many), limit)
     return {"from nothing, 1 scan": one, "standing, 20 scans": many}
+
+
+def _stand(
+    estimator: Estimator,
+    scene: Scene,
+    pose: Array,
+    clean: Array,
+    outcomes: tuple[TaskOutcome, TaskOutcome],
+    limit: float | None = None,
+) -> None:
+    """Localises a standing robot from an unknown start; ``outcomes`` are those after one scan and after all.
+
+    ``clean`` (B,) m is the scan without noise, ``limit`` the bound of the position error in m after one scan.
+    """
+    one, many = outcomes
+    estimator.restart()
+    for k in range(STANDING_SCANS):
+        posterior = _timed_update(estimator, scene.observe(clean, k / scene.scanner.rate), one if k == 0 else many)
+        if k == 0:
+            one.add(posterior, pose, limit)
+    many.add(posterior, pose, None if limit is None else limit / np.sqrt(STANDING_SCANS))
 
 
 def blocked(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, TaskOutcome]:
@@ -117,13 +132,7 @@ def blocked(estimator: Estimator, scene: Scene, trials: int, progress: ProgressW
     one, many = TaskOutcome(), TaskOutcome()
     poses = scene.poses(trials)
     for pose, clean in zip(progress(poses), scene.clean(poses), strict=True):
-        estimator.restart()
-        hidden = scene.blocked(clean, 0.3)
-        for k in range(STANDING_SCANS):
-            posterior = _timed_update(estimator, scene.observe(hidden, k / scene.scanner.rate), one if k == 0 else many)
-            if k == 0:
-                one.add(posterior, pose, None)
-        many.add(posterior, pose, None)
+        _stand(estimator, scene, pose, scene.blocked(clean, 0.3), (one, many))
     return {"30 % blocked, 1 scan": one, "30 % blocked, 20 scans": many}
 
 
@@ -131,13 +140,7 @@ def furnished(estimator: Estimator, scene: Scene, trials: int, progress: Progres
     """Global localisation with 30 % of the beams changed by furniture and glass that the map lacks."""
     one, many = TaskOutcome(), TaskOutcome()
     for pose in progress(scene.poses(trials)):
-        estimator.restart()
-        clean = scene.furnished(pose, 0.3)
-        for k in range(STANDING_SCANS):
-            posterior = _timed_update(estimator, scene.observe(clean, k / scene.scanner.rate), one if k == 0 else many)
-            if k == 0:
-                one.add(posterior, pose, None)
-        many.add(posterior, pose, None)
+        _stand(estimator, scene, pose, scene.furnished(pose, 0.3), (one, many))
     return {"30 % furniture, 1 scan": one, "30 % furniture, 20 scans": many}
 
 

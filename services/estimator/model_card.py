@@ -12,15 +12,13 @@ import numpy as np
 
 from common.errors import UserError
 from common.geometry.world import World, load_world
-from common.messages.requests import ModelReply
+from common.messages.requests import FILE_NAME, ModelReply
 from common.versions import commit, versions
 from services.estimator.factory import EstimatorOptions, Geometry, field_path
 from services.estimator.precise.learning import weights as precise_weights
 from services.estimator.precise.learning.drive_learning import HELD_OUT_EVERY
 from services.estimator.precise.learning.live_learning import RECIPE, Version
 from services.estimator.shared.model_folder import find_folder
-
-MODEL_NAME = r"[A-Za-z0-9_-]{1,64}"
 
 
 @dataclass(frozen=True)
@@ -80,7 +78,7 @@ def save_learned(folder: Path, name: str, original: ModelInUse, version: Version
 
     Its calibration is that of the original model, if that has one.
     """
-    if re.fullmatch(MODEL_NAME, name) is None:
+    if re.fullmatch(FILE_NAME, name) is None:
         raise UserError(f"name {name!r}: give up to 64 letters, digits, - and _")
     path, field, errors = precise_weights.path_of(folder.resolve(), name), version.model.field, version.errors
     if path.exists():

@@ -14,7 +14,7 @@ from common.geometry.ros_map_writer import write_grid
 from common.geometry.tum import write_tum
 from common.geometry.world import known_worlds
 from common.messages.definitions import Belief, Hypothesis, Map, Odom, Pose, Scan, Stamped
-from common.messages.requests import Reply, Request, SaveMapReply, SaveMapRequest
+from common.messages.requests import FILE_NAME, Reply, Request, SaveMapReply, SaveMapRequest
 from common.messages.topics import BELIEF, MAP, ODOM, SAVE_MAP, SCAN, Query, Topic
 from common.robot.motion_distortion import evenly_spaced
 from common.robot.ranges import ranges_for_localisation
@@ -28,7 +28,6 @@ from services.mapper.slam.front_end import Place
 from services.mapper.slam.mapper import GrownMap, Mapper
 from services.mapper.slam.search import search
 
-MAP_NAME = r"[A-Za-z0-9_-]{1,64}"
 UPDATE_PERIOD_NS = 1_000_000_000  # between the beginnings of two updates of the map, which leaves time for the scans
 REPEAT_PERIOD_NS = 5_000_000_000  # an unchanged map is published again after this time, for subscribers that came later
 
@@ -151,7 +150,7 @@ def save_map(folder: Path, name: str, mapper: Mapper) -> Path:
     """Writes map and trajectory; returns the path of NAME.yaml. Raises UserError if that fails."""
     if mapper.map is None:
         raise UserError("there is no map yet: do scans arrive?")
-    if re.fullmatch(MAP_NAME, name) is None or name in known_worlds():
+    if re.fullmatch(FILE_NAME, name) is None or name in known_worlds():
         raise UserError(f"name {name!r}: give up to 64 letters, digits, - and _, and not the name of a shipped world")
     path = folder.resolve() / f"{name}.yaml"
     files = [path.with_suffix(suffix) for suffix in (".yaml", ".pgm", ".tum")]

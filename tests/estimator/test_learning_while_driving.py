@@ -22,6 +22,7 @@ from services.estimator.precise.learning.key_scans import KeyScans
 from services.estimator.service import EstimatorService
 from services.estimator.settings import EstimatorSettings
 from tests.conftest import WAIT_TIMEOUT_S, received_messages
+from tests.estimator.test_service import StoringService
 
 PERIOD_S, STEP_M, BEAMS = 0.5, 0.25, 120
 WORLD = """
@@ -62,17 +63,6 @@ def scan_message(scanner, k, ranges):
         stamp_ns=round(PERIOD_S * 1e9) * (k + 1), angle_min=first, angle_increment=increment, range_min=0.05,
         range_max=scanner.range_max, ranges=ranges, mount=Pose.of(np.array(scanner.mount)), sigma=scanner.sigma,
     )  # fmt: skip
-
-
-class StoringService(EstimatorService):
-    """Stores messages instead of publishing them."""
-
-    def __init__(self, settings):
-        super().__init__(settings)
-        self.sent = []
-
-    def publish(self, topic, message):
-        self.sent.append(message)
 
 
 def test_kidnapping_while_learning():

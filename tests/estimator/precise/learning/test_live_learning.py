@@ -123,7 +123,7 @@ def test_nothing_new(former):
 
 def test_people_leave_no_trace(former, version):
     model, places = former
-    # Every 8 s somebody walks through the room, 0.8 m between two scans.
+    # Every 8 s a person walks through the room, 0.8 m between two scans.
     people = [((0.4 + 0.8 * (k % 10), 0.6 + 0.04 * k), 0.8 * k - 0.1, 0.8 * k + 0.1) for k in range(80) if k % 10 < 5]
     scans, empty = drive(AFTER, *WEST, 80, people=people), drive(AFTER, *WEST, 80)
     hit = scans.ranges < empty.ranges - 0.1
