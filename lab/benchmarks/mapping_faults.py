@@ -1,4 +1,7 @@
-"""`presage bench mapping-faults`: drives that could deceive the mapper."""
+"""`presage bench mapping-faults`: drives that could deceive the mapper.
+
+Errors are measured in the frame in which the part of the drive before the disturbance fits best.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,6 @@ from typing import Any, Literal
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
 from common.geometry import se2
 from common.geometry.occupancy_grid import OCCUPIED
@@ -20,7 +22,9 @@ from common.geometry.se2 import Array
 from common.geometry.world import World
 from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import TWINS, Scene
-from lab.benchmarks.mapping import fitted, trajectory_errors
+from lab.accuracy.tasks import is_at
+from lab.benchmarks.mapping import alignment
+from lab.experiments.results import markdown, millimetres, number
 from lab.integrity.buildings import make_building
 from lab.integrity.cases import BEAMS
 from lab.integrity.changes import KidnappingPlaces, crowd
@@ -85,8 +89,18 @@ CASES = {
 }
 
 
-def make_drive(case: str, seed: int, seconds: float) -> tuple[RawDrive, Array, World]:
-    """A drive with odometry, its true poses (N, 3), and its world; the robot is carried off in the middle."""
+@dataclass(frozen=True)
+class DisturbedDrive:
+    """A drive with odometry, and where it really was."""
+
+    drive: RawDrive
+    truth: Array  # (N, 3)
+    world: World
+    undisturbed: int  # number of scans before the robot is carried off
+
+
+def make_drive(case: str, seed: int, seconds: float) -> DisturbedDrive:
+    """A drive in the building of a seed."""
     fault = CASES[case]
     world = TWINS if fault.world == "twins" else make_building(seed, fault.world).world
     scene = Scene.of(world, BEAMS, [seed, 30])
@@ -100,7 +114,8 @@ def make_drive(case: str, seed: int, seconds: float) -> tuple[RawDrive, Array, W
     clean = _ranges_in_crowd(scene, truth) if fault.crowd else scene.clean(truth)
     ranges = np.array([scene.observe(each, 0.0).ranges for each in clean])
     laser = Laser(scanner.angles(), np.array(scanner.mount), scanner.range_max)
-    return RawDrive(np.arange(len(truth)) / scanner.rate, ranges, laser, odom), truth, world
+    drive = RawDrive(np.arange(len(truth)) / scanner.rate, ranges, laser, odom)
+    return DisturbedDrive(drive, truth, world, len(parts[0]))
 
 
 def _odometry(parts: list[Array], rng: np.random.Generator) -> Array:
@@ -129,30 +144,35 @@ def bench_mapping_faults(worlds: int, seed: int, seconds: float, json_file: Path
     check_file(json_file, "--json")
     rows = []
     for case in CASES:
-        for number in range(seed, seed + worlds):
-            drive, truth, world = make_drive(case, number, seconds)
+        for building in range(seed, seed + worlds):
+            drive = make_drive(case, building, seconds)
             for odometry in (True, False):
-                with console.status(f"{case}, building {number}"):
-                    used = drive if odometry else replace(drive, odom=None)
-                    rows.append({"case": case, "seed": number, "odometry": odometry, **map_drive(used, truth, world)})
-    _print(rows, console)
+                with console.status(f"{case}, building {building}"):
+                    rows.append({"case": case, "seed": building, "odometry": odometry, **map_drive(drive, odometry)})
+    print(table(rows))
     write_json(json_file, {"rows": rows, "seconds": seconds, **provenance(seed)})
     return 0
 
 
-def map_drive(drive: RawDrive, truth: Array, world: World) -> dict[str, Any]:
+def map_drive(disturbed: DisturbedDrive, odometry: bool) -> dict[str, Any]:
     """Errors of the map of a drive."""
+    drive = disturbed.drive
     begin = time.perf_counter()
-    built = build_trajectory(drive)
+    built = build_trajectory(drive if odometry else replace(drive, odom=None))
     taken = time.perf_counter() - begin
     known = np.isfinite(built.poses).all(axis=1)
-    position, _ = trajectory_errors(built.poses[known], truth[known])
-    placed = fitted(built.poses[known], truth[known])
+    poses, truth = built.poses[known], disturbed.truth[known]
+    before = np.flatnonzero(known) < disturbed.undisturbed
+    reference = before if before.any() else ~before  # the map may be the part after it
+    placed = se2.compose(alignment(poses[reference], truth[reference]), poses)
+    right = np.array([is_at(*pair) for pair in zip(placed, truth, strict=True)])
+    errors = np.hypot(*(placed - truth)[right, :2].T)
     return {
         "placed": float(known.mean()),
-        "position_rms_m": float(np.sqrt((position**2).mean())),
-        "position_max_m": float(position.max()),
-        "false_walls": false_walls(placed, drive.ranges[known], drive.laser, world),
+        "wrong_place": float(np.count_nonzero(~right) / len(known)),
+        "position_rms_m": float(np.sqrt((errors**2).mean())),  # of scans that are not at a wrong place
+        "position_max_m": float(errors.max()),
+        "false_walls": false_walls(placed, drive.ranges[known], drive.laser, disturbed.world),
         "closures": len(built.closures),
         "lost": built.unmatched,
         "seconds": taken,
@@ -168,20 +188,23 @@ def false_walls(poses: Array, ranges: Array, laser: Laser, world: World) -> floa
     return float((world.clearance(centres) > FALSE_WALL_M).mean())
 
 
-def _print(rows: list[dict[str, Any]], console: Console) -> None:
-    table = Table(title="Mapping drives that could deceive")
-    for title in ("case", "odometry", "placed", "position RMS, mm", "worst (mm)", "false walls (%)", "time (s)"):
-        table.add_column(title)
+def table(rows: list[dict[str, Any]]) -> str:
+    """The Markdown table of docs/mapping.md: the smallest and the largest value of all drives of a case."""
+    cells = []
     for case in CASES:
-        for odometry in (True, False):
-            of_case = [row for row in rows if row["case"] == case and row["odometry"] == odometry]
-            table.add_row(
+        of_case = [row for row in rows if row["case"] == case]
+        cells.append(
+            [
                 case,
-                "yes" if odometry else "no",
-                " ".join(f"{row['placed']:.0%}" for row in of_case),
-                " ".join(f"{row['position_rms_m'] * 1e3:.0f}" for row in of_case),
-                f"{max(row['position_max_m'] for row in of_case) * 1e3:.0f}",
-                " ".join(f"{row['false_walls'] * 100:.1f}" for row in of_case),
-                f"{max(row['seconds'] for row in of_case):.0f}",
-            )
-    console.print(table)
+                _extremes([number(100 * row["placed"], 0) for row in of_case]),
+                _extremes([number(100 * row["wrong_place"], 0) for row in of_case]),
+                _extremes([millimetres(row["position_rms_m"]) for row in of_case]),
+                _extremes([number(100 * row["false_walls"], 1) for row in of_case]),
+            ]
+        )
+    return markdown(("", "scans placed, %", "at a wrong place, %", "position RMS, mm", "false walls, %"), cells)
+
+
+def _extremes(numbers: list[str]) -> str:
+    low, high = (limit(numbers, key=float) for limit in (min, max))
+    return low if low == high else f"{low} to {high}"

@@ -31,6 +31,8 @@ MODULES = {
     "peers": "lab.peers.experiment",
     "refinement": "lab.benchmarks.refinement",
     "visits": "lab.benchmarks.visits",
+    "mapping-faults": "lab.benchmarks.mapping_faults",
+    "live-refinement": "lab.benchmarks.live_refinement",
 }
 # Results with and without the terms of information, in one table.
 COMPARED = {
@@ -46,7 +48,9 @@ TABLE_MARKS = re.compile(r"(<!-- table (?P<name>[\w/.-]+) -->\n).*?(<!-- end -->
 
 def table_of(name: str, folder: Path) -> str:
     """Table and notes of a result in ``folder``, named "e1" or "converged/e1", for example."""
-    kind = name.rsplit("/", maxsplit=1)[-1].partition("-")[0]  # navigation-unknown belongs to navigation
+    kind = name.rsplit("/", maxsplit=1)[-1]
+    if kind not in MODULES:
+        kind = kind.partition("-")[0]  # navigation-unknown belongs to navigation
     if kind not in MODULES:
         raise UserError(f"no experiment {kind!r}: choose from {', '.join(MODULES)}")
     table: Callable[[Any], str] = import_module(MODULES[kind]).table
