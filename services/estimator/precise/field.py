@@ -63,6 +63,14 @@ class DistanceField:
     origin: tuple[float, float]  # m in map, of node (0, 0)
     resolution: float  # m
 
+    def near(self, places: Array) -> Array:
+        """Phi (N,) in m at the node nearest to each place (N, 2) m in map; NaN beyond the grid."""
+        column, row = np.round((places - self.origin) / self.resolution).astype(int).T
+        inside = (column >= 0) & (row >= 0) & (column < self.phi.shape[1]) & (row < self.phi.shape[0])
+        phi = np.full(len(places), np.nan)
+        phi[inside] = self.phi[row[inside], column[inside]]
+        return phi
+
     def with_solids(self, places: Array) -> DistanceField:
         """The field, negative wherever no beam from ``places`` (S, 2) m passes.
 

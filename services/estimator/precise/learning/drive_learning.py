@@ -110,11 +110,8 @@ def learn_model(beams: Beams, recipe: Recipe, report: Callable[[float], None] = 
 
 def free_places(model: FieldModel, places: Array) -> Array:
     """The places (N, 2) m in map that are in seen free space."""
-    field, seen = model.field, model.seen
-    column, row = np.round((places - field.origin) / field.resolution).astype(int).T
-    inside = (column >= 0) & (row >= 0) & (column < field.phi.shape[1]) & (row < field.phi.shape[0])
-    inside[inside] &= field.phi[row[inside], column[inside]] > SEED_CLEARANCE_M
-    return np.asarray(places[inside if seen is None else inside & seen.contains(places)])
+    free = model.field.near(places) > SEED_CLEARANCE_M
+    return np.asarray(places[free if model.seen is None else free & model.seen.contains(places)])
 
 
 def _outside_of(measured: Beams, simulated: Beams) -> Beams:
@@ -134,11 +131,12 @@ def replay(model: GenerativeModel, places: Array, drive: ReferenceDrive, samples
 def still_valid(measured: Beams, replayed: Beams, h: float) -> Beams:
     """The beams replayed from a former model that the measured ones do not contradict.
 
-    Left out are those that end at a surface that is gone, or would pass through one that is new.
+    Left out are those that end at a surface that is gone, or would pass through one that is new: from any side, also
+    from the space behind it, which the measured beams did not see, and from inside it.
     """
     cells = SurfaceCells.of(replayed, h)
     gone = cells.at(cells.contradicted_by(measured), replayed.ends())
-    present = FieldModel(field_of_surfaces(measured, h), seen=seen_cells(measured))
-    expected = present.expect(np.column_stack([replayed.starts, replayed.directions]), np.zeros(1))
-    in_front = np.isfinite(expected.scale) & (expected.ranges < replayed.ranges[:, None] - MAX_ERROR_M)
-    return replayed.part(~(gone | in_front[:, 0]))
+    present = field_of_surfaces(measured, h)
+    reach = present.trace(np.column_stack([replayed.starts, replayed.directions]), np.zeros(1)).ranges[:, 0]
+    blocked = (reach < replayed.ranges - MAX_ERROR_M) | (present.near(replayed.starts) <= 0)
+    return replayed.part(~(gone | blocked))

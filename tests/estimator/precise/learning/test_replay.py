@@ -41,3 +41,18 @@ def test_replay_of_what_is_not_contradicted():
     assert is_kept[west & ~gone & ~blocked].mean() > 0.95
     assert is_kept[west & blocked].mean() < 0.1
     assert is_kept[gone].mean() < 0.1
+
+
+def test_nothing_is_replayed_through_a_new_surface():
+    """Seen from the west only, a new cupboard also stops beams from behind and from inside it."""
+    ranges = RayCaster(BEFORE)
+    poses = np.array([[1.3, 3.2, 0.0], [1.6, 3.4, 0.0], [0.95, 2.5, 0.0]])
+    replayed = Beams.of(poses, np.zeros(3), ANGLES, ranges.expect(poses, ANGLES).ranges)
+    driven, seen = scans(AFTER, (0.2, 1.5), (0.6, 3.7), 60, 0.02)
+    kept = still_valid(Beams.of(driven, np.zeros(3), ANGLES, seen), replayed, 0.05)
+    x, y = kept.starts.T
+    # Where they cross the cupboard's western side
+    forward = (0.7 - x) / kept.unit()[:, 0]
+    at = y + forward * kept.unit()[:, 1]
+    crossing = (forward > 0.05) & (forward < kept.ranges - 0.15) & (np.abs(at - 2.5) < 0.25)
+    assert crossing.mean() < 0.002
