@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,14 @@ import psutil
 
 from common.geometry.se2 import Array
 from common.geometry.world import World, load_world
+from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import Scene
+from lab.benchmarks.mapping import fitted
+from lab.experiments.results import markdown, millimetres
 from lab.integrity.buildings import make_building
 from lab.integrity.cases import BEAMS, START_DEVIATION
 from lab.integrity.maps import noisy_grid
+from presage.terminal.output import check_file, write_json
 from services.estimator.factory import EstimatorOptions, Geometry, prepare
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.learning import weights
@@ -38,12 +43,12 @@ def start_estimator(rough: World, scene: Scene, start: Array) -> PreciseEstimato
     return made
 
 
-def drive_and_learn(rough: World, scene: Scene, path: Array) -> tuple[list[dict[str, Any]], Version | None]:
-    """Drives along poses (N, 3); returns what each version is like, and the last one."""
+def drive_and_learn(rough: World, scene: Scene, path: Array) -> tuple[dict[str, Any], Version | None]:
+    """Drives along poses (N, 3); returns what was learned when, at what cost, and the last version."""
     estimator = start_estimator(rough, scene, path[0])
-    former, places = estimator.model, estimator.seeds.places
+    original, places = estimator.model, estimator.seeds.places
     keys = KeyScans(scene.scanner.angles(), np.array(scene.scanner.mount), scene.scanner.range_max)
-    rows: list[dict[str, Any]] = []
+    versions: list[dict[str, Any]] = []
     update_ms: list[tuple[float, float]] = []  # of tracking and of the collection of key scans, CPU time
     version, pending, errors, since = None, None, [], 0.0
     for k, clean in enumerate(scene.clean(path)):
@@ -60,22 +65,27 @@ def drive_and_learn(rough: World, scene: Scene, path: Array) -> tuple[list[dict[
             estimator.use_model(version.model, version.seeds)
         if pending is None and (drive := keys.take_drive()) is not None:
             begin, since = time.process_time(), stamp
-            pending = learn_version(former, places, estimator.model, drive)
-            rows.append({
+            pending = learn_version(original, places, estimator.model, drive)
+            versions.append({
                 "at_s": stamp,
                 "key_scans": len(drive.poses),
                 "learning_cpu_s": time.process_time() - begin,
                 "accepted": pending is not None,
                 "error_median_m": float(np.median(errors[-int(10 * scene.scanner.rate):])),
             })  # fmt: skip
-            print(rows[-1], flush=True)
-    for quantile in (0.5, 0.99):
-        tracking, collecting = np.quantile(update_ms, quantile, axis=0)
-        print(f"update, quantile {quantile:g}: tracking {tracking:.1f} ms, collecting key scans {collecting:.2f} ms")
-    if version is not None:
-        size = len(weights.encode(version.model, version.seeds.places))
-        print(f"key scans {key_scan_bytes(keys) / 1e6:.1f} MB; a version, as published, {size / 1e3:.0f} kB")
-    return rows, version
+            print(versions[-1], flush=True)
+    mean, (median, most) = np.mean(update_ms, axis=0), np.quantile(update_ms, (0.5, 0.99), axis=0)
+    costs = {
+        f"{name}_{kind}_ms": float(values[column])
+        for column, name in enumerate(("tracking", "collecting"))
+        for kind, values in (("mean", mean), ("median", median), ("p99", most))
+    }
+    return {
+        "versions": versions,
+        **costs,
+        "key_scans_bytes": key_scan_bytes(keys),
+        "version_bytes": 0 if version is None else len(weights.encode(version.model, version.seeds.places)),
+    }, version
 
 
 def key_scan_bytes(keys: KeyScans) -> int:
@@ -83,33 +93,68 @@ def key_scan_bytes(keys: KeyScans) -> int:
     return sum(key.ranges.nbytes for key in keys.verified.values())
 
 
-def test_errors(rough: World, scene: Scene, version: Version | None) -> Array:
-    """Position errors (N,) in m of another drive, with a version or with the rough map."""
+def test_errors(rough: World, scene: Scene, version: Version | None) -> dict[str, float]:
+    """Position errors of another drive, with a version or with the rough map.
+
+    Those that are aligned do not count where the map as a whole lies.
+    """
     path = scene.path(TEST_SECONDS)
     estimator = start_estimator(rough, scene, path[0])
     if version is not None:
         estimator.use_model(version.model, version.seeds)
     clean = scene.clean(path)
-    found = [estimator.update(scene.observe(each, k / scene.scanner.rate)).pose for k, each in enumerate(clean)]
-    return np.asarray(np.hypot(*(np.array(found) - path)[:, :2].T))
+    found = np.array(
+        [estimator.update(scene.observe(each, k / scene.scanner.rate)).pose for k, each in enumerate(clean)]
+    )
+    errors, aligned = (np.hypot(*(poses - path)[:, :2].T) for poses in (found, fitted(found, path)))
+    return {
+        "position_median_m": float(np.median(errors)),
+        "position_rms_m": float(np.sqrt((errors**2).mean())),
+        "position_max_m": float(errors.max()),
+        "aligned_median_m": float(np.median(aligned)),
+    }
+
+
+def refine(name: str, seed: int, seconds: float) -> dict[str, Any]:
+    """Results in one world."""
+    world = load_world("office") if name == "office" else make_building(int(name)).world
+    rough = noisy_grid(Scene.of(world, BEAMS, [seed, ROUGH_SEED]))
+    scene = Scene.of(world, BEAMS, [seed, DRIVE_SEED])
+    learned, version = drive_and_learn(rough, scene, scene.path(seconds))
+    before, after = (test_errors(rough, Scene.of(world, BEAMS, [seed, TEST_SEED]), each) for each in (None, version))
+    return {"world": world.name, "rough": before, "after": after, **learned}
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """The Markdown table of docs/mapping.md, in mm: median, RMS and maximum; and medians without the map's place."""
+    cells = []
+    for row in rows:
+        errors = [
+            "; ".join(millimetres(row[kind][f"position_{value}_m"]) for value in ("median", "rms", "max"))
+            for kind in ("rough", "after")
+        ]
+        aligned = [millimetres(row[kind]["aligned_median_m"]) for kind in ("rough", "after")]
+        cells.append([row["world"], *errors, *aligned])
+    return markdown(("world", "rough map", "after learning", "rough map, aligned", "after learning, aligned"), cells)
 
 
 def main() -> None:
-    """Prints the errors before and after."""
+    """Prints the errors before and after, and writes them to a file if one is given."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--world", default="office", help="office, or the seed of a generated building")
+    parser.add_argument(
+        "--worlds", default="office", help="comma-separated: office, or the seed of a generated building"
+    )
     parser.add_argument("--seconds", type=float, default=300.0)
     parser.add_argument("--seed", type=int, default=5000)
+    parser.add_argument("--json", type=Path)
     args = parser.parse_args()
-    world = load_world("office") if args.world == "office" else make_building(int(args.world)).world
-    rough = noisy_grid(Scene.of(world, BEAMS, [args.seed, ROUGH_SEED]))
-    scene = Scene.of(world, BEAMS, [args.seed, DRIVE_SEED])
-    _, version = drive_and_learn(rough, scene, scene.path(args.seconds))
-    for name, each in (("rough map", None), ("learned while driving", version)):
-        errors = test_errors(rough, Scene.of(world, BEAMS, [args.seed, TEST_SEED]), each) * 1e3
-        rms, most = np.sqrt((errors**2).mean()), errors.max()
-        print(f"{name}: position error median {np.median(errors):.1f}, RMS {rms:.1f}, maximum {most:.1f} mm")
+    check_file(args.json, "--json")
+    rows = [refine(name, args.seed, args.seconds) for name in args.worlds.split(",")]
+    for row in rows:
+        print({name: value for name, value in row.items() if name != "versions"})
+    print(table(rows))
     print(f"memory of this process: {psutil.Process().memory_info().rss / 1e6:.0f} MB")
+    write_json(args.json, {"rows": rows, "seconds": args.seconds, **provenance(args.seed)})
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 from rich.console import Console
 
 from common.geometry import se2
@@ -160,7 +161,7 @@ def map_drive(disturbed: DisturbedDrive, odometry: bool) -> dict[str, Any]:
     begin = time.perf_counter()
     built = build_trajectory(drive if odometry else replace(drive, odom=None))
     taken = time.perf_counter() - begin
-    known = np.isfinite(built.poses).all(axis=1)
+    known: npt.NDArray[np.bool_] = np.isfinite(built.poses).all(axis=1)
     poses, truth = built.poses[known], disturbed.truth[known]
     before = np.flatnonzero(known) < disturbed.undisturbed
     reference = before if before.any() else ~before  # the map may be the part after it
@@ -169,7 +170,7 @@ def map_drive(disturbed: DisturbedDrive, odometry: bool) -> dict[str, Any]:
     errors = np.hypot(*(placed - truth)[right, :2].T)
     return {
         "placed": float(known.mean()),
-        "wrong_place": float(np.count_nonzero(~right) / len(known)),
+        "wrong_place": float(np.count_nonzero(~right) / len(built.poses)),
         "position_rms_m": float(np.sqrt((errors**2).mean())),  # of scans that are not at a wrong place
         "position_max_m": float(errors.max()),
         "false_walls": false_walls(placed, drive.ranges[known], drive.laser, disturbed.world),

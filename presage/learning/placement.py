@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.special import ndtr
 
 from common.errors import UserError
 from common.geometry import se2
@@ -21,7 +20,7 @@ from services.estimator.factory import EstimatorOptions, Geometry, prepare
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.precise.learning.field_learning import Recipe, learn_field
-from services.estimator.precise.learning.surfaces import Beams, SurfaceCells
+from services.estimator.precise.learning.frame import moved_into_cells
 from services.estimator.shared.interface import Observation
 from services.mapper.slam.pose_graph import PoseLink, optimise
 
@@ -30,11 +29,6 @@ SAME_M = 0.3  # poses found in the map that differ by less agree
 MIN_FOUND = 0.5  # share of the key scans that must agree
 # Standard deviations, m, m, rad: of the drive between two key scans, and of the poses found, because of model errors.
 DRIFT, MODEL = np.array([0.003, 0.003, 0.001]), np.array([0.002, 0.002, 0.001])
-# For surfaces in the cells of a grid
-EDGE_M = 0.005  # standard deviation of a surface's distance from the edge of its cell
-MISSING_SHARE = 0.1  # of the surfaces that the grid does not have
-CELL_M, MAX_ELEMENTS = 0.05, 3000  # the elements that stand for the surfaces
-FIRST_STEP_M, LAST_STEP_M = 0.008, 0.0005  # of the search
 
 
 @dataclass(frozen=True)
@@ -74,34 +68,6 @@ def place(world: World, keys: ReferenceDrive, model: Path | None = None) -> Plac
     elif world.grid is not None:
         placed = moved_into_cells(world, replace(keys, poses=placed))
     return Placement(placed, share, float(np.median(_distance(placed[searched], found))))
-
-
-def moved_into_cells(world: World, keys: ReferenceDrive) -> Array:
-    """Poses (N, 3) of key scans, moved as a whole so that the surfaces they saw lie in occupied cells of a grid.
-
-    A grid says that a surface is somewhere in a cell, equally likely everywhere; the estimator expects it at the edge.
-    """
-    cells = SurfaceCells.of(Beams.of(keys.poses, keys.mount, keys.angles, keys.ranges), CELL_M)
-    elements = np.stack([cells.mx[cells.is_surface], cells.my[cells.is_surface]], axis=-1) + cells.low
-    elements = elements[:: 1 + len(elements) // MAX_ELEMENTS]
-    middle = np.array([*elements.mean(axis=0), 0.0])
-    radius = float(np.hypot(*(elements - middle[:2]).T).mean())
-
-    def cost(move: Array) -> float:
-        inside = ndtr(-world.surface_distance(se2.transform(middle + move, elements - middle[:2])) / EDGE_M)
-        return -float(np.log(MISSING_SHARE + (1 - MISSING_SHARE) * inside).sum())
-
-    # Compass search (Kolda, Lewis & Torczon 2003)
-    move, lowest, step = np.zeros(3), cost(np.zeros(3)), FIRST_STEP_M
-    directions = np.concatenate([np.eye(3), -np.eye(3)]) / [1.0, 1.0, radius]
-    while step >= LAST_STEP_M:
-        costs = [cost(move + step * direction) for direction in directions]
-        best = int(np.argmin(costs))
-        if costs[best] < lowest:
-            move, lowest = move + step * directions[best], costs[best]
-        else:
-            step /= 2
-    return se2.compose(middle + move, se2.between(middle, keys.poses))
 
 
 def _bent(placed: Array, found: Array, covariances: Array) -> Array:

@@ -83,17 +83,17 @@ def save_learned(folder: Path, name: str, original: ModelInUse, version: Version
     path, field, errors = precise_weights.path_of(folder.resolve(), name), version.model.field, version.errors
     if path.exists():
         raise UserError(f"{path} exists already: choose another name")
-    former = precise_weights.FieldCard.model_validate_json(original.card) if original.card else None
+    card_before = precise_weights.FieldCard.model_validate_json(original.card) if original.card else None
     card = precise_weights.FieldCard(
         world=original.world,
-        scanner=geometry.scanner("learned while driving") if former is None else former.scanner,
+        scanner=geometry.scanner("learned while driving") if card_before is None else card_before.scanner,
         samples=version.key_scans,
         seed=RECIPE.seed,
         resolution=field.resolution,
         origin=field.origin,
         sweeps=RECIPE.sweeps,
         ripple=version.model.ripple,
-        inflation=1.0 if former is None else former.inflation,
+        inflation=1.0 if card_before is None else card_before.inflation,
         test_samples=version.key_scans // HELD_OUT_EVERY,
         test_range_error_median_m=float(np.median(errors)),
         test_range_error_mean_m=float(errors.mean()),
@@ -101,7 +101,7 @@ def save_learned(folder: Path, name: str, original: ModelInUse, version: Version
         test_position_error_rms_m=None,
         learning_s=0.0,
         source=f"{version.key_scans} key scans while driving; elsewhere {original.file or 'the map'}",
-        calibration=None if former is None else former.calibration,
+        calibration=None if card_before is None else card_before.calibration,
         commit=commit(),
         command=f"presage save-model {name}",
         versions=versions(),

@@ -27,6 +27,7 @@ from services.estimator.precise.learning.field_learning import (
     seed_places,
     seen_cells,
 )
+from services.estimator.precise.learning.frame import in_frame_of
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.noise import estimate_noise
@@ -44,7 +45,6 @@ LASTING_S, LASTING_CELL_M = 3.0, 0.1  # a surface is learned if beams end near a
 EPOCHS = 4  # parts of the key scans, of which each may contradict those before it
 ALIGNMENTS = 3  # times that the key scans are matched to the field learned from them
 ALIGNMENT_SCHEDULE_M = (0.02, 0.0, 0.0)  # added to the deviation of every beam, step by step
-FRAME_STEPS = 5  # of Gauss-Newton, with which the key scans are moved into the frame of the original model
 ALIGNMENT_DEVIATION = np.array([0.05, 0.05, 0.02])  # m, m, rad: of the poses of key scans, in a rough map
 
 
@@ -164,25 +164,3 @@ def _aligned(model: GenerativeModel, keys: ReferenceDrive, priors: Array, sigma:
         view = View(model, likelihood, keys.mount, keys.angles, ranges.astype(float), keys.range_max)
         poses.append(view.descend(pose[None], Prior(prior[None], information), ALIGNMENT_SCHEDULE_M)[0][0])
     return replace(keys, poses=np.array(poses))
-
-
-def in_frame_of(original: GenerativeModel, keys: ReferenceDrive) -> ReferenceDrive:
-    """The key scans, moved together to where they fit the ``original`` model best.
-
-    Least squares of the distances of all beams' ends to the surfaces: errors of a rough map average out.
-    """
-    poses = keys.poses
-    middle = np.array([*poses[:, :2].mean(axis=0), 0.0])
-    for _ in range(FRAME_STEPS):
-        lasers = se2.compose(poses, keys.mount)
-        expected = original.expect(lasers, keys.angles)
-        by_x, by_y, by_yaw = np.moveaxis(expected.jacobian, -1, 0)
-        slope = np.hypot(by_x, by_y)  # of the range by the distance to the surface
-        with np.errstate(invalid="ignore", divide="ignore"):
-            distance = (keys.ranges - expected.ranges) / slope
-            used = (np.abs(distance) < MAX_ERROR_M) & np.isfinite(expected.scale)
-        x, y = ((lasers[:, axis] - middle[axis])[:, None] for axis in (0, 1))
-        J = np.stack([by_x, by_y, by_yaw - y * by_x + x * by_y], axis=-1)[used] / slope[used, None]
-        step = np.linalg.lstsq(J.T @ J, J.T @ distance[used])[0]
-        poses = se2.compose(middle + step, se2.between(middle, poses))
-    return replace(keys, poses=poses)

@@ -14,8 +14,8 @@ from services.estimator.precise.field import FieldModel
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.precise.learning.field_learning import Recipe, learn_field
+from services.estimator.precise.learning.frame import in_frame_of
 from services.estimator.precise.learning.live_learning import (
-    in_frame_of,
     lasting_surfaces,
     learn_version,
     mean_error,
@@ -57,7 +57,7 @@ def beams(scans):
 
 
 @pytest.fixture(scope="module")
-def former():
+def original():
     """A model of both rooms as they were, and the places that it knows."""
     scans = drive(BEFORE, (0.3, 0.3), (7.7, 3.7), 400, 1)
     model = FieldModel(learn_field(beams(scans), Recipe(0.05, sweeps=6, beams_per_sweep=200_000)))
@@ -65,9 +65,9 @@ def former():
 
 
 @pytest.fixture(scope="module")
-def version(former):
+def version(original):
     """A version from a drive in the west room, after the cupboard was moved."""
-    model, places = former
+    model, places = original
     return learn_version(model, places, model, drive(AFTER, *WEST, 80), RECIPE)
 
 
@@ -81,9 +81,9 @@ def error(model, world, low, high):
 WEST, EAST = ((0.3, 0.3), (3.7, 3.7)), ((4.5, 0.3), (7.7, 3.7))
 
 
-def test_moved_cupboard(former, version):
+def test_moved_cupboard(original, version):
     """The field follows the cupboard in the west room, and stays as it was in the east room."""
-    model, _ = former
+    model, _ = original
     before, after = (error(each, AFTER, *WEST) for each in (model, version.model))
     assert before > 0.01
     assert after < 0.5 * before
@@ -96,33 +96,33 @@ def test_moved_cupboard(former, version):
     assert np.hypot(*(version.seeds.places - west[0, :2]).T).min() < 0.4
 
 
-def test_poses_of_a_rough_map(former):
+def test_poses_of_a_rough_map(original):
     """Poses of a rough map are wrong by centimetres each; the field that they give together is not."""
     scans, others = (drive(BEFORE, (0.3, 0.3), (7.7, 3.7), 120, seed) for seed in (0, 5))
     off = np.random.default_rng(3).normal(0, 1, (2, 120, 3)) * (0.02, 0.02, 0.005)
     rough = RayCaster(grid_of("rough", replace(others, poses=others.poses + off[0])))
-    version = learn_version(rough, former[1], rough, replace(scans, poses=scans.poses + off[1]), RECIPE)
+    version = learn_version(rough, original[1], rough, replace(scans, poses=scans.poses + off[1]), RECIPE)
     assert error(version.model, BEFORE, *WEST) < 0.003
 
 
-def test_frame_of_the_former_model(former):
+def test_frame_of_the_original_model(original):
     """Key scans that are consistent, but all off by the same, are moved back."""
     scans = drive(BEFORE, (0.3, 0.3), (7.7, 3.7), 60)
     moved = se2.compose(np.array([0.03, -0.02, 0.01]), scans.poses)
-    off = in_frame_of(former[0], replace(scans, poses=moved)).poses - scans.poses
+    off = in_frame_of(original[0], replace(scans, poses=moved)).poses - scans.poses
     assert np.abs(off[:, :2]).max() < 0.003
     assert np.abs(se2.wrap(off[:, 2])).max() < 0.001
 
 
-def test_nothing_new(former):
+def test_nothing_new(original):
     """A model that predicts the scans as well as what could be learned from them stays."""
-    _, places = former
+    _, places = original
     exact = RayCaster(BEFORE)
     assert learn_version(exact, places, exact, drive(BEFORE, *WEST, 60), RECIPE) is None
 
 
-def test_people_leave_no_trace(former, version):
-    model, places = former
+def test_people_leave_no_trace(original, version):
+    model, places = original
     # Every 8 s a person walks through the room, 0.8 m between two scans.
     people = [((0.4 + 0.8 * (k % 10), 0.6 + 0.04 * k), 0.8 * k - 0.1, 0.8 * k + 0.1) for k in range(80) if k % 10 < 5]
     scans, empty = drive(AFTER, *WEST, 80, people=people), drive(AFTER, *WEST, 80)
