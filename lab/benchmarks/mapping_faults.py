@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 from rich.console import Console
 
 from common.geometry import se2
@@ -161,7 +160,7 @@ def map_drive(disturbed: DisturbedDrive, odometry: bool) -> dict[str, Any]:
     begin = time.perf_counter()
     built = build_trajectory(drive if odometry else replace(drive, odom=None))
     taken = time.perf_counter() - begin
-    known: npt.NDArray[np.bool_] = np.isfinite(built.poses).all(axis=1)
+    known = np.asarray(np.isfinite(built.poses).all(axis=1))
     poses, truth = built.poses[known], disturbed.truth[known]
     before = np.flatnonzero(known) < disturbed.undisturbed
     reference = before if before.any() else ~before  # the map may be the part after it
