@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lab.accuracy.scenes import Scene
-from lab.benchmarks.visits import contains, drive_through_rooms, move_furniture_in
+from lab.benchmarks.visits import MODELS, contains, drive_through_rooms, move_furniture_in, table
 from lab.integrity.buildings import make_building
 
 
@@ -25,3 +25,16 @@ def test_drive_enters_all_rooms():
     path = drive_through_rooms(scene, building, 1.0)
     assert all(contains(room, path[:, :2]).any() for room in building.rooms)
     assert building.world.clearance(path[:, :2]).min() > 0.2
+
+
+def test_table_divides_rooms_by_what_the_drive_entered():
+    row = {"visit": 2, "in_changed_room": [True, True, False], "in_entered_room": [True, False, True]}
+    row |= {model: [0.001, None, 0.002] for model in MODELS}
+    lines = table([{"visit": 1}, row]).splitlines()
+    found = {cells[2].strip(): cells[3].strip() for cells in (line.split("|") for line in lines[2:6])}
+    assert found == {
+        "all": "2/3; 1.50",
+        "changing, entered": "1/1; 1.00",
+        "changing, not entered": "0/1; –",
+        "unchanging": "1/1; 2.00",
+    }
