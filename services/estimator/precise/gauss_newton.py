@@ -17,7 +17,7 @@ from common.geometry import se2
 from common.robot.ranges import is_surface
 from services.estimator.precise.likelihood import Evidence
 from services.estimator.precise.scan_surfaces import ScanSurfaces
-from services.estimator.precise.surface_evidence import SurfaceEvidence
+from services.estimator.precise.surface_evidence import SurfaceEvidence, find_borders
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -66,12 +66,14 @@ class _AtPoses:
     stated: Expected  # as the model predicts
     expected: Expected  # the same with the map's error
     behind: Array  # (N, B) m, ranges behind the surfaces that the scan passed through
+    borders: npt.NDArray[np.bool_]  # (N, B) where the map shows another surface than at the beam before
     evidence: dict[tuple[float, bytes | None], SurfaceEvidence] = field(default_factory=dict)
 
     def first(self, count: int) -> _AtPoses:
         """The same at the first ``count`` poses."""
         rows = slice(count)
-        return _AtPoses(self.poses[rows], self.stated.part(rows), self.expected.part(rows), self.behind[rows])
+        stated, expected = self.stated.part(rows), self.expected.part(rows)
+        return _AtPoses(self.poses[rows], stated, expected, self.behind[rows], self.borders[rows])
 
 
 @dataclass(frozen=True)
@@ -160,6 +162,7 @@ class View:
                 self.range_max,
                 at.expected,
                 at.behind,
+                at.borders,
                 self.surfaces,
                 self.likelihood,
                 self.changed,
@@ -184,7 +187,8 @@ class View:
             with np.errstate(invalid="ignore"):
                 passed = self.ranges > expected.ranges + self.likelihood.deviation(expected.ranges)
             behind = self.model.expect_behind(lasers, self.angles, np.where(passed, expected.ranges, np.inf))
-            self._last[:] = [_AtPoses(np.array(poses), stated, expected, behind)]
+            borders = find_borders(stated, lasers, self.angles)
+            self._last[:] = [_AtPoses(np.array(poses), stated, expected, behind, borders)]
         elif len(poses) < len(self._last[0].poses):
             self._last[:] = [self._last[0].first(len(poses))]
         return self._last[0]

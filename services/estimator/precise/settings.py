@@ -13,8 +13,8 @@ class Settings:
 
     # Search
     ranked_seeds: int = 300  # seeds whose surfaces are compared with the scan's
-    search_starts: int = 32  # of them, from which a search of the whole map descends
-    search_beams: int = 150  # beams used by these descents
+    search_starts: int = 48  # of them, from which a search of the whole map descends
+    search_beams: int = 100  # beams used by these descents
     search_results: int = 12  # results of them, from which it descends with all beams
     near_starts: int = 48  # poses from which a search near a given pose descends
     max_hypotheses: int = 8

@@ -2,7 +2,8 @@
 
 Each beam is in one of four states: it ends at the surface that the map shows, at something new in front of it, at
 something behind it that the map lacks, or at the next surface of the map behind one that was removed. The states are a
-Markov chain along the scan, since neighbouring beams mostly meet the same surface. The forward algorithm sums over all
+Markov chain along the scan, since neighbouring beams mostly meet the same surface. The state is drawn anew where the
+scan shows another surface, and where the map does: a removed chair says nothing about the wall beside it. The forward algorithm sums over all
 sequences of states, and the backward algorithm gives the probability of each state (Rabiner 1989, section III).
 """
 
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 CHANGED = np.array([0.0, 0.6, 0.2, 0.2])
 COINCIDENCE = 0.3  # probability that something new is within `NEAR_SIGMAS` of a surface of the map
 NEAR_SIGMAS = 3.0
+BORDER_M = 0.05  # a surface of the map that lies farther from the plane of the one beside it is another one
 PLAUSIBLE_SIGMAS = 2.0  # a larger error makes it less plausible that a beam ends at a surface of the map
 PLAUSIBLE_MEAN = 0.04  # nats, mean of what Gaussian errors lose by this
 
@@ -51,6 +53,7 @@ class SurfaceEvidence:
         range_max: float,
         expected: Expected,
         behind: Array,
+        borders: npt.NDArray[np.bool_],
         surfaces: ScanSurfaces,
         likelihood: Likelihood,
         changed: float,
@@ -59,8 +62,9 @@ class SurfaceEvidence:
     ) -> SurfaceEvidence:
         """Compares a scan (B,) m with what is expected.
 
-        ``behind`` (N, B) m are the ranges to the next surface behind the expected one. Beams in ``skip`` (B,) do not
-        count as evidence, but are explained all the same. ``changed`` is the share of surfaces that the map does not
+        ``behind`` (N, B) m are the ranges to the next surface behind the expected one; ``borders`` (N, B) is true where
+        the map shows another surface than at the beam before. Beams in ``skip`` (B,) do not count as evidence, but are
+        explained all the same. ``changed`` is the share of surfaces that the map does not
         show as they are.
         """
         count = len(expected.ranges)
@@ -73,6 +77,7 @@ class SurfaceEvidence:
             ranges,
             expected.ranges,
             behind,
+            borders,
             expected.scale,
             sigma,
             likelihood.relative,
@@ -158,6 +163,7 @@ def _sum(
     ranges: Array,
     expected: Array,
     behind: Array,
+    borders: npt.NDArray[np.bool_],
     scale: Array,
     sigma: float,
     relative: float,
@@ -176,14 +182,16 @@ def _sum(
     """Fills the fields of `SurfaceEvidence`."""
     used = np.flatnonzero(~np.isnan(ranges) & (ranges > -np.inf))
     size, states = len(used), len(prior)
-    forward, emitted, keep = np.empty((size, states)), np.empty((size, states)), np.empty(size)
-    for n in range(size):
-        keep[n] = 0.0 if n == 0 or starts[used[n]] else 1 - change
+    forward, emitted, keep = np.empty((size, states)), np.empty((size, states)), np.empty((size, states))
     for k in range(expected.shape[0]):
         total[k], explained[k] = 0.0, 0.0
         weights[k] = 0.0
         for n in range(size):
             b = used[n]
+            keep[n] = 0.0 if n == 0 or starts[b] else 1 - change
+            if n > 0 and borders[k, used[n - 1] + 1 : b + 1].any():
+                # The map's next surface is there, or not, by itself; what is in front of both goes on.
+                keep[n, 0], keep[n, 2], keep[n, 3] = 0.0, 0.0, 0.0
             at, surface = _nearest_surface(ranges[b], expected[k], b, edges[b])
             _emit(
                 ranges[b],
@@ -195,10 +203,10 @@ def _sum(
                 range_max,
                 own[b],
                 ideal[b],
-                keep[n],
+                0.0 if n == 0 or starts[b] else 1.0,
                 emitted[n],
             )
-            norm = _step_forward(forward, emitted, prior, keep, n)
+            norm = _step_forward(forward, emitted, prior, keep[n], n)
             if not skip[b]:
                 total[k] += norm
         backward = np.ones(states)
@@ -234,28 +242,64 @@ def _nearest_surface(r: float, expected: Array, b: int, reach: int) -> tuple[int
 def _step_forward(forward: Array, emitted: Array, prior: Array, keep: Array, n: int) -> float:
     """Fills the probabilities forward[n] (4,) of the states, given the beams up to the n-th.
 
-    emitted[n] are log densities, and become densities relative to the largest one. Returns the log density of the n-th
-    beam given those before it.
+    emitted[n] are log densities, and become densities relative to the largest one. ``keep`` (4,) is the probability that
+    a beam is in the same state as the one before, instead of one drawn from ``prior``. Returns the log density of the
+    n-th beam given those before it.
     """
-    top, norm = emitted[n].max(), 0.0
+    top, norm, drawn = emitted[n].max(), 0.0, 1.0
+    for i in range(len(prior)):
+        if n > 0:
+            drawn -= keep[i] * forward[n - 1, i]
     for i in range(len(prior)):
         emitted[n, i] = math.exp(emitted[n, i] - top)
-        forward[n, i] = (1 - keep[n]) * prior[i] * emitted[n, i]
-        if keep[n] > 0.0:
-            forward[n, i] += keep[n] * forward[n - 1, i] * emitted[n, i]
+        forward[n, i] = drawn * prior[i] * emitted[n, i]
+        if n > 0:
+            forward[n, i] += keep[i] * forward[n - 1, i] * emitted[n, i]
         norm += forward[n, i]
     forward[n] /= norm
     return float(math.log(norm) + top)
 
 
 @jit
-def _step_backward(backward: Array, emitted: Array, prior: Array, keep: float) -> None:
+def _step_backward(backward: Array, emitted: Array, prior: Array, keep: Array) -> None:
     """Updates the likelihood (4,) of the beams that follow, for each state, by one more beam."""
-    fresh, norm = 0.0, 0.0
+    drawn, norm = 0.0, 0.0
     for i in range(len(prior)):
         backward[i] *= emitted[i]
-        fresh += (1 - keep) * prior[i] * backward[i]
+        drawn += prior[i] * backward[i]
     for i in range(len(prior)):
-        backward[i] = keep * backward[i] + fresh
+        backward[i] = keep[i] * backward[i] + (1 - keep[i]) * drawn
         norm += backward[i]
     backward /= norm
+
+
+def find_borders(expected: Expected, lasers: Array, angles: Array) -> npt.NDArray[np.bool_]:
+    """Mask (N, B) of the beams at which the map shows another surface than at the beam before.
+
+    Where two surfaces meet without a gap, as in a corner, there is no border. ``lasers`` (N, 3) are the poses in map,
+    ``angles`` (B,) rad the beams in the laser frame.
+    """
+    borders = np.zeros(expected.ranges.shape, np.bool_)
+    _mark_borders(expected.ranges, expected.jacobian, lasers, angles, borders)
+    return borders
+
+
+@jit
+def _mark_borders(
+    ranges: Array, jacobian: Array, lasers: Array, angles: Array, borders: npt.NDArray[np.bool_]
+) -> None:
+    """Marks the borders of `find_borders`."""
+    for k in range(ranges.shape[0]):
+        returned, x, y, nx, ny = False, 0.0, 0.0, 0.0, 0.0  # end point and normal of the beam before
+        for b in range(ranges.shape[1]):
+            r, direction = ranges[k, b], lasers[k, 2] + angles[b]
+            if r == np.inf:
+                borders[k, b], returned = returned, False
+                continue
+            to_x, to_y = r * math.cos(direction) - x, r * math.sin(direction) - y
+            before = abs(nx * to_x + ny * to_y)
+            length = math.hypot(jacobian[k, b, 0], jacobian[k, b, 1])
+            if length > 0:  # 0 where the beam grazes a surface
+                nx, ny = jacobian[k, b, 0] / length, jacobian[k, b, 1] / length
+            borders[k, b] = not returned or min(before, abs(nx * to_x + ny * to_y)) > BORDER_M
+            returned, x, y = True, x + to_x, y + to_y

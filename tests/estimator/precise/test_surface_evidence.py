@@ -13,8 +13,8 @@ from common.geometry.world import World
 from services.estimator.precise import surface_evidence
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.scan_surfaces import ScanSurfaces
-from services.estimator.precise.surface_evidence import CHANGED, SurfaceEvidence
-from services.estimator.shared.generative_models import Expected
+from services.estimator.precise.surface_evidence import CHANGED, SurfaceEvidence, find_borders
+from services.estimator.shared.generative_models import Expected, RayCaster
 
 RANGE_MAX = 25.0
 SIGMA_M = 0.01
@@ -73,17 +73,44 @@ def test_a_wall_predicts_itself(sigma):
     assert np.abs(surprise[10:]).mean() < 0.1
 
 
-def by_enumeration(emitted, starts, change, skip):
+def evidence_in(world, ranges, angles, sigma=SIGMA_M, bare=None):
+    """The evidence of a scan at `WALL` for a ``world``; what was removed there is not in the world ``bare``."""
+    expected = RayCaster(world).expect(WALL, angles)
+    behind = bare.ray_distances(WALL, angles) if bare else np.full((1, len(angles)), np.inf)
+    borders = find_borders(expected, WALL, angles)
+    surfaces = ScanSurfaces.of(ranges, angles, Likelihood(sigma))
+    return SurfaceEvidence.of(ranges, RANGE_MAX, expected, behind, borders, surfaces, Likelihood(sigma), SHARE)
+
+
+@pytest.mark.parametrize(
+    ("laser", "obstacles", "count"),
+    [
+        (WALL, [], 0),
+        (CORNER, [], 0),
+        (WALL, COLUMN, 2),
+        (WALL, [{"circle": {"center": (4.5, 3.0), "radius": 0.3}}], 2),
+    ],
+    ids=["three walls", "corner", "column", "round column"],
+)
+def test_borders_of_the_map(laser, obstacles, count):
+    """The map shows another surface where a column covers the wall, but not in a corner or around the column."""
+    world = World(name="square", boundary=SQUARE, obstacles=obstacles)
+    borders = find_borders(RayCaster(world).expect(laser, ANGLES), laser, ANGLES)[0]
+    assert borders[0]
+    assert borders[1:].sum() == count
+
+
+def by_enumeration(emitted, starts, borders, change, skip):
     """Log-likelihood of the beams that are not skipped, and the weight (B,) of the first state."""
-    keep = np.where(starts, 0.0, 1 - change)
-    keep[0] = 0.0
+    keep = np.tile(np.where(starts, 0.0, 1 - change)[:, None], len(PRIOR))
+    keep[np.ix_(borders, [0, 2, 3])] = 0.0
     total, weight, before = 0.0, np.zeros(len(emitted)), 1.0
     for count in range(1, len(emitted) + 1):
         evidence, weight = 0.0, np.zeros(len(emitted))
         for states in product(range(len(PRIOR)), repeat=count):
             p = PRIOR[states[0]] * emitted[0, states[0]]
             for b, (old, new) in enumerate(pairwise(states), 1):
-                p *= (keep[b] * (old == new) + (1 - keep[b]) * PRIOR[new]) * emitted[b, new]
+                p *= (keep[b, old] * (old == new) + (1 - keep[b, old]) * PRIOR[new]) * emitted[b, new]
             evidence += p
             weight[:count] += p * (np.array(states) == 0)
         total += 0.0 if skip[count - 1] else np.log(evidence / before)
@@ -101,6 +128,7 @@ def test_forward_and_backward_algorithm(seed):
     ranges = np.choose(chosen, [surface, behind, rng.uniform(0.5, 2, BEAMS), surface + 0.3, np.full(BEAMS, np.inf)])
     ranges = ranges + 0.05 * rng.standard_normal(BEAMS)
     (density, ideal), starts = rng.normal(0, 1, (2, BEAMS)), rng.random(BEAMS) < 0.3
+    borders = rng.random(BEAMS) < 0.3
     change = rng.uniform(0.01, 0.3)
     skip = rng.random(BEAMS) < 0.3
     starts[0] = True
@@ -121,10 +149,12 @@ def test_forward_and_backward_algorithm(seed):
             1.0 - starts[b],
             emitted[b],
         )
-    total, weights = by_enumeration(np.exp(emitted), starts, change, skip)
+    total, weights = by_enumeration(np.exp(emitted), starts, borders, change, skip)
     made = ScanSurfaces(density, starts, ideal, np.zeros(BEAMS, np.bool_), edges, change)
     expected = Expected(surface[None], scale[None], np.zeros((1, BEAMS, 3)))
-    found = SurfaceEvidence.of(ranges, RANGE_MAX, expected, behind[None], made, likelihood, SHARE, skip=skip)
+    found = SurfaceEvidence.of(
+        ranges, RANGE_MAX, expected, behind[None], borders[None], made, likelihood, SHARE, skip=skip
+    )
     assert found.log_likelihood[0] == pytest.approx(total, abs=1e-9)
     assert found.weights[0] == pytest.approx(weights, abs=1e-9)
 
@@ -151,15 +181,11 @@ def test_beams_near_edges():
 def test_corners_of_the_map():
     """At the true pose, a corner that the map shows costs nothing, although the scan alone does not predict it."""
     angles = np.linspace(-np.pi, np.pi, 400, endpoint=False)
-    mapped = World(name="square", boundary=SQUARE).ray_distances(WALL, angles)
-    ranges = mapped[0] + SIGMA_M * np.random.default_rng(0).standard_normal(400)
+    world = World(name="square", boundary=SQUARE)
+    ranges = world.ray_distances(WALL, angles)[0] + SIGMA_M * np.random.default_rng(0).standard_normal(400)
     surfaces = ScanSurfaces.of(ranges, angles, Likelihood(SIGMA_M))
-    expected = Expected(mapped, np.full((1, 400), 1e-3), np.zeros((1, 400, 3)))
-    found = SurfaceEvidence.of(
-        ranges, RANGE_MAX, expected, np.full((1, 400), np.inf), surfaces, Likelihood(SIGMA_M), SHARE
-    )
     assert surfaces.density.sum() < surfaces.ideal.sum() - 20
-    assert found.log_likelihood[0] > surfaces.ideal.sum() - 10
+    assert evidence_in(world, ranges, angles).log_likelihood[0] > surfaces.ideal.sum() - 10
 
 
 def test_unused_beams():
@@ -168,16 +194,9 @@ def test_unused_beams():
     away_from_edges = np.flatnonzero(surfaces_of(ranges).edges == 0)
     ranges[rng.choice(away_from_edges, 20, replace=False)] = np.nan
     used = ~np.isnan(ranges)
-    world = World(name="square", boundary=SQUARE)
-    found = []
-    for chosen in (np.ones(len(ranges), np.bool_), used):
-        angles, likelihood = ANGLES[chosen], Likelihood(SIGMA_M)
-        surfaces = ScanSurfaces.of(ranges[chosen], angles, likelihood)
-        count = int(chosen.sum())
-        mapped = world.ray_distances(WALL, angles)
-        expected = Expected(mapped, np.full((1, count), 1e-3), np.zeros((1, count, 3)))
-        behind = np.full((1, count), np.inf)
-        found.append(SurfaceEvidence.of(ranges[chosen], RANGE_MAX, expected, behind, surfaces, likelihood, SHARE))
+    world = World(name="square", boundary=SQUARE, obstacles=COLUMN)
+    chosen = (np.ones(len(ranges), np.bool_), used)
+    found = [evidence_in(world, ranges[each], ANGLES[each], bare=World(name="bare", boundary=SQUARE)) for each in chosen]
     assert found[0].log_likelihood == pytest.approx(found[1].log_likelihood, abs=1)
     assert found[0].weights[0, used] == pytest.approx(found[1].weights[0], abs=0.05)
     assert not found[0].weights[0, ~used].any()
@@ -187,22 +206,29 @@ def test_one_event_however_many_beams():
     """A column that the map lacks, or that was removed, costs about the same with three times as many beams."""
     bare = World(name="bare", boundary=SQUARE)
     column = World(name="column", boundary=SQUARE, obstacles=COLUMN)
-    likelihood = Likelihood(SIGMA_M)
     for real, mapped in ((column, bare), (bare, column)):
         losses = []
         for count in (121, 361):
             angles = np.deg2rad(np.linspace(-60, 60, count))
             noise = SIGMA_M * np.random.default_rng(1).standard_normal(count)
             ranges = real.ray_distances(WALL, angles)[0] + noise
-            evidence = []
-            for world in (real, mapped):
-                expected = Expected(
-                    world.ray_distances(WALL, angles), np.full((1, count), 1e-3), np.zeros((1, count, 3))
-                )
-                behind = bare.ray_distances(WALL, angles) if world is column else np.full((1, count), np.inf)
-                surfaces = ScanSurfaces.of(ranges, angles, likelihood)
-                evidence.append(SurfaceEvidence.of(ranges, RANGE_MAX, expected, behind, surfaces, likelihood, SHARE))
-            losses.append(float(evidence[0].log_likelihood[0] - evidence[1].log_likelihood[0]))
-            assert evidence[0].explained[0] > 0.98
+            at_real, at_mapped = (
+                evidence_in(world, ranges, angles, bare=bare if world is column else None) for world in (real, mapped)
+            )
+            losses.append(float(at_real.log_likelihood[0] - at_mapped.log_likelihood[0]))
+            assert at_real.explained[0] > 0.98
         assert 1 < losses[1] < 25
         assert abs(losses[1] - losses[0]) < 5
+
+
+def test_each_removed_thing_costs_its_probability():
+    """A table whose legs are gone costs little more than what the map says of how often such a thing is gone."""
+    bare = World(name="bare", boundary=SQUARE)
+    legs = [{"circle": {"center": (4.5, y), "radius": 0.04}} for y in (2.0, 2.7, 3.3, 4.0)]
+    ranges = scan(WALL)
+    without = evidence_in(bare, ranges, ANGLES)
+    with_legs = evidence_in(World(name="table", boundary=SQUARE, obstacles=legs), ranges, ANGLES, bare=bare)
+    cost = float(without.log_likelihood[0] - with_legs.log_likelihood[0]) / len(legs)
+    gone = -np.log(PRIOR[2] + PRIOR[3])
+    assert gone - 0.5 < cost < gone - np.log(PRIOR[0]) + 0.5
+    assert with_legs.explained[0] > 0.95
