@@ -3,8 +3,9 @@
 Each beam is in one of four states: it ends at the surface that the map shows, at something new in front of it, at
 something behind it that the map lacks, or at the next surface of the map behind one that was removed. The states are a
 Markov chain along the scan, since neighbouring beams mostly meet the same surface. The state is drawn anew where the
-scan shows another surface, and where the map does: a removed chair says nothing about the wall beside it. The forward algorithm sums over all
-sequences of states, and the backward algorithm gives the probability of each state (Rabiner 1989, section III).
+scan shows another surface, and where the map does: a removed chair says nothing about the wall beside it. The forward
+algorithm sums over all sequences of states, and the backward algorithm gives the probability of each state (Rabiner
+1989, section III).
 """
 
 from __future__ import annotations
@@ -242,9 +243,9 @@ def _nearest_surface(r: float, expected: Array, b: int, reach: int) -> tuple[int
 def _step_forward(forward: Array, emitted: Array, prior: Array, keep: Array, n: int) -> float:
     """Fills the probabilities forward[n] (4,) of the states, given the beams up to the n-th.
 
-    emitted[n] are log densities, and become densities relative to the largest one. ``keep`` (4,) is the probability that
-    a beam is in the same state as the one before, instead of one drawn from ``prior``. Returns the log density of the
-    n-th beam given those before it.
+    emitted[n] are log densities, and become densities relative to the largest one. ``keep`` (4,) is the probability
+    that a beam is in the same state as the one before, instead of one drawn from ``prior``. Returns the log density of
+    the n-th beam given those before it.
     """
     top, norm, drawn = emitted[n].max(), 0.0, 1.0
     for i in range(len(prior)):
@@ -285,9 +286,7 @@ def find_borders(expected: Expected, lasers: Array, angles: Array) -> npt.NDArra
 
 
 @jit
-def _mark_borders(
-    ranges: Array, jacobian: Array, lasers: Array, angles: Array, borders: npt.NDArray[np.bool_]
-) -> None:
+def _mark_borders(ranges: Array, jacobian: Array, lasers: Array, angles: Array, borders: npt.NDArray[np.bool_]) -> None:
     """Marks the borders of `find_borders`."""
     for k in range(ranges.shape[0]):
         returned, x, y, nx, ny = False, 0.0, 0.0, 0.0, 0.0  # end point and normal of the beam before

@@ -196,7 +196,9 @@ def test_unused_beams():
     used = ~np.isnan(ranges)
     world = World(name="square", boundary=SQUARE, obstacles=COLUMN)
     chosen = (np.ones(len(ranges), np.bool_), used)
-    found = [evidence_in(world, ranges[each], ANGLES[each], bare=World(name="bare", boundary=SQUARE)) for each in chosen]
+    found = [
+        evidence_in(world, ranges[each], ANGLES[each], bare=World(name="bare", boundary=SQUARE)) for each in chosen
+    ]
     assert found[0].log_likelihood == pytest.approx(found[1].log_likelihood, abs=1)
     assert found[0].weights[0, used] == pytest.approx(found[1].weights[0], abs=0.05)
     assert not found[0].weights[0, ~used].any()
