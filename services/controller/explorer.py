@@ -61,7 +61,7 @@ class Explorer:
 
     @property
     def active(self) -> bool:
-        """Whether there is something left to do."""
+        """Whether the exploration still has a goal: a viewpoint, or the way back."""
         return self.phase in {"exploring", "returning"}
 
     @property
@@ -76,11 +76,11 @@ class Explorer:
         return se2.compose(poses[min(self._home_key, len(poses) - 1)], self._home)
 
     def pause(self) -> None:
-        """A user has set a goal, or cancelled it."""
+        """Pauses the exploration, because a user has set or cancelled a goal."""
         self.goal, self.paused, self._user_goal_over_since_ns = None, True, None
 
     def move(self, pose: Array, *, located: bool) -> None:
-        """The robot is at a pose (3,), in the map if it is ``located``, else in a frame of its own."""
+        """Updates the robot's pose (3,), which is in the map if it is ``located``, else in its own frame."""
         if located == self._located:
             self.path_m += float(np.hypot(*(pose - self._pose)[:2]))
         self._pose, self._located = pose, located
@@ -103,7 +103,7 @@ class Explorer:
         if not self.active or not (self.paused or self.goal is not None):
             return False
         if state.phase is Phase.UNLOCALISED:
-            self._last_moved = self._pose, 0  # it gets on in another way
+            self._last_moved = self._pose, 0  # the policy drives to localise
             return False
         if self.paused:
             return self._resume_after_user_goal(state, stamp_ns)

@@ -64,7 +64,7 @@ class Navigator:
         self._manual.update(drive, max(self.scan_stamp or 0, self._command.stamp_ns or 0))
 
     def on_goal(self, goal: Goal) -> None:
-        """Replace the goal, cancel it, or refuse it if it is known that it cannot be reached. Or begin to explore."""
+        """Replace, cancel or refuse the goal, or begin to explore. A goal known to be unreachable is refused."""
         self._requested = None
         if goal.cancel or goal.explore or self.explorer is None or not self.explorer.active:
             self.explorer = None

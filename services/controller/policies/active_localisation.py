@@ -86,7 +86,7 @@ class VisitedPlaces:
         return motion
 
     def give_up(self, place: Array) -> None:
-        """If the robot does not get on, count the place (2,) m that it drives to as visited."""
+        """Count the place (2,) m that the robot drives to as visited, if there was no progress for `STALLED_NS`."""
         if self._stamp_ns is not None and self._stamp_ns - self._progress[1] > STALLED_NS:
             self._progress = np.zeros(2), self._stamp_ns
             self._add(place)

@@ -79,26 +79,33 @@ def _ambiguity(graph: FreeSpaceGraph, grid: Grid, information: Array) -> Array:
     ``information`` (cells of the coarse ``grid``, 3, 3) is that of the scans of a metre. The directions in which the
     position is known better and worse, and the heading, are treated separately.
     """
-    left = np.linalg.inv(information + np.eye(3) / UNKNOWN_VARIANCE)
-    of_a_metre = np.column_stack([np.linalg.eigvalsh(left[:, :2, :2]), left[:, 2, 2]])
-    drift = efe.DRIFT_PER_METRE**2
-    balance = (np.sqrt(drift**2 + 4 * drift * of_a_metre) - drift) / 2  # variance where drift and scans balance
+    scan_covariance = np.linalg.inv(information + np.eye(3) / UNKNOWN_VARIANCE)
+    scan_variances = np.column_stack([np.linalg.eigvalsh(scan_covariance[:, :2, :2]), scan_covariance[:, 2, 2]])
+    motion_variance = efe.DRIFT_PER_METRE**2
+    # Each metre adds the motion's variance, and the scans reduce it: stationary variance of a scalar Kalman filter.
+    stationary = (np.sqrt(motion_variance**2 + 4 * motion_variance * scan_variances) - motion_variance) / 2
     entropy = np.zeros(graph.grid.cells)
-    for variance, resolution in zip(balance.T, np.diag(efe.RESOLUTION), strict=True):
+    for variance, resolution in zip(stationary.T, np.diag(efe.RESOLUTION), strict=True):
         deviation = grid.interpolate(np.sqrt(variance).reshape(grid.shape), graph.grid.centres())
-        deviation = efe.DRIFT_PER_METRE * _least_on_the_way(graph, deviation / efe.DRIFT_PER_METRE)
+        deviation = _propagate_deviation(graph, deviation)
         entropy += np.log1p(deviation**2 / resolution) / 2
     return entropy.reshape(graph.grid.shape)
 
 
-def _least_on_the_way(graph: FreeSpaceGraph, metres: Array) -> Array:
-    """The least of ``metres`` (cells,) at any cell plus the length of the way from there, for each cell of a graph."""
-    # An additional node is as far from each cell as these metres. Edges of length 0 would be none.
-    additional = csr_matrix(np.append(np.maximum(metres, 1e-9), 0.0))
+def _propagate_deviation(graph: FreeSpaceGraph, deviation: Array) -> Array:
+    """The standard deviation (cells,) in each cell of a graph, if the robot may come from any other cell.
+
+    There it is that of the scans, ``deviation`` (cells,) in m or rad; on the way it grows by `efe.DRIFT_PER_METRE`.
+    """
+    distance = deviation / efe.DRIFT_PER_METRE
+    # Dijkstra's algorithm starts at an additional node, as far from each cell as the way on which the deviation of the
+    # scans there would grow. Edges of length 0 would be none.
+    additional = csr_matrix(np.append(np.maximum(distance, 1e-9), 0.0))
     lengths = graph.lengths
-    lengths.resize((len(metres), len(metres) + 1))
-    found = dijkstra(vstack([lengths, additional], format="csr"), indices=len(metres))
-    return np.asarray(np.minimum(metres, found[:-1]))  # cells that are not free have no edges
+    lengths.resize((len(distance), len(distance) + 1))
+    found = dijkstra(vstack([lengths, additional], format="csr"), indices=len(distance))
+    # Cells that are not free have no edges.
+    return np.asarray(efe.DRIFT_PER_METRE * np.minimum(distance, found[:-1]))
 
 
 def _coarse_grid(grid: Grid) -> Grid:

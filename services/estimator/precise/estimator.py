@@ -16,11 +16,11 @@ from services.estimator.precise.hypotheses import (
     UnknownPlace,
     clip_to_map,
     constraining_beams,
+    is_unobserved,
+    principal_directions,
     probability_of_being_near,
     project_evidence,
-    unobserved_direction,
     update_mode,
-    weakest_direction,
     weigh,
 )
 from services.estimator.precise.likelihood import Likelihood
@@ -226,7 +226,7 @@ class PreciseEstimator:
     def _predict(self, mode: Mode, period: float, odom: Array | None, command: Array | None) -> list[Candidate]:
         """Predicts the motions that the robot may have made since the last scan; the last one is the widest."""
         return predict_motion(
-            self.settings.motion, mode.pose, mode.noise_covariance, period, odom, command, mode.velocity
+            self.settings.motion, mode.pose, mode.noise_covariance, period, odom, command, mode.velocity, mode.drift
         )
 
     def _track_hypotheses(self, view: View, observation: Observation) -> View:
@@ -295,11 +295,10 @@ class PreciseEstimator:
         """
         mode, period = self.modes[k], self._period(observation.stamp)
         candidates, pose, evidence = match.motions[k], match.poses[k], match.evidence
-        unobserved = self._unobserved_direction(view, mode, pose, evidence.curvature[k])
-        project_evidence(evidence, k, unobserved)
-        # A match with recent scans, the only candidate then, gives the motion in the unobserved direction, too.
-        is_unobserved = unobserved is not None and len(candidates) > 1
-        if unobserved is not None and is_unobserved and self._odometry_since_last_scan(observation) is None:
+        unobserved = self._remove_unobserved(view, mode, pose, evidence, k)
+        # A match with recent scans, the only candidate then, gives the motion in the unobserved directions, too.
+        unknown_motion = len(unobserved) > 0 and len(candidates) > 1
+        if unknown_motion and self._odometry_since_last_scan(observation) is None:
             *candidates, widest = (
                 widen_unobserved(self.settings.motion, each, unobserved, mode.unobserved_scans, period)
                 for each in (*candidates, widest)
@@ -309,21 +308,35 @@ class PreciseEstimator:
             for each in candidates
         ]
         best = min(fused, key=lambda each: each.surprise)
-        updated = update_mode(mode, best, evidence, k, period, unobserved=is_unobserved)
+        updated = update_mode(mode, best, evidence, k, period, unobserved=unknown_motion)
         if self._went_back(observation.stamp):
             return updated
         return replace(updated, log_evidence=mode.log_evidence - widest.excess(best.mean))
 
-    def _unobserved_direction(self, view: View, mode: Mode, pose: Array, curvature: Array) -> Array | None:
-        """The direction (2,) that a scan with ``curvature`` (3, 3) at ``pose`` (3,) does not observe, if any."""
+    def _remove_unobserved(self, view: View, mode: Mode, pose: Array, evidence: Evidence, k: int) -> Array:
+        """Returns the unit vectors (K, 3) of x, y, yaw that a scan at ``pose`` (3,) does not observe.
+
+        Usually none, and one along a corridor. Where hardly a beam meets a surface, all three. Removes the k-th
+        ``evidence`` along them, and that of the few beams that face along a corridor, in place.
+        """
         min_beams = self.settings.min_constraining_share * len(view.angles)
+        (weakest, strongest), ratio = principal_directions(evidence.curvature[k])
         if mode.unobserved_scans:
             # The pose may be metres off, so a ripple or a beam that happens to fit must not pass for a feature.
-            direction: Array | None = weakest_direction(curvature)[0]
             min_beams *= 3
-        else:
-            direction = unobserved_direction(curvature, self.model.ripple)
-        return None if direction is None or constraining_beams(view, pose, direction) > min_beams else direction
+        elif not is_unobserved(ratio, self.model.ripple):
+            return np.zeros((0, 3))
+        count, facing = constraining_beams(view, pose, weakest)
+        if count > min_beams:
+            return np.zeros((0, 3))
+        unobserved = np.eye(3)
+        if constraining_beams(view, pose, strongest)[0] > min_beams:
+            attention = view.surface_evidence(pose[None]).weights * ~facing
+            evidence.replace(k, view.evidence(pose[None], 0.0, attention))
+            (weakest, _), _ = principal_directions(evidence.curvature[k])
+            unobserved = np.array([[*weakest, 0.0]])
+        project_evidence(evidence, k, unobserved)
+        return unobserved
 
     def _weigh_scan(self, view: View, modes: list[Mode], local: Array | None, period: float) -> None:
         """Weighs hypotheses by how well the map predicts those surfaces of the scan that are new to the robot.
@@ -351,9 +364,21 @@ class PreciseEstimator:
         self._local_pose, self._old_beams, self._log_change = local, old, log_change
         kidnapping = max(mode.log_evidence for mode in self.modes) + float(np.log(self.settings.unknown_probability))
         self._unknown_place.allow_kidnapping(kidnapping, self.settings.unmapped_share)
+        self._unknown_place.allow_mismatch(max(map(self._log_mismatch, self.modes, modes)))
         # Either the surroundings have changed, or the robot was carried off and all surfaces are new.
         self._unknown_place.present = max(_log_anywhere(view, old) + log_change, _log_anywhere(view, small))
         self._set_hypotheses(modes)
+
+    def _log_mismatch(self, before: Mode, after: Mode) -> float:
+        """Evidence in nats that a scan was matched at a wrong one of the poses that a hypothesis allowed ``before``.
+
+        Such are all those at which it was not expected, if it has made an uncertain pose certain.
+        """
+        gained = self._probability_of_being_near(after) - self._probability_of_being_near(before)
+        return before.log_evidence + (float(np.log(gained)) if gained > 0 else -np.inf)
+
+    def _probability_of_being_near(self, mode: Mode) -> float:
+        return probability_of_being_near(self._covariance(mode))
 
     def _set_hypotheses(self, modes: list[Mode]) -> None:
         """Sets the hypotheses and their weights."""

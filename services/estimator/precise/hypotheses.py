@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -48,6 +48,7 @@ class Mode:
     clutter: float = CLUTTER_PROBABILITY  # probability that all that was new in the last key scan was clutter
     present_clutter: float = CLUTTER_PROBABILITY  # the same of the present scan
     velocity: Array | None = None  # (3,) in base_link; None while unknown
+    drift: Array = field(default_factory=lambda: np.zeros((3, 3)))  # covariance of the pose with the drift
     weight: float = 1.0
     unobserved_scans: int = 0  # number of consecutive scans without information along some direction
 
@@ -79,6 +80,10 @@ class UnknownPlace:
         self.log_unmapped = max(self.log_unmapped, log_probability + float(np.log(unmapped)))
         self.log_evidence = max(self.log_evidence, log_probability)
 
+    def allow_mismatch(self, log_probability: float) -> None:
+        """The hypotheses may have been matched at a wrong place; a search of the whole map finds the right one."""
+        self.log_evidence = max(self.log_evidence, log_probability)
+
     def add_key_scan(self) -> None:
         """The present scan becomes a key scan."""
         self.log_evidence += self.present
@@ -90,29 +95,27 @@ class UnknownPlace:
         self.log_evidence = self.log_unmapped
 
 
-def weakest_direction(curvature: Array) -> tuple[Array, float]:
-    """The direction (2,) about which a scan says least, and the ratio of its information to that across it."""
+def principal_directions(curvature: Array) -> tuple[Array, float]:
+    """The directions (2, 2), as rows, about which a scan says least and most, and the ratio of their information."""
     values, vectors = np.linalg.eigh(position_information(curvature))
-    return vectors[:, 0], float(values[0] / values[1]) if values[1] > 0 else 0.0
+    return vectors.T, float(values[0] / values[1]) if values[1] > 0 else 0.0
 
 
-def unobserved_direction(curvature: Array, ripple: float) -> Array | None:
-    """The direction (2,) that a scan does not observe, if any.
+def is_unobserved(ratio: float, ripple: float) -> bool:
+    """Whether a scan does not observe a direction, by the ``ratio`` of its information to that across it.
 
     In a corridor without features a learned field still has ripples: walls tilted by about ``ripple`` rad, which add
     along the corridor about ripple² of the curvature across it. Information that does not clearly exceed this counts
     as none.
     """
-    direction, ratio = weakest_direction(curvature)
-    return direction if ratio < MIN_INFORMATION_RATIO + RIPPLE_FACTOR * ripple**2 else None
+    return ratio < MIN_INFORMATION_RATIO + RIPPLE_FACTOR * ripple**2
 
 
-def project_evidence(evidence: Evidence, k: int, unobserved: Array | None) -> None:
-    """Removes the k-th evidence along a direction (2,) that the scan does not observe, in place."""
-    if unobserved is None:
+def project_evidence(evidence: Evidence, k: int, unobserved: Array) -> None:
+    """Removes the k-th evidence along the unit vectors (K, 3) of x, y, yaw that the scan does not observe, in place."""
+    if not len(unobserved):
         return
-    projection = np.eye(3)
-    projection[:2, :2] -= np.outer(unobserved, unobserved)
+    projection = np.eye(3) - unobserved.T @ unobserved
     evidence.xi[k] = projection @ evidence.xi[k]
     for matrix in (evidence.curvature, evidence.xi_noise_covariance, evidence.xi_model_covariance):
         matrix[k] = projection @ matrix[k] @ projection
@@ -126,7 +129,8 @@ def mode_from_search(
     Without a prior every pose in ``volume`` m² rad was equally likely, and complexity is the Kullback-Leibler
     divergence from that. ``unknown`` (3, 3), the covariance of an unknown pose, remains along unobserved directions.
     """
-    project_evidence(evidence, k, unobserved_direction(evidence.curvature[k], ripple))
+    (weakest, _), ratio = principal_directions(evidence.curvature[k])
+    project_evidence(evidence, k, np.array([[*weakest, 0.0]]) if is_unobserved(ratio, ripple) else np.zeros((0, 3)))
     information = prior.information[k] if prior else np.linalg.inv(unknown)
     inverse = np.linalg.inv(evidence.curvature[k] + information)
     slope = evidence.xi[k] + (prior.information[k] @ difference(prior.mean[k : k + 1], pose[None])[0] if prior else 0)
@@ -165,7 +169,7 @@ def update_mode(mode: Mode, fused: Fused, evidence: Evidence, k: int, period: fl
 
     The scan's information reduces the noise covariance. The model's errors are alike from scan to scan, so instead of
     their variances their deviations add, each with its share in the pose. ``unobserved`` is true if the scan has no
-    information along some direction.
+    information along some direction. The scan corrects the pose, but not the drift.
     """
     inverse = np.linalg.inv(fused.information)
     prior_information = fused.information - evidence.curvature[k]
@@ -188,6 +192,7 @@ def update_mode(mode: Mode, fused: Fused, evidence: Evidence, k: int, period: fl
         log_evidence=mode.log_evidence,
         clutter=mode.clutter,
         velocity=velocity,
+        drift=inverse @ prior_information @ fused.candidate.drift,
         unobserved_scans=mode.unobserved_scans + 1 if unobserved else 0,
     )
 
@@ -240,13 +245,17 @@ def weigh(modes: list[Mode], log_unknown: float, count: int) -> tuple[list[Mode]
     return weighted, float(weights[-1])
 
 
-def constraining_beams(view: View, pose: Array, direction: Array) -> float:
-    """Expected number of beams on surfaces of the map that face ``direction`` (2,), and so fix ``pose`` along it."""
+def constraining_beams(view: View, pose: Array, direction: Array) -> tuple[float, npt.NDArray[np.bool_]]:
+    """Expected number of beams on surfaces of the map that face ``direction`` (2,), and so fix ``pose`` along it.
+
+    Also returns the mask (B,) of the beams that would meet such surfaces.
+    """
     expected = view.model.expect(se2.compose(pose, view.mount)[None], view.angles)
     normal, surface, scale = expected.jacobian[0, :, :2], expected.ranges[0], expected.scale[0]
     facing = np.abs(normal @ direction) > np.sin(CORNER_ANGLE_RAD) * np.hypot(*normal.T)
     used = facing & np.isfinite(view.ranges) & np.isfinite(surface)
-    return float(view.likelihood.inlier(view.ranges[used], surface[used], scale[used], view.range_max).sum())
+    count = view.likelihood.inlier(view.ranges[used], surface[used], scale[used], view.range_max).sum()
+    return float(count), facing
 
 
 def probability_of_being_near(covariance: Array) -> float:

@@ -52,6 +52,11 @@ class Evidence:
         """Returns the evidence at some of the poses."""
         return Evidence(*(values[rows] for values in vars(self).values()))
 
+    def replace(self, row: int, other: Evidence) -> None:
+        """Replaces the evidence at one pose by the first of another, in place."""
+        for values, replacement in zip(vars(self).values(), vars(other).values(), strict=True):
+            values[row] = replacement[0]
+
 
 @dataclass(frozen=True)
 class Likelihood:

@@ -9,11 +9,16 @@ The prior is a mixture of motions, here called candidates:
 
 The evidence of the scan selects the candidate. So the scans of a standing robot are averaged, and the belief of a
 moving robot does not lag.
+
+Slipping wheels lose a share of every motion, on each axis, so the errors of odometry are alike from scan to scan:
+their deviations add, not their variances. The shares are therefore a state of the filter, here called drift. They are
+not estimated, but their covariance with the pose is kept (Schmidt-Kalman filter). Scans that observe the pose reduce
+it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,6 +48,7 @@ class MotionNoise:
     turn_by_path: float = 5e-4  # rad² per metre travelled
     path_by_path: float = 1e-3  # m² per metre travelled
     path_by_turn: float = 1e-4  # m² per radian turned
+    slip: float = 0.05  # standard deviation of the share by which odometry mistakes every motion alike, on each axis
     command_share: float = 0.2  # as a share of the commanded velocity
     standing: float = 1e-4  # m and rad per scan: motion of a robot that stands still
     surprise: float = 0.02  # probability of any other motion
@@ -56,6 +62,7 @@ class Candidate:
     mean: Array  # (3,)
     covariance: Array  # (3, 3) in map
     probability: float
+    drift: Array = field(default_factory=lambda: np.zeros((3, 3)))  # covariance with the drift, of unit variance
 
     def squared_distance(self, pose: Array) -> float:
         """Squared Mahalanobis distance of ``pose`` (3,) from the mean."""
@@ -76,34 +83,38 @@ def predict_motion(
     odom: Array | None = None,
     command: Array | None = None,
     velocity: Array | None = None,
+    drift: Array | None = None,
 ) -> list[Candidate]:
     """Returns the candidates after ``period`` s, from the last posterior (3,), (3, 3); the last one is the widest.
 
-    ``odom`` (3,) is the motion since then in base_link. ``command`` and ``velocity`` (3,) are in m/s, m/s, rad/s in
-    base_link; without odometry a command takes precedence over the velocity.
+    ``drift`` (3, 3) is the posterior's covariance with the drift; 0 by default. ``odom`` (3,) is the motion since then
+    in base_link. ``command`` and ``velocity`` (3,) are in m/s, m/s, rad/s in base_link; without odometry a command
+    takes precedence over the velocity.
     """
     max_motion = np.array([noise.speed, noise.speed, noise.turn]) * period
     rest = 1 - noise.surprise
+    before = Candidate("before", pose, covariance, 1.0, np.zeros((3, 3)) if drift is None else drift)
     found = []
     if odom is not None:
         moved, turned = float(np.hypot(odom[0], odom[1])), abs(float(odom[2]))
         position = np.sqrt(noise.path_by_path * moved + noise.path_by_turn * turned) + noise.standing
         heading = np.sqrt(noise.turn_by_turn * turned + noise.turn_by_path * moved) + noise.standing
-        found.append(_propagate("odometry", pose, covariance, odom, np.array([position, position, heading]), rest))
+        deviation = np.array([position, position, heading])
+        found.append(_propagate("odometry", before, odom, deviation, rest))
     else:
-        found.append(_propagate("standing", pose, covariance, np.zeros(3), np.full(3, noise.standing), rest / 2))
+        found.append(_propagate("standing", before, np.zeros(3), np.full(3, noise.standing), rest / 2))
         limits = np.array([noise.acceleration, noise.acceleration, noise.turn_acceleration])
         change = limits * period * max(period, SMOOTHING_TIME_S)
         if command is not None:
             change = change + noise.command_share * np.abs(command) * period
-            found.append(_propagate("commanded", pose, covariance, command * period, change, rest / 2))
+            found.append(_propagate("commanded", before, command * period, change, rest / 2))
         elif velocity is not None:
             velocity = limit_velocity(noise, velocity)
             deviation = np.sqrt(change**2 + _velocity_variance(pose, covariance, period))
-            found.append(_propagate("going on", pose, covariance, velocity * period, deviation, rest / 2))
+            found.append(_propagate("going on", before, velocity * period, deviation, rest / 2))
     centre = odom if odom is not None else np.zeros(3)
-    found.append(_propagate("any motion", pose, covariance, centre, max_motion + np.abs(centre), noise.surprise))
-    return found
+    found.append(_propagate("any motion", before, centre, max_motion + np.abs(centre), noise.surprise))
+    return found if odom is None else [_add_drift(each, noise.slip * odom, float(pose[2])) for each in found]
 
 
 def limit_velocity(noise: MotionNoise, velocity: Array) -> Array:
@@ -131,34 +142,38 @@ def _velocity_variance(pose: Array, covariance: Array, period: float) -> Array:
     return np.asarray(2 * share * (1 + share) * np.diagonal(turn @ covariance @ turn.T))
 
 
-def _propagate(
-    name: str, pose: Array, covariance: Array, step: Array, deviation: Array, probability: float
-) -> Candidate:
-    by_pose, by_step = se2.compose_jacobians(pose, step)
-    propagated = by_pose @ covariance @ by_pose.T + (by_step * deviation**2) @ by_step.T
-    return Candidate(name, se2.compose(pose, step), propagated, probability)
+def _propagate(name: str, before: Candidate, step: Array, deviation: Array, probability: float) -> Candidate:
+    by_pose, by_step = se2.compose_jacobians(before.mean, step)
+    covariance = by_pose @ before.covariance @ by_pose.T + (by_step * deviation**2) @ by_step.T
+    return Candidate(name, se2.compose(before.mean, step), covariance, probability, by_pose @ before.drift)
+
+
+def _add_drift(candidate: Candidate, lost: Array, yaw: float) -> Candidate:
+    """Adds the drift of one period: the motion that slipping may have ``lost`` (3,) in base_link at the heading."""
+    growth = se2.rotation(yaw) * lost
+    covariance = candidate.covariance + growth @ candidate.drift.T + candidate.drift @ growth.T + growth @ growth.T
+    return replace(candidate, covariance=covariance, drift=candidate.drift + growth)
 
 
 def widen_unobserved(
-    noise: MotionNoise, candidate: Candidate, direction: Array, scans: int, period: float
+    noise: MotionNoise, candidate: Candidate, directions: Array, scans: int, period: float
 ) -> Candidate:
-    """Adds the motion at full speed along ``direction`` (2,), which the last ``scans`` scans did not observe.
+    """Adds the motion at full speed along ``directions`` (K, 3), which the last ``scans`` scans did not observe.
 
-    The standard deviation grows in proportion to time.
+    The directions are unit vectors of x, y, yaw. The standard deviation grows in proportion to time.
     """
-    covariance = candidate.covariance.copy()
-    covariance[:2, :2] += np.outer(direction, direction) * (noise.speed * period) ** 2 * (2 * scans + 1)
-    return replace(candidate, covariance=covariance)
+    motion = directions.T @ directions * np.array([noise.speed, noise.speed, noise.turn]) * period
+    return replace(candidate, covariance=candidate.covariance + (2 * scans + 1) * motion @ motion.T)
 
 
 def limit_to_map(candidate: Candidate, unknown: Array) -> Candidate:
-    """Limits the variance of the position to that of a completely unknown pose, ``unknown`` (3, 3)."""
+    """Limits the variances to those of a completely unknown pose, ``unknown`` (3, 3)."""
     excess = np.sqrt(np.diag(candidate.covariance) / np.diag(unknown))
-    excess[2] = 1.0
     if (excess <= 1).all():
         return candidate
     scale = 1 / np.maximum(excess, 1.0)
-    return replace(candidate, covariance=candidate.covariance * np.outer(scale, scale))
+    covariance = candidate.covariance * np.outer(scale, scale)
+    return replace(candidate, covariance=covariance, drift=candidate.drift * scale[:, None])
 
 
 def reachable_poses(noise: MotionNoise, pose: Array, period: float, basin: float) -> Array:

@@ -234,11 +234,11 @@ def test_ambiguity_of_the_pose():
         factor = rng.standard_normal((3, 5)) * np.array([30.0, 30.0, 60.0])[:, None]
         information[cell] = factor @ factor.T
     left = np.linalg.inv(information + np.eye(3) / UNKNOWN_VARIANCE)
-    of_a_metre = np.column_stack([np.linalg.eigvalsh(left[:, :2, :2]), left[:, 2, 2]])
+    scan_variances = np.column_stack([np.linalg.eigvalsh(left[:, :2, :2]), left[:, 2, 2]])
     expected = np.zeros(graph.grid.cells)
     centres = graph.grid.centres()
     distances = dijkstra(graph.lengths)
-    for variance, resolution in zip(of_a_metre.T, np.diag(efe.RESOLUTION), strict=True):
+    for variance, resolution in zip(scan_variances.T, np.diag(efe.RESOLUTION), strict=True):
         staying = np.zeros(count)
         for k in range(count):  # a metre of drift, then the scans of a metre, until it stays the same
             for _ in range(2000):

@@ -15,7 +15,7 @@ from common.geometry.world import World, load_world
 from common.limits import MAX_BEAMS
 from lab.accuracy import bound, tasks
 from lab.accuracy.runner import quick_field
-from lab.accuracy.scenes import TWINS, Scene
+from lab.accuracy.scenes import TIM571, TWINS, Scene
 from services.estimator.factory import EstimatorOptions, Geometry, prepare
 from services.estimator.precise.estimator import TARGET_BEAMS, PreciseEstimator
 from services.estimator.precise.global_seeds import Seeds, thin_places
@@ -24,11 +24,12 @@ from services.estimator.shared.interface import Observation
 from tests.estimator.models import ROOM
 
 BEAMS = 271
+WIDE_HALL = World(name="wide-hall", boundary=[(0, 0), (40, 0), (40, 30), (0, 30)])
 HALL = World(name="hall", boundary=[(0, 0), (60, 0), (60, 2), (0, 2)])  # longer than the scanner's 25 m
 
 
-def estimator(world: World, beams: int = BEAMS) -> tuple[PreciseEstimator, Scene]:
-    scene = Scene.of(world, beams, 3)
+def estimator(world: World, beams: int = BEAMS, range_max: float = 25.0) -> tuple[PreciseEstimator, Scene]:
+    scene = Scene.of(world, beams, 3, TIM571.model_copy(update={"range_max": range_max}))
     model = RayCaster(world)
     places = thin_places(world.sample_free(4000, np.random.default_rng(0), 0.05), 0.3)
     return PreciseEstimator(model, Seeds.at(model, places), np.array(scene.scanner.mount)), scene
@@ -138,6 +139,71 @@ def test_driving_in_a_featureless_hall(learned):
     assert stated[0] > (0.5 if learned else 1)
     assert abs(error[1]) < 0.02
     assert posterior.state != "tracking"
+
+
+def drive(made, scene, path, slip=None):
+    """Posteriors along poses (N, 3); with odometry that reports a share ``slip`` too much, or without."""
+    made.restart(path[0], np.diag([1e-4, 1e-4, 1e-4]))
+    odom, found = path[0], []
+    for k, (pose, clean) in enumerate(zip(path, scene.clean(path), strict=True)):
+        if slip is not None and k:
+            odom = se2.compose(odom, (1 + slip) * se2.between(path[k - 1], pose))
+        found.append(made.update(scene.observe(clean, k / 15, None if slip is None else odom)))
+    return found
+
+
+def straight(x, y, yaw, length, speed=1.0):
+    along = np.arange(0, length, speed / 15)[:, None]
+    return np.array([x, y, yaw]) + along * np.array([np.cos(yaw), np.sin(yaw), 0.0])
+
+
+def test_slip_where_nothing_is_in_range():
+    """The error of slipping wheels grows with the distance; the belief does not presume that it averages out."""
+    made, scene = estimator(WIDE_HALL, range_max=4.0)
+    path = straight(2.0, 2.0, 0.6, 16.0)
+    found = drive(made, scene, path, slip=0.06)
+    error = [float(np.hypot(*off(posterior, pose)[:2])) for posterior, pose in zip(found, path, strict=True)]
+    assert all(posterior.state != "tracking" for posterior, e in zip(found, error, strict=True) if e > 0.2)
+    along = se2.rotation(-0.6) @ off(found[-1], path[-1])
+    stated = np.sqrt((se2.rotation(-0.6) @ found[-1].covariance @ se2.rotation(0.6))[0, 0])
+    assert 0.5 < along[0] < 2 * stated < 2
+
+
+def test_odometry_where_scans_confirm_it():
+    """Slip does not reduce the accuracy in view of walls."""
+    made, scene = estimator(ROOM)
+    path = straight(1.0, 1.0, 0.2, 3.0)
+    found = drive(made, scene, path, slip=0.06)
+    assert all(posterior.state == "tracking" for posterior in found)
+    assert max(np.abs(off(posterior, pose)[:2]).max() for posterior, pose in zip(found, path, strict=True)) < 0.02
+    assert np.sqrt(np.trace(found[-1].covariance[:2, :2])) < 0.005
+
+
+def test_slip_back_to_a_similar_place():
+    """After a drift by the distance of two equal pillars, the scan fits at the wrong one."""
+    pillars = [{"box": {"center": (x, 0.25), "size": (0.4, 0.5)}} for x in np.arange(3.0, 37.0, 0.8)]
+    made, scene = estimator(World(name="pillars", boundary=WIDE_HALL.boundary, obstacles=pillars), range_max=4.0)
+    path = np.concatenate([straight(6.0, 2.0, 0.4, 12.0), straight(17.05, 6.67, -0.4, 12.0)])
+    found = drive(made, scene, path, slip=0.05)
+    error = [float(np.hypot(*off(posterior, pose)[:2])) for posterior, pose in zip(found, path, strict=True)]
+    assert max(error) > 0.3
+    assert not [e for posterior, e in zip(found, error, strict=True) if posterior.state == "tracking" and e > 0.2]
+
+
+def test_nothing_in_range_without_odometry():
+    """The belief widens in all directions as fast as the robot can drive and turn, up to the whole map."""
+    made, scene = estimator(WIDE_HALL, range_max=4.0)
+    path = straight(2.0, 2.0, 0.6, 12.0)
+    found = drive(made, scene, path)
+    first = int(np.argmax((scene.clean(path) > 4.0).all(axis=1)))
+    for k in (first + 30, len(path) - 1):
+        stated = np.sqrt(np.diag(found[k].covariance))
+        assert (np.abs(off(found[k], path[k])) < 2 * stated).all()
+        assert (stated[:2] > 1).all()
+        assert stated[2] > 1
+    assert found[-1].state != "tracking"
+    limit = np.sqrt(np.diag(made.seeds.spread))
+    assert (np.sqrt(np.diag(found[-1].covariance)) < 1.01 * limit).all()
 
 
 @pytest.mark.parametrize("start", [[7.7, 2.5, -2.6], [7.7, 2.5]], ids=["pose", "position"])

@@ -17,7 +17,7 @@ from services.estimator.precise.gauss_newton import MAX_STEP, Prior, View, desce
 from services.estimator.precise.global_seeds import Seeds, thin_places
 from services.estimator.precise.hypotheses import Mode, constraining_beams, select_distinct, weigh
 from services.estimator.precise.likelihood import Likelihood
-from services.estimator.precise.motion_model import Candidate, MotionNoise, fuse, predict_motion
+from services.estimator.precise.motion_model import Candidate, MotionNoise, fuse, predict_motion, widen_unobserved
 from services.estimator.precise.search import NEAR_SCHEDULE_M
 from services.estimator.shared.generative_models import Expected, RayCaster
 from tests.estimator.models import ROOM
@@ -220,6 +220,38 @@ def test_motion_priors():
     assert sum(c.probability for c in (standing, going, wide)) == pytest.approx(1)
 
 
+def test_drift():
+    """Equal shares of every motion add up: there and back they cancel, straight on they grow with the distance."""
+    noise = MotionNoise(path_by_path=0, path_by_turn=0, turn_by_path=0, turn_by_turn=0, standing=0, slip=0.1)
+
+    def drifted(steps):
+        pose, P, drift = TRUTH, np.zeros((3, 3)), None
+        for step in steps:
+            moved = predict_motion(noise, pose, P, 0.1, odom=np.array(step), drift=drift)[0]
+            pose, P, drift = moved.mean, moved.covariance, moved.drift
+        return se2.rotation(-TRUTH[2]) @ P @ se2.rotation(-TRUTH[2]).T
+
+    assert drifted([[0.2, 0, 0]] * 50) == pytest.approx(np.diag([1.0, 0, 0]), abs=1e-9)
+    assert drifted([[0.2, 0, 0]] * 50 + [[-0.2, 0, 0]] * 50) == pytest.approx(np.zeros((3, 3)), abs=1e-9)
+    assert np.sqrt(drifted([[0, 0.1, 0]] * 10)[1, 1]) == pytest.approx(0.1)
+    assert np.sqrt(drifted([[0, 0, 0.3]] * 10)[2, 2]) == pytest.approx(0.3)
+
+
+def test_unobserved_motion():
+    """The deviation grows at full speed along the unobserved directions alone."""
+    noise, found = MotionNoise(speed=1.0, turn=2.0), Candidate("x", TRUTH, 1e-6 * np.eye(3), 1.0)
+    along = np.array([[0.6, 0.8, 0.0]])
+    one, every = found, found
+    for k in range(30):
+        one, every = (
+            widen_unobserved(noise, each, directions, k, 0.1) for each, directions in ((one, along), (every, np.eye(3)))
+        )
+    values, vectors = np.linalg.eigh(one.covariance)
+    assert np.sqrt(values) == pytest.approx([1e-3, 1e-3, 3], abs=1e-2)
+    assert np.abs(vectors[:, 2]) == pytest.approx([0.6, 0.8, 0], abs=1e-6)
+    assert np.sqrt(np.diag(every.covariance)) == pytest.approx([3, 3, 6], rel=1e-3)
+
+
 def mode(x, log_evidence, present=0.0):
     nothing = np.zeros((3, 3))
     return Mode(
@@ -245,10 +277,12 @@ def test_constraining_beams():
     clean = hall.expect(pose[None], ANGLES).ranges[0]
     at_ends = np.abs(np.sin(ANGLES)) * clean < 0.99
     seen = View(hall, Likelihood(), np.zeros(3), ANGLES, clean, 25.0)
-    assert constraining_beams(seen, pose, along) == pytest.approx(at_ends.sum(), rel=0.1)
-    assert constraining_beams(seen, pose, across) > 10 * at_ends.sum()
+    count, facing = constraining_beams(seen, pose, along)
+    assert count == pytest.approx(at_ends.sum(), rel=0.1)
+    assert facing.tolist() == at_ends.tolist()
+    assert constraining_beams(seen, pose, across)[0] > 10 * at_ends.sum()
     hidden = replace(seen, ranges=np.where(at_ends, 0.8, clean))
-    assert constraining_beams(hidden, pose, along) < 0.1
+    assert constraining_beams(hidden, pose, along)[0] < 0.1
 
 
 def test_headings_across_pi():
