@@ -244,8 +244,23 @@ class PreciseEstimator:
             poses, evidence = view.descend(match.poses, _prior_of([each[-1] for each in match.motions]))
             match = replace(match, poses=poses, evidence=evidence)
         modes = [self._fuse(view, k, match, motions[k][-1], observation) for k in range(len(match.poses))]
+        modes += self._search_where_possible(view, modes[0], match.motions[0])
         self._weigh_scan(view, modes, match.local_pose, period)
         return view
+
+    def _search_where_possible(self, view: View, best: Mode, candidates: list[Candidate]) -> list[Mode]:
+        """Other hypotheses that fit the scan, if it has just made the ``best`` one certain.
+
+        Before, the robot may have been at many poses, and the descent from one of them finds the nearest match only.
+        """
+        before = self.modes[0]
+        enough = self.settings.tracking_probability
+        if self._probability_of_being_near(before) >= enough or self._probability_of_being_near(best) < enough:
+            return []
+        motion = candidates[0]
+        found = search_near(view, motion.mean, motion.covariance, self.seeds, self.settings, self._rng)
+        at_best = before.log_evidence + _prior_of([motion]).energy(best.pose[None])[0]
+        return [replace(mode, log_evidence=at_best + mode.log_evidence) for mode in found]
 
     def _match(self, view: View, motions: list[list[Candidate]], period: float, *, with_odometry: bool) -> ScanMatch:
         """Matches the scan to the map near the predicted pose of each hypothesis.

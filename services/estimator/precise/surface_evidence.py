@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 CHANGED = np.array([0.0, 0.6, 0.2, 0.2])
 COINCIDENCE = 0.3  # probability that something new is within `NEAR_SIGMAS` of a surface of the map
 NEAR_SIGMAS = 3.0
-BORDER_M = 0.05  # a surface of the map that lies farther from the plane of the one beside it is another one
+BORDER_M = 0.1  # a surface of the map that lies farther from the plane of the one beside it is another one
 PLAUSIBLE_SIGMAS = 2.0  # a larger error makes it less plausible that a beam ends at a surface of the map
 PLAUSIBLE_MEAN = 0.04  # nats, mean of what Gaussian errors lose by this
 
