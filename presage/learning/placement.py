@@ -20,7 +20,7 @@ from services.estimator.factory import EstimatorOptions, Geometry, prepare
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.precise.learning.field_learning import Recipe, learn_field
-from services.estimator.precise.learning.frame import moved_into_cells
+from services.estimator.precise.learning.frame import move_into_cells
 from services.estimator.shared.interface import Observation
 from services.mapper.slam.pose_graph import PoseLink, optimise
 
@@ -66,7 +66,7 @@ def place(world: World, keys: ReferenceDrive, model: Path | None = None) -> Plac
     if model is not None:
         placed = _bent(placed, found, covariances)
     elif world.grid is not None:
-        placed = moved_into_cells(world, replace(keys, poses=placed))
+        placed = move_into_cells(world, replace(keys, poses=placed))
     return Placement(placed, share, float(np.median(_distance(placed[searched], found))))
 
 

@@ -9,7 +9,7 @@ from common.messages.definitions import LearnedField
 PART_BYTES = 1 << 19  # of data in one message; the bus accepts payloads of twice this size
 
 
-def messages_of(data: bytes, version: int, base: str, stamp_ns: int) -> list[LearnedField]:
+def split_into_messages(data: bytes, version: int, base: str, stamp_ns: int) -> list[LearnedField]:
     """Splits an encoded field into messages."""
     pieces = [data[begin : begin + PART_BYTES] for begin in range(0, len(data), PART_BYTES)]
     return [

@@ -50,7 +50,7 @@ from common.robot.ranges import ranges_for_localisation
 from common.runtime.odometry_sync import OdometrySync, ScanWithOdometry
 from common.runtime.service import Service
 from services.estimator.factory import EstimatorOptions, Factory, Geometry, prepare
-from services.estimator.field_exchange import FieldAssembler, messages_of
+from services.estimator.field_exchange import FieldAssembler, split_into_messages
 from services.estimator.learner import LearnedVersion, Learner
 from services.estimator.model_card import ModelInUse, model_in_use, save_learned
 from services.estimator.paper.perception import Descent
@@ -216,7 +216,7 @@ class EstimatorService(Service):
 
     def _publish_field(self, learned: LearnedVersion, stamp_ns: int) -> None:
         self._field_ns = stamp_ns
-        for message in messages_of(learned.data, self.field_version, self._base(), stamp_ns):
+        for message in split_into_messages(learned.data, self.field_version, self._base(), stamp_ns):
             self.publish(FIELD, message)
 
     def _base(self) -> str:

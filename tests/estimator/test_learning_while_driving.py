@@ -16,7 +16,7 @@ from common.messages.topics import BELIEF, FIELD, SAVE_MODEL, SCAN
 from common.robot.scan_geometry import Sweep
 from lab.accuracy.scenes import Scene
 from services.estimator.factory import EstimatorOptions, Geometry, prepare
-from services.estimator.field_exchange import FieldAssembler, messages_of
+from services.estimator.field_exchange import FieldAssembler, split_into_messages
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.key_scans import KeyScans
 from services.estimator.service import EstimatorService
@@ -148,7 +148,7 @@ def test_learn_save_and_follow(process, bus, worlds, tmp_path):
 
 def test_parts():
     data = np.random.default_rng(0).bytes(1_300_000)
-    first, second = (messages_of(data, version, "base", version) for version in (1, 2))
+    first, second = (split_into_messages(data, version, "base", version) for version in (1, 2))
     assert len(first) == 3
     assembler = FieldAssembler()
     assert [assembler.add(part) for part in first] == [None, None, data]

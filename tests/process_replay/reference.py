@@ -58,7 +58,7 @@ def tolerance(field: str, expected: float) -> float:
 def compare(expected: Sequence[Row], got: Sequence[Row]) -> list[str]:
     """A line for every field that differs, and for every message that is missing or new."""
     found = []
-    for number, old, new in _aligned(expected, got):
+    for number, old, new in _pair_rows(expected, got):
         where = f"message {number} ({_kind(old or new or {})})"
         if old is None or new is None:
             found.append(f"{where}: " + ("missing" if new is None else "new, the reference has none"))
@@ -67,8 +67,8 @@ def compare(expected: Sequence[Row], got: Sequence[Row]) -> list[str]:
     return found
 
 
-def _aligned(expected: Sequence[Row], got: Sequence[Row]) -> Iterator[tuple[int, Row | None, Row | None]]:
-    """Pairs messages of the same kind and stamp. Yields number, expected and new row; None where one is missing."""
+def _pair_rows(expected: Sequence[Row], got: Sequence[Row]) -> Iterator[tuple[int, Row | None, Row | None]]:
+    """Pairs messages of the same kind and stamp. Yields the number and both rows, None for a missing one."""
     matcher = SequenceMatcher(None, [_kind(row) for row in expected], [_kind(row) for row in got], autojunk=False)
     for what, a, after_a, b, after_b in matcher.get_opcodes():
         if what == "equal":
@@ -97,7 +97,7 @@ def _same(path: str, old: Any, new: Any) -> bool:
 
 def merged(expected: Sequence[Row], got: Sequence[Row]) -> list[Row]:
     """The new rows, with the old numbers where they agree within tolerance, so that unchanged lines stay the same."""
-    pairs = _aligned(expected, got)
+    pairs = _pair_rows(expected, got)
     return [new if old is None else _merged(old, new, "") for _, old, new in pairs if new is not None]
 
 

@@ -45,7 +45,7 @@ class EstimateError:
         surfaces is among those that the map explains, so the fewer these are, the less each is to be trusted.
         """
         to_base = se2.rotation(-float(pose[2]))
-        offsets, widening = _without_each_surface(view.evidence_by_surface(pose), to_base)
+        offsets, widening = _estimate_without_each_surface(view.evidence_by_surface(pose), to_base)
         mistaken = MISTAKEN_SURFACE / max(explained, MISTAKEN_SURFACE)
         return cls(to_base @ covariance @ to_base.T, offsets, widening, mistaken)
 
@@ -77,10 +77,10 @@ class EstimateError:
         return np.asarray(high)
 
 
-def _without_each_surface(evidence: Evidence, to_base: Array) -> tuple[Array, Array]:
-    """What the pose would be without each of the N surfaces of a scan.
+def _estimate_without_each_surface(evidence: Evidence, to_base: Array) -> tuple[Array, Array]:
+    """Estimates the pose again without each of the N surfaces of a scan.
 
-    Returns the offsets (N, 3) of that pose in base_link, and the factors (N, 3) by which its deviation would be larger.
+    Returns the offsets (N, 3) of these poses in base_link, and the factors (N, 3) by which their deviations are larger.
     ``to_base`` (3, 3) turns a pose's derivative from map to base_link.
     """
     xi, information = evidence.xi.sum(axis=0), evidence.curvature.sum(axis=0) + WEAK_PRIOR

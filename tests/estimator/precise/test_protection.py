@@ -12,7 +12,7 @@ from services.estimator.precise.protection import (
     EXCEEDED_SHARE,
     MISTAKEN_SURFACE,
     EstimateError,
-    _without_each_surface,
+    _estimate_without_each_surface,
 )
 from tests.estimator.precise.test_inference import TRUTH, scan, view
 
@@ -39,7 +39,7 @@ def test_evidence_by_surface(matched):
 def test_pose_without_each_surface(matched):
     made, pose = matched
     evidence = made.evidence_by_surface(pose)
-    offsets, widening = _without_each_surface(evidence, se2.rotation(-float(pose[2])))
+    offsets, widening = _estimate_without_each_surface(evidence, se2.rotation(-float(pose[2])))
 
     def solution(used):
         information = evidence.curvature[used].sum(axis=0) + WEAK_PRIOR

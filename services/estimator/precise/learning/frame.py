@@ -27,11 +27,11 @@ CELL_M, MAX_ELEMENTS = 0.05, 3000  # the elements that stand for the surfaces
 FIRST_STEP_M, LAST_STEP_M = 0.008, 0.0005  # of the search
 
 
-def in_frame_of(original: GenerativeModel, keys: ReferenceDrive) -> ReferenceDrive:
-    """The key scans, moved together to where they fit the ``original`` model best.
+def align_to_map(original: GenerativeModel, keys: ReferenceDrive) -> ReferenceDrive:
+    """Moves the key scans, as one rigid whole, to where they fit the ``original`` model best.
 
-    Least squares of the distances of all beams' ends to the surfaces: errors of a rough map average out. If that is a
-    grid, the surfaces then settle in its cells.
+    Minimises the squared distances of all beams' ends to the surfaces, so that errors of a rough map average out. If
+    the map is a grid, the surfaces are then moved into its occupied cells.
     """
     poses = keys.poses
     middle = np.array([*poses[:, :2].mean(axis=0), 0.0])
@@ -49,14 +49,14 @@ def in_frame_of(original: GenerativeModel, keys: ReferenceDrive) -> ReferenceDri
         poses = se2.compose(middle + step, se2.between(middle, poses))
     keys = replace(keys, poses=poses)
     if isinstance(original, RayCaster) and original.world.grid is not None:
-        keys = replace(keys, poses=moved_into_cells(original.world, keys))
+        keys = replace(keys, poses=move_into_cells(original.world, keys))
     return keys
 
 
-def moved_into_cells(world: World, keys: ReferenceDrive) -> Array:
-    """Poses (N, 3) of key scans, moved as a whole so that the surfaces they saw lie in occupied cells of a grid.
+def move_into_cells(world: World, keys: ReferenceDrive) -> Array:
+    """Returns the poses (N, 3) of key scans, moved as a whole so that the surfaces seen lie in a grid's occupied cells.
 
-    A grid says that a surface is somewhere in a cell, equally likely everywhere; the estimator expects it at the edge.
+    In a grid, a surface may be anywhere in its cell with equal probability; the estimator expects it at the edge.
     """
     cells = SurfaceCells.of(Beams.of(keys.poses, keys.mount, keys.angles, keys.ranges), CELL_M)
     elements = np.stack([cells.mx[cells.is_surface], cells.my[cells.is_surface]], axis=-1) + cells.low

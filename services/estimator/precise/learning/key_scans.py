@@ -91,7 +91,7 @@ class KeyScans:
         self._verify()
         if velocity is not None and _is_trusted(posterior) and self._is_due(pose):
             self._last_key = pose
-            ranges = self._corrected(observation, velocity).astype(np.float32)
+            ranges = self._correct_for_motion(observation, velocity).astype(np.float32)
             self._unverified.append(KeyScan(stamp, pose, ranges, self._path))
 
     def forget_unverified(self) -> None:
@@ -134,8 +134,8 @@ class KeyScans:
         off = se2.between(self._last_key, pose)
         return bool(np.hypot(off[0], off[1]) >= MIN_DISTANCE_M or abs(off[2]) >= MIN_TURN_RAD)
 
-    def _corrected(self, observation: Observation, velocity: Array) -> Array:
-        """Ranges (B,) in m as if measured at the stamp, along the scanner's beams."""
+    def _correct_for_motion(self, observation: Observation, velocity: Array) -> Array:
+        """Returns the ranges (B,) in m along the scanner's beams, as if all were measured at the stamp."""
         ranges, angles = observation.ranges, observation.angles
         if observation.time_increment:
             times = beam_times(len(angles), observation.time_increment)

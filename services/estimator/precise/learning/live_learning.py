@@ -27,7 +27,7 @@ from services.estimator.precise.learning.field_learning import (
     seed_places,
     seen_cells,
 )
-from services.estimator.precise.learning.frame import in_frame_of
+from services.estimator.precise.learning.frame import align_to_map
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.noise import estimate_noise
@@ -66,22 +66,22 @@ def learn_version(
 
     Returns None if the model in use, ``present``, predicts the key scans as well.
     """
-    tracked = lasting_surfaces(keys)
+    tracked = remove_moving_objects(keys)
     sigma = estimate_noise(tracked.ranges, tracked.angles)
-    error = _error_of(original, tracked, sigma)
+    error = _estimate_map_error(original, tracked, sigma)
     replayed = replay(original, places, tracked, min(len(places), MAX_REPLAYED_SCANS), recipe.seed)
-    beside, elsewhere = _divided(replayed, tracked, error, recipe.seed)
+    beside, elsewhere = _split_replayed_beams(replayed, tracked, error, recipe.seed)
     aligned = tracked
     for _ in range(ALIGNMENTS):
-        aligned = _aligned(_learn(aligned, beside, recipe, 1), aligned, tracked.poses, sigma)
-    aligned = in_frame_of(original, aligned)
+        aligned = _match_key_scans(_learn(aligned, beside, recipe, 1), aligned, tracked.poses, sigma)
+    aligned = align_to_map(original, aligned)
     numbers = np.arange(len(aligned.poses))
     is_held_out = numbers % HELD_OUT_EVERY == HELD_OUT_EVERY // 2
     held_out = aligned.part(is_held_out)
     trial = _learn(aligned.part(~is_held_out), beside, recipe, EPOCHS)
     unaligned = tracked.part(is_held_out)
     errors, present_errors = (
-        range_errors(model, _aligned(model, unaligned, unaligned.poses, sigma)) for model in (trial, present)
+        range_errors(model, _match_key_scans(model, unaligned, unaligned.poses, sigma)) for model in (trial, present)
     )
     if mean_error(errors) >= mean_error(present_errors):
         return None
@@ -95,10 +95,10 @@ def learn_version(
     return Version(model, Seeds.at(model, starts), len(keys.poses), errors, present_errors)
 
 
-def lasting_surfaces(keys: ReferenceDrive) -> ReferenceDrive:
-    """The key scans without beams that end where none ended `LASTING_S` earlier or later, as at a person passing by.
+def remove_moving_objects(keys: ReferenceDrive) -> ReferenceDrive:
+    """Removes the beams that end where no beam ended `LASTING_S` earlier or later, as at a person passing by.
 
-    What is there for longer and then gone is removed when the field is learned, because other beams pass through it.
+    Objects that stay longer before they leave are removed when the field is learned: later beams pass through them.
     """
     row, column = np.nonzero(np.isfinite(keys.ranges) & (keys.ranges > 0))
     if not len(row):
@@ -128,19 +128,19 @@ def range_errors(model: GenerativeModel, keys: ReferenceDrive) -> Array:
     return np.asarray(np.abs(keys.ranges[use] - expected.ranges[use]))
 
 
-def _error_of(model: GenerativeModel, keys: ReferenceDrive, sigma: float) -> float:
-    """Standard deviation in m of the model's errors, beyond the scanner's noise ``sigma`` m."""
+def _estimate_map_error(model: GenerativeModel, keys: ReferenceDrive, sigma: float) -> float:
+    """Estimates the standard deviation in m of the model's own errors, without the scanner's noise ``sigma`` m."""
     errors = range_errors(model, keys)
     errors = errors[errors < MAX_ERROR_M]
     variance = (NORMAL_MAD * float(np.median(errors))) ** 2 - sigma**2 if len(errors) else 0.0
     return float(np.sqrt(max(variance, PRECISE_M**2)))
 
 
-def _divided(replayed: Beams, keys: ReferenceDrive, error: float, seed: int) -> tuple[Beams, Beams]:
-    """The beams replayed from the original model that end where key scans saw something, and all others.
+def _split_replayed_beams(replayed: Beams, keys: ReferenceDrive, error: float, seed: int) -> tuple[Beams, Beams]:
+    """Splits the beams replayed from the original model: those that end where key scans saw something, and all others.
 
-    If the model is rough, only few of those are used: they all have the ``error`` of the model, in m, however many
-    they are, while that of measured beams averages out.
+    The rougher the model, the fewer of the first are kept: the ``error`` of the model, in m, does not average out over
+    many beams, as the noise of measured beams does.
     """
     seen = seen_cells(Beams.of(keys.poses, keys.mount, keys.angles, keys.ranges)).contains(replayed.ends())
     chosen = np.random.default_rng(seed).random(len(seen)) < (PRECISE_M / error) ** 2
@@ -156,8 +156,8 @@ def _learn(keys: ReferenceDrive, replayed: Beams, recipe: Recipe, epochs: int) -
     return learn_model(beams, recipe)
 
 
-def _aligned(model: GenerativeModel, keys: ReferenceDrive, priors: Array, sigma: float) -> ReferenceDrive:
-    """The key scans at the poses where they fit the model best, near ``priors`` (N, 3)."""
+def _match_key_scans(model: GenerativeModel, keys: ReferenceDrive, priors: Array, sigma: float) -> ReferenceDrive:
+    """Matches each key scan to the model, near its prior pose in ``priors`` (N, 3)."""
     information, likelihood = np.diag(ALIGNMENT_DEVIATION**-2.0)[None], Likelihood(sigma)
     poses = []
     for pose, prior, ranges in zip(keys.poses, priors, keys.ranges, strict=True):

@@ -9,7 +9,7 @@ from common.geometry.world import load_world
 from lab.accuracy.scenes import Scene
 from lab.integrity.maps import noisy_grid
 from services.estimator.precise.learning.calibration import ReferenceDrive
-from services.estimator.precise.learning.frame import in_frame_of, moved_into_cells
+from services.estimator.precise.learning.frame import align_to_map, move_into_cells
 from services.estimator.shared.generative_models import RayCaster
 
 
@@ -22,5 +22,5 @@ def test_surfaces_settle_in_the_cells_of_a_grid():
     keys = ReferenceDrive(
         np.arange(60.0), poses + off, ranges, scanner.angles(), np.array(scanner.mount), scanner.range_max
     )
-    for moved in (moved_into_cells(rough, keys), in_frame_of(RayCaster(rough), keys).poses):
+    for moved in (move_into_cells(rough, keys), align_to_map(RayCaster(rough), keys).poses):
         assert np.hypot(*(moved - poses)[:, :2].mean(axis=0)) == pytest.approx(0, abs=0.006)

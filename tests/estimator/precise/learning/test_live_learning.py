@@ -14,12 +14,12 @@ from services.estimator.precise.field import FieldModel
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.precise.learning.field_learning import Recipe, learn_field
-from services.estimator.precise.learning.frame import in_frame_of
+from services.estimator.precise.learning.frame import align_to_map
 from services.estimator.precise.learning.live_learning import (
-    lasting_surfaces,
     learn_version,
     mean_error,
     range_errors,
+    remove_moving_objects,
 )
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.generative_models import RayCaster
@@ -109,13 +109,13 @@ def test_frame_of_the_original_model(original):
     """Key scans that are consistent, but all off by the same, are moved back."""
     scans = drive(BEFORE, (0.3, 0.3), (7.7, 3.7), 60)
     moved = se2.compose(np.array([0.03, -0.02, 0.01]), scans.poses)
-    off = in_frame_of(original[0], replace(scans, poses=moved)).poses - scans.poses
+    off = align_to_map(original[0], replace(scans, poses=moved)).poses - scans.poses
     assert np.abs(off[:, :2]).max() < 0.003
     assert np.abs(se2.wrap(off[:, 2])).max() < 0.001
 
 
-def test_nothing_new(original):
-    """A model that predicts the scans as well as what could be learned from them stays."""
+def test_unchanged_surroundings(original):
+    """The model in use is kept if a model learned from the scans predicts them no better."""
     _, places = original
     exact = RayCaster(BEFORE)
     assert learn_version(exact, places, exact, drive(BEFORE, *WEST, 60), RECIPE) is None
@@ -128,16 +128,16 @@ def test_people_leave_no_trace(original, version):
     scans, empty = drive(AFTER, *WEST, 80, people=people), drive(AFTER, *WEST, 80)
     hit = scans.ranges < empty.ranges - 0.1
     assert hit.mean() > 0.02
-    kept = lasting_surfaces(scans)
+    kept = remove_moving_objects(scans)
     assert np.isfinite(kept.ranges[~hit]).mean() > 0.98
     with_people = learn_version(model, places, model, scans, RECIPE).model
     assert error(with_people, AFTER, *WEST) < error(version.model, AFTER, *WEST) + 0.002
 
 
-def test_somebody_who_stands_still_for_a_scan():
+def test_person_standing_still_for_a_scan():
     scans = drive(AFTER, *WEST, 30, people=[((1.5, 1.8), 7.9, 9.7)])
     hit = scans.ranges < drive(AFTER, *WEST, 30).ranges - 0.1
-    kept = lasting_surfaces(scans)
+    kept = remove_moving_objects(scans)
     assert np.isneginf(kept.ranges[hit]).mean() > 0.8
 
 
