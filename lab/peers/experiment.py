@@ -218,8 +218,8 @@ def _finite(value: float) -> float | None:
 HEADS = (
     "task, estimator",
     "knows",
-    "converged (95 %)",
-    "error, cm: median (95 %) / mean / 95 %",
+    "converged (95 % interval)",
+    "error, cm: median (95 % interval) / mean / 95th percentile",
     "all trials, cm: median / RMS",
     "heading (°)",
     "`tracking`, of these wrong",
