@@ -98,17 +98,20 @@ class SurfaceEvidence:
 
 
 @jit
-def _log_density(error: float, variance: float, ideal: float, keep: float) -> float:
+def _log_density(error: float, noise: float, model: float, ideal: float, keep: float) -> float:
     """Log density of a range that differs by ``error`` m from that of a surface of the map.
 
-    Beyond the first beam on a surface, the beams before it predict the range better than a map with errors does
-    (density ``ideal``, because the map shows the corners). The map only says whether it is plausible.
+    ``noise`` and ``model`` are the variances in m² of the scanner's and of the map's error. Beyond the first beam on a
+    surface, the beams before it predict the range better than a map with errors does (density ``ideal``, because the
+    map shows the corners). The map only says whether it is plausible. Its error is alike along a surface, so each beam
+    says so only by the share of the scanner's noise.
     """
+    variance = noise + model
     square = error * error / variance
     if keep == 0.0:
         return math.log((1 - OUTLIER) * math.exp(-0.5 * square) / math.sqrt(2 * math.pi * variance) + OUTLIER / FAR_M)
     excess = 0.5 * max(0.0, square - PLAUSIBLE_SIGMAS**2) - PLAUSIBLE_MEAN
-    return float(max(ideal - excess, math.log(OUTLIER / FAR_M)))
+    return float(max(ideal - excess * noise / variance, math.log(OUTLIER / FAR_M)))
 
 
 @jit
@@ -142,21 +145,22 @@ def _emit(
         log_densities[1] = log_densities[2] = own
         log_densities[3] = math.log(NO_RETURN if behind < range_max else 1 - NO_RETURN)
         return
-    error, near = -np.inf, False
+    error, near, coincidence = -np.inf, False, 0.0
     model = scale * scale
     if surface < range_max:
         noise = sigma * sigma + relative * relative * surface * surface
         error = r - surface
         near = error * error < NEAR_SIGMAS**2 * (noise + model)
-        log_densities[0] = _log_density(error, noise + model, ideal, keep)
-    coincidence = math.log(COINCIDENCE) if near else 0.0
+        if near:
+            coincidence = math.log(COINCIDENCE) * noise / (noise + model)
+        log_densities[0] = _log_density(error, noise, model, ideal, keep)
     if error < 0 or near:
         log_densities[1] = own + coincidence
     if error > 0 or near:
         log_densities[2] = own + coincidence
     if behind < range_max:
         noise = sigma * sigma + relative * relative * behind * behind
-        log_densities[3] = _log_density(r - behind, noise + model, ideal, keep)
+        log_densities[3] = _log_density(r - behind, noise, model, ideal, keep)
 
 
 @jit
