@@ -86,4 +86,5 @@ class Compose:
         return sorted(self.folder.glob("*.mcap"))
 
     def down(self) -> str:
-        return self("down", "--volumes", "--remove-orphans", timeout=90).stderr
+        """Removes everything, the services of profiles too, which `down` alone leaves running."""
+        return self("--profile", "*", "down", "--volumes", "--remove-orphans", timeout=90).stderr
