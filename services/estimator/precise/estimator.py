@@ -253,9 +253,8 @@ class PreciseEstimator:
 
         Before, the robot may have been at many poses, and the descent from one of them finds the nearest match only.
         """
-        before = self.modes[0]
-        enough = self.settings.tracking_probability
-        if self._probability_of_being_near(before) >= enough or self._probability_of_being_near(best) < enough:
+        before, certain = self.modes[0], self.settings.tracking_probability
+        if not self._probability_of_being_near(before) < certain <= self._probability_of_being_near(best):
             return []
         motion = candidates[0]
         found = search_near(view, motion.mean, motion.covariance, self.seeds, self.settings, self._rng)
@@ -581,7 +580,7 @@ class PreciseEstimator:
         """Probability that the best hypothesis is within 0.2 m and 5 degrees of the truth."""
         best = self.modes[0]
         at_best = best.weight * (1 - self._unknown_place.weight)
-        return at_best * probability_of_being_near(self._covariance(best))
+        return at_best * self._probability_of_being_near(best)
 
     def _state(self, probability: float) -> State:
         if probability >= self.settings.tracking_probability:

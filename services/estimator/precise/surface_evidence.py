@@ -2,8 +2,8 @@
 
 Each beam is in one of four states: it ends at the surface that the map shows, at something new in front of it, at
 something behind it that the map lacks, or at the next surface of the map behind one that was removed. The states are a
-Markov chain along the scan, since neighbouring beams mostly meet the same surface. The state is drawn anew where the
-scan shows another surface, and where the map does: a removed chair says nothing about the wall beside it. The forward
+Markov chain along the scan, since neighbouring beams mostly meet the same surface. Where the scan or the map shows
+another surface, the states are independent: a removed chair says nothing about the wall beside it. The forward
 algorithm sums over all sequences of states, and the backward algorithm gives the probability of each state (Rabiner
 1989, section III).
 """
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 CHANGED = np.array([0.0, 0.6, 0.2, 0.2])
 COINCIDENCE = 0.3  # probability that something new is within `NEAR_SIGMAS` of a surface of the map
 NEAR_SIGMAS = 3.0
-BORDER_M = 0.1  # a surface of the map that lies farther from the plane of the one beside it is another one
+BORDER_M = 0.1  # where the map's next range is farther off the plane of the surface before, another surface begins
 PLAUSIBLE_SIGMAS = 2.0  # a larger error makes it less plausible that a beam ends at a surface of the map
 PLAUSIBLE_MEAN = 0.04  # nats, mean of what Gaussian errors lose by this
 
@@ -65,8 +65,7 @@ class SurfaceEvidence:
 
         ``behind`` (N, B) m are the ranges to the next surface behind the expected one; ``borders`` (N, B) is true where
         the map shows another surface than at the beam before. Beams in ``skip`` (B,) do not count as evidence, but are
-        explained all the same. ``changed`` is the share of surfaces that the map does not
-        show as they are.
+        explained all the same. ``changed`` is the share of surfaces that the map does not show as they are.
         """
         count = len(expected.ranges)
         total, explained, weights = np.empty(count), np.empty(count), np.empty(expected.ranges.shape)
@@ -98,7 +97,7 @@ class SurfaceEvidence:
 
 
 @jit
-def _log_density(error: float, noise: float, model: float, ideal: float, keep: float) -> float:
+def _log_density(error: float, noise: float, model: float, ideal: float, begins: np.bool_) -> float:
     """Log density of a range that differs by ``error`` m from that of a surface of the map.
 
     ``noise`` and ``model`` are the variances in m² of the scanner's and of the map's error. Beyond the first beam on a
@@ -108,7 +107,7 @@ def _log_density(error: float, noise: float, model: float, ideal: float, keep: f
     """
     variance = noise + model
     square = error * error / variance
-    if keep == 0.0:
+    if begins:
         return math.log((1 - OUTLIER) * math.exp(-0.5 * square) / math.sqrt(2 * math.pi * variance) + OUTLIER / FAR_M)
     excess = 0.5 * max(0.0, square - PLAUSIBLE_SIGMAS**2) - PLAUSIBLE_MEAN
     return float(max(ideal - excess * noise / variance, math.log(OUTLIER / FAR_M)))
@@ -125,13 +124,13 @@ def _emit(
     range_max: float,
     own: float,
     ideal: float,
-    keep: float,
+    begins: np.bool_,
     log_densities: Array,
 ) -> None:
     """Fills the log density (4,) in nats of a range in each state.
 
-    ``own`` is that on a surface that the map lacks, ``ideal`` on one that it shows; ``keep`` is the probability of the
-    same state as at the beam before, 0 where a surface begins.
+    ``own`` is that on a surface that the map lacks, ``ideal`` on one that it shows; ``begins`` is true at the
+    first beam on a surface of the scan.
     """
     outlier = math.log(OUTLIER / FAR_M)
     log_densities[:] = outlier
@@ -153,14 +152,14 @@ def _emit(
         near = error * error < NEAR_SIGMAS**2 * (noise + model)
         if near:
             coincidence = math.log(COINCIDENCE) * noise / (noise + model)
-        log_densities[0] = _log_density(error, noise, model, ideal, keep)
+        log_densities[0] = _log_density(error, noise, model, ideal, begins)
     if error < 0 or near:
         log_densities[1] = own + coincidence
     if error > 0 or near:
         log_densities[2] = own + coincidence
     if behind < range_max:
         noise = sigma * sigma + relative * relative * behind * behind
-        log_densities[3] = _log_density(r - behind, noise, model, ideal, keep)
+        log_densities[3] = _log_density(r - behind, noise, model, ideal, begins)
 
 
 @jit
@@ -193,9 +192,9 @@ def _sum(
         weights[k] = 0.0
         for n in range(size):
             b = used[n]
-            keep[n] = 0.0 if n == 0 or starts[b] else 1 - change
+            keep[n] = 0.0 if starts[b] else 1 - change
             if n > 0 and borders[k, used[n - 1] + 1 : b + 1].any():
-                # The map's next surface is there, or not, by itself; what is in front of both goes on.
+                # Whether the map's next surface is there is independent; something new in front may cover both.
                 keep[n, 0], keep[n, 2], keep[n, 3] = 0.0, 0.0, 0.0
             at, surface = _nearest_surface(ranges[b], expected[k], b, edges[b])
             _emit(
@@ -208,7 +207,7 @@ def _sum(
                 range_max,
                 own[b],
                 ideal[b],
-                0.0 if n == 0 or starts[b] else 1.0,
+                starts[b],
                 emitted[n],
             )
             norm = _step_forward(forward, emitted, prior, keep[n], n)

@@ -146,7 +146,7 @@ def test_forward_and_backward_algorithm(seed):
             RANGE_MAX,
             density[b],
             ideal[b],
-            1.0 - starts[b],
+            starts[b],
             emitted[b],
         )
     total, weights = by_enumeration(np.exp(emitted), starts, borders, change, skip)
