@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from common.geometry import se2
 from services.estimator.particle_filter.sensor import Explanation, Sensor
-from services.estimator.particle_filter.settings import Settings
+from services.estimator.particle_filter.settings import ParticleFilterSettings
 from services.estimator.shared.interface import Hypothesis, Observation, Posterior, Predicted
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class CorrelativeMatcher:
     def __init__(self, world: World, mount: tuple[float, float, float]) -> None:
         """``mount`` (3,) is the laser in base_link, m, m, rad."""
         self.world, self.mount = world, np.array(mount, float)
-        self._sensor = Sensor(world, Settings.tuned())
+        self._sensor = Sensor(world, ParticleFilterSettings.tuned())
         x0, y0, x1, y1 = world.bounds
         margin = self._sensor.settings.laser_likelihood_max_dist
         self._low = np.array([x0, y0]) - margin

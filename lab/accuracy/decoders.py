@@ -14,7 +14,7 @@ from rich.table import Table
 
 from common.geometry.world import load_world
 from common.robot.scanner import SCANNERS
-from lab.accuracy.panorama import Shape, train_panorama
+from lab.accuracy.panorama import PanoramaShape, train_panorama
 from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import Scene
 from presage.terminal.output import check_file, write_json
@@ -71,7 +71,7 @@ def panorama(steps: int, **shape: Any) -> Learn:
     """Returns a function that trains a panorama network for ``steps`` batches of 256 scans."""
 
     def learn(scans: TrainingScans) -> tuple[GenerativeModel, int]:
-        model = train_panorama(Shape(**shape), scans.poses, scans.angles, scans.ranges, steps, 0)
+        model = train_panorama(PanoramaShape(**shape), scans.poses, scans.angles, scans.ranges, steps, 0)
         return model, sum(x.numel() for x in model.network.parameters())
 
     return learn
@@ -85,7 +85,7 @@ def paper(epochs: int) -> Learn:
         parameters = training.TrainingParameters(epochs=epochs, learning_rate=3e-3)
         data = training.Data(scans.poses, scans.ranges)
         held_out = training.Data(scans.calibration, scans.calibration_ranges)
-        trainer = training.Trainer(decoder.Shape(len(scans.angles), 128, 8), norm, parameters, data, held_out)
+        trainer = training.Trainer(decoder.DecoderShape(len(scans.angles), 128, 8), norm, parameters, data, held_out)
         model = trainer.run()
         size = sum(x.numel() for x in trainer.decoder.parameters())
         return PaperScans(model, scans.scanner, HEADING, trainer.progress.test_l1[-1]), size

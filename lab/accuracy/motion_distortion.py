@@ -22,7 +22,7 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.world import load_world
 from common.robot.motion_distortion import beam_times
-from lab.accuracy.contenders import CONTENDERS, Place
+from lab.accuracy.compared_estimators import COMPARED_ESTIMATORS, EstimatorSetup
 from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import Scene
 from lab.accuracy.tasks import is_at
@@ -60,7 +60,9 @@ def run(job: DistortionJob) -> list[dict[str, Any]]:
         path = scene.path(job.seconds, at_full_speed=True)
         for kind in SCANS:
             scene.rng = np.random.default_rng((job.seed, number, 1))
-            estimator = CONTENDERS[job.estimator].make(Place(world, Geometry.of(scene.scanner), job.seed))
+            estimator = COMPARED_ESTIMATORS[job.estimator].make(
+                EstimatorSetup(world, Geometry.of(scene.scanner), job.seed)
+            )
             estimator.restart(path[0], np.diag([0.01, 0.01, 0.01]))
             estimates = []
             for observation in observations(scene, path, kind, job.prior):

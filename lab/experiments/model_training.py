@@ -12,7 +12,7 @@ from common.geometry.se2 import Array
 from common.versions import commit, versions
 from lab.accuracy.scenes import Scene
 from services.estimator.paper import training
-from services.estimator.paper.decoder import Normalisation, PaperModel, Shape, use_one_core
+from services.estimator.paper.decoder import DecoderShape, Normalisation, PaperModel, use_one_core
 from services.estimator.paper.estimator import PaperPerception
 from services.estimator.paper.perception import Descent
 from services.estimator.paper.training import Data, usable_ranges
@@ -93,7 +93,9 @@ def train_paper(scene: Scene, heading: float, samples: int, steps: int, seed: in
     )
     norm = Normalisation.of(scene.world.bounds, float(train.ranges.max()))
     began = time.process_time()
-    trainer = training.Trainer(Shape(scene.scanner.beams, HIDDEN_UNITS, CHANNELS), norm, parameters, train, watch)
+    trainer = training.Trainer(
+        DecoderShape(scene.scanner.beams, HIDDEN_UNITS, CHANNELS), norm, parameters, train, watch
+    )
     model = trainer.run()
     took = time.process_time() - began
     error = np.abs(model.ranges(judge.poses) - judge.ranges)

@@ -82,7 +82,7 @@ def list_(context: typer.Context) -> None:
 def _obstacles(context: typer.Context) -> list[Obstacle]:
     from common.messages.requests import Request, WorldReply
     from common.messages.topics import WORLD
-    from presage.live.bus_watch import session
+    from presage.live.latest_messages import session
 
     with session(chosen_link(context, OBSERVER)) as bus:
         reply = bus.ask(WORLD, Request(), WorldReply)
@@ -115,7 +115,7 @@ def _shape(x: float, y: float, size: tuple[float, float], yaw: float, radius: fl
 def _change(context: typer.Context, action: str, name: str, obstacle: Obstacle | None) -> None:
     from common.messages.requests import ObstacleRequest, Reply
     from common.messages.topics import OBSTACLE
-    from presage.live.bus_watch import session
+    from presage.live.latest_messages import session
 
     try:
         request = ObstacleRequest.model_validate({"action": action, "name": name, "obstacle": obstacle})

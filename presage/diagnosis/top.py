@@ -16,7 +16,7 @@ from common.messages.definitions import Health
 from common.messages.topics import topic_of
 from common.messages.wire import DecodeError
 from presage.diagnosis.health_board import WATCHED, HealthBoard, Rate, Row
-from presage.live.bus_watch import session
+from presage.live.latest_messages import session
 
 REFRESH_PERIOD_S = 0.5
 LIVELINESS_TIMEOUT_S = 5.0  # for the router's list of tokens; it answers at once unless the machine is busy

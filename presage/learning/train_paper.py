@@ -21,7 +21,7 @@ from common.versions import commit, versions
 from presage.learning.simulated_scans import collect, scanner_on_bus
 from services.estimator.paper import training, weights
 from services.estimator.paper.checkpoint import Checkpoint
-from services.estimator.paper.decoder import Normalisation, PaperModel, Shape
+from services.estimator.paper.decoder import DecoderShape, Normalisation, PaperModel
 from services.estimator.paper.training import Data, Trainer, TrainingParameters, usable_ranges
 
 TEST_SAMPLES = 1000
@@ -92,7 +92,7 @@ def _fit(
     bar: Progress,
 ) -> tuple[Trainer, float]:
     norm = Normalisation.of(world.bounds, float(data["train"].ranges.max()))
-    shape = Shape(scanner.beams, options.shape_hidden, options.shape_channels)
+    shape = DecoderShape(scanner.beams, options.shape_hidden, options.shape_channels)
     trainer = Trainer(shape, norm, options.parameters, data["train"], data["test"])
     if checkpoint.restore(trainer):
         bar.console.print(f"resuming an interrupted run after epoch {trainer.progress.epoch}")

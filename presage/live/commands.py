@@ -27,7 +27,7 @@ from common.messages.requests import (
 )
 from common.messages.topics import GOAL, LOCALISE, QUERIES, SAVE_MAP, SAVE_MODEL, STATUS, TELEPORT, TOPICS, Topic
 from common.messages.wire import DecodeError, Message
-from presage.live.bus_watch import Watch, session
+from presage.live.latest_messages import LatestMessages, session
 
 # Measured with the stamps of the messages. A person in the way usually moves on sooner.
 BLOCKED_TIMEOUT_S = 30.0
@@ -49,32 +49,32 @@ def topic_named(name: str) -> Topic:
 def send_goal(link: Link, goal: Goal, console: Console, *, wait: bool) -> int:
     """Sends or cancels a goal; returns 0 if it is accepted (with ``wait``: reached), else 1."""
     with session(link) as bus:
-        watch = Watch(bus, STATUS)
+        messages = LatestMessages(bus, STATUS)
         if not bus.wait_matching(GOAL, 3.0):
             raise UserError("no controller receives goals: is it running?")
-        status = watch.until(Status, lambda _: True, 3.0)
+        status = messages.wait_for(Status, lambda _: True, 3.0)
         if status is None:
             raise UserError(
                 "the controller publishes no status: does it receive beliefs? `presage doctor` finds the cause"
             )
         bus.put(GOAL, goal.model_copy(update={"stamp_ns": status.stamp_ns}).encode())
         if goal.cancel:
-            done = watch.until(Status, lambda s: s.state == "idle", 3.0)
+            done = messages.wait_for(Status, lambda s: s.state == "idle", 3.0)
             console.print("cancelled; the robot stops" if done else "sent, but not confirmed by the controller")
             return 0 if done else 1
-        if (status := watch.until(Status, lambda s: s.goal_seq == goal.seq, 3.0)) is None:
+        if (status := messages.wait_for(Status, lambda s: s.goal_seq == goal.seq, 3.0)) is None:
             raise UserError("the controller did not acknowledge the goal within 3 s")
         if status.state == "blocked":
             raise UserError(status.reason)
         console.print(f"going to ({goal.pose.x:g}, {goal.pose.y:g})")
-        return _follow(watch, goal, console) if wait else 0
+        return _follow(messages, goal, console) if wait else 0
 
 
-def _follow(watch: Watch, goal: Goal, console: Console) -> int:
+def _follow(messages: LatestMessages, goal: Goal, console: Console) -> int:
     """Waits until the goal is reached (returns 0), or refused or blocked for too long (returns 1)."""
     least_distance, blocked_ns, previous_ns = np.inf, 0, None
     with console.status("navigating") as line:
-        while (status := _next_status(watch, console)) is not None:
+        while (status := _next_status(messages, console)) is not None:
             if status.goal_seq != goal.seq:
                 raise UserError("the goal was replaced by another" if status.goal else "the goal was cancelled")
             to_go = f"{status.distance:.2f} m to go" if status.distance is not None else ""
@@ -90,14 +90,14 @@ def _follow(watch: Watch, goal: Goal, console: Console) -> int:
     raise UserError(f"the controller has published no status for {STATUS_TIMEOUT_S:g} s")
 
 
-def _next_status(watch: Watch, console: Console) -> Status | None:
+def _next_status(messages: LatestMessages, console: Console) -> Status | None:
     """Returns the next status, or None after a timeout.
 
     The timeout is long enough to restart the estimator meanwhile: without beliefs the controller publishes no status.
     """
-    if (status := watch.until(Status, lambda _: True, STATUS_WARNING_S)) is None:
+    if (status := messages.wait_for(Status, lambda _: True, STATUS_WARNING_S)) is None:
         console.print(f"the controller publishes no status; waiting up to {STATUS_TIMEOUT_S:g} s for it")
-        status = watch.until(Status, lambda _: True, STATUS_TIMEOUT_S - STATUS_WARNING_S)
+        status = messages.wait_for(Status, lambda _: True, STATUS_TIMEOUT_S - STATUS_WARNING_S)
     return status
 
 

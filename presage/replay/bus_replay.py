@@ -14,7 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from common.bus.bus import Link
 from common.errors import UserError
 from common.messages.requests import PlayerReply
-from presage.live.bus_watch import session
+from presage.live.latest_messages import session
 from presage.replay.keyboard import HELP, keyboard
 from services.recorder.replaying.replay import ReplayControl, ReplayOptions, names_of, replay
 

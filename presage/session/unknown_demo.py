@@ -26,7 +26,7 @@ from common.messages.definitions import Belief, Goal, Map, Pose, Stamped, Status
 from common.messages.requests import PoseRequest, Reply
 from common.messages.topics import BELIEF, GOAL, MAP, STATUS, TELEPORT, TRUTH
 from common.versions import commit
-from presage.live.bus_watch import Watch
+from presage.live.latest_messages import LatestMessages
 from presage.session.demo import DemoOptions, check_recorded, new_recording
 from presage.session.page import show_page_link
 from presage.session.preflight import plan_session
@@ -67,7 +67,7 @@ class Observer:
 
     def __init__(self, bus: Bus, stack: Stack, world: World, console: Console) -> None:
         self.stack, self.world, self.console = stack, world, console
-        self.watch = Watch(bus, TRUTH, BELIEF, STATUS, MAP)
+        self.messages = LatestMessages(bus, TRUTH, BELIEF, STATUS, MAP)
         self.steps: list[Step] = []
         self.contacts = 0  # truths in which the robot touches something
         self.mapped_share = 0.0
@@ -130,7 +130,7 @@ class Observer:
                     raise StepError(f"{doing}: {self._state()}")
                 if time.monotonic() > deadline:
                     raise StepError(f"{doing} took longer than {limit_s:g} s: {self._state()}")
-                if (message := self.watch.next(0.5)) is not None:
+                if (message := self.messages.next(0.5)) is not None:
                     self._take(message)
                 line.update(escape(f"{doing}: {self._state()}"))
 

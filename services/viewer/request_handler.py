@@ -71,11 +71,11 @@ class RequestHandler:
 
     async def act(self, visitor: Visitor, action: requests.Action) -> ActionResult:  # noqa: PLR0911 - one per action
         """Carries out a visitor's action. Returns the reason if that fails."""
-        if not self.context.control_allowed and not isinstance(action, requests.Watch):
+        if not self.context.control_allowed and not isinstance(action, requests.WatchRobot):
             return ActionResult(ok=False, reason="visitors of this page only watch (it runs without --allow-control)")
         try:
             match action:
-                case requests.Watch():
+                case requests.WatchRobot():
                     return self._watch(visitor, action.robot)
                 case requests.ListRecordings():
                     return await self._recordings()

@@ -18,7 +18,7 @@ from lab.accuracy.scenes import Scene
 from services.estimator.factory import EstimatorOptions, Geometry, prepare
 from services.estimator.field_exchange import FieldAssembler, split_into_messages
 from services.estimator.precise.learning import weights
-from services.estimator.precise.learning.key_scans import KeyScans
+from services.estimator.precise.learning.key_scans import KeyScanCollector
 from services.estimator.service import EstimatorService
 from services.estimator.settings import EstimatorSettings
 from tests.conftest import WAIT_TIMEOUT_S, received_messages
@@ -76,7 +76,7 @@ def test_kidnapping_while_learning():
     path, rate = np.concatenate([before, after]), scene.scanner.rate
     estimator = prepare(EstimatorOptions(office, model="exact"))(Geometry.of(scene.scanner))
     estimator.restart(path[0])
-    keys = KeyScans(scene.scanner.angles(), np.array(scene.scanner.mount), scene.scanner.range_max)
+    keys = KeyScanCollector(scene.scanner.angles(), np.array(scene.scanner.mount), scene.scanner.range_max)
     for k, clean in enumerate(scene.clean(path)):
         observation = scene.observe(clean, k / rate)
         keys.add(estimator.update(observation), observation)

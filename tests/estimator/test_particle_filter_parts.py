@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from common.errors import UserError
 from common.geometry import se2
 from common.geometry.world import World
-from services.estimator.particle_filter import Settings, motion, resampling
+from services.estimator.particle_filter import ParticleFilterSettings, motion, resampling
 from services.estimator.particle_filter.beam_model import BeamModel, RangeTable
 from services.estimator.particle_filter.clusters import hypotheses, labels, moments
 from services.estimator.particle_filter.likelihood_field import LikelihoodField, SurfaceDistances
@@ -220,7 +220,7 @@ def test_recovery():
 def test_settings():
     for wrong in ({"sigma_hit": 0.0}, {"alpha1": -1.0}, {"max_beams": 0}, {"z_rand": 0.0}, {"min_particles": 9000}):
         with pytest.raises(UserError, match="particle filter"):
-            dataclasses.replace(Settings(), **wrong)
+            dataclasses.replace(ParticleFilterSettings(), **wrong)
 
 
 def test_overlapping_obstacles():

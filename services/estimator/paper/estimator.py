@@ -1,4 +1,4 @@
-"""Preset `paper` behind the Estimator interface."""
+"""Preset `paper` behind the PoseEstimator interface."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class PaperPerception:
         )
 
     def predict(self, poses: Array, angles: Array) -> Predicted:
-        """Predicts scans (see Estimator), at the decoder's heading only; +inf where it has no beams.
+        """Predicts scans (see PoseEstimator), at the decoder's heading only; +inf where it has no beams.
 
         Sigma is the decoder's mean error on test scans.
         """

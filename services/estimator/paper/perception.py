@@ -12,7 +12,7 @@ from services.estimator.paper.free_energy import FreeEnergy
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
-    from services.estimator.paper.decoder import GenerativeModel
+    from services.estimator.paper.decoder import ScanPredictor
 
 Mask = npt.NDArray[np.bool_]
 State = Literal["localising", "tracking", "lost"]
@@ -46,7 +46,7 @@ class Estimate:
 class PaperEstimator:
     """Belief about (x, y), with a known constant heading, without covariance and without a motion model."""
 
-    model: GenerativeModel
+    model: ScanPredictor
     model_error: float  # m, mean absolute error of the model's beams on test scans
     bounds: tuple[float, float, float, float]  # m, x0, y0, x1, y1 of the map, within which the belief stays
     pose: Array  # (3,) initial belief

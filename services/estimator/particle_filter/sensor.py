@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from common.geometry.se2 import Array
     from common.geometry.world import World
-    from services.estimator.particle_filter.settings import Settings
+    from services.estimator.particle_filter.settings import ParticleFilterSettings
     from services.estimator.shared.interface import Observation
 
 SIGMA_PER_SPREAD = 1.5  # sigma of a hit, relative to the spread of the particles
@@ -35,7 +35,7 @@ class Explanation(NamedTuple):
 class Sensor:
     """The laser model that the settings select, in one world."""
 
-    def __init__(self, world: World, settings: Settings) -> None:
+    def __init__(self, world: World, settings: ParticleFilterSettings) -> None:
         """Builds the distance field of ``world``, and the table of ranges if the settings select the beam model."""
         s = self.settings = settings
         self.field = LikelihoodField(

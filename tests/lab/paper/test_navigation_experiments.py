@@ -102,13 +102,13 @@ def test_missing_message():
 
 
 def test_estimator_without_a_service(tmp_path):
-    job = navigation.NavigationJob(0, 1, estimators=("particle-filter, heading known",))
+    job = navigation.JourneyJob(0, 1, estimators=("particle-filter, heading known",))
     with pytest.raises(UserError, match="heading known"):
         navigation.run(job, 1, tmp_path, 1, QUIET)
 
 
 def test_e3_through_real_processes(tmp_path):
-    job = navigation.NavigationJob(0, 7, apart=3.0, estimators=("precise",), field=ExperimentWorld(beams=101))
+    job = navigation.JourneyJob(0, 7, apart=3.0, estimators=("precise",), field=ExperimentWorld(beams=101))
     result = navigation.run(job, 1, tmp_path, 1, QUIET)
     summary = result.summary["precise"]
     assert (summary["reached"], summary["trials_with_contact"]) == (1, 0)

@@ -29,7 +29,7 @@ from lab.real_logs.filter_tuning import starting_point
 from presage.learning.train_drive import TrainDriveOptions as Training
 from presage.learning.train_drive import split, train_from_drive
 from presage.logs.log import Reading
-from services.estimator.particle_filter import Settings as ParticleSettings
+from services.estimator.particle_filter import ParticleFilterSettings
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.field_learning import Recipe
 from services.estimator.precise.motion_model import MotionNoise
@@ -123,7 +123,7 @@ def test_motion_model_of_amcl(folder):
     job = StretchJob(
         str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), "amcl-defaults", LASER, 100
     )
-    assert create_estimator(job).settings == ParticleSettings(robot_model_type="omni")
+    assert create_estimator(job).settings == ParticleFilterSettings(robot_model_type="omni")
 
 
 def test_odometry_of_a_kidnapping():

@@ -17,7 +17,7 @@ from common.messages.wire import DecodeError
 M = TypeVar("M", bound=Stamped)
 
 
-class Watch:
+class LatestMessages:
     """Subscribes to topics and keeps the newest message of each."""
 
     def __init__(self, bus: Bus, *topics: Topic) -> None:
@@ -39,7 +39,7 @@ class Watch:
                     return message
         return None
 
-    def until(self, kind: type[M], condition: Callable[[M], bool], timeout: float) -> M | None:
+    def wait_for(self, kind: type[M], condition: Callable[[M], bool], timeout: float) -> M | None:
         """Returns the next message of type ``kind`` that meets the condition, or None after ``timeout`` s."""
         deadline = time.monotonic() + timeout
         while (left := deadline - time.monotonic()) > 0:
