@@ -121,7 +121,7 @@ class FleetLoad:
             if robot is not searching_robot:
                 sent[BELIEF.key(robot.name), self._stamp(k)] = time.time_ns()
             elif k % round(rate) == 0:
-                self._buses[robot.name].request(LOCALISE, LocaliseRequest(), k, Inbox())
+                self._buses[robot.name].send_request(LOCALISE, LocaliseRequest(), k, Inbox())
             self._buses[robot.name].put(SCAN, payload)
             robot.scans = k + 1
         return self._window(count, sent)

@@ -85,7 +85,7 @@ def _obstacles(context: typer.Context) -> list[Obstacle]:
     from presage.live.latest_messages import session
 
     with session(chosen_link(context, OBSERVER)) as bus:
-        reply = bus.ask(WORLD, Request(), WorldReply)
+        reply = bus.query(WORLD, Request(), WorldReply)
     if reply.world is None:
         raise UserError(f"refused: {reply.reason}")
     return list(reply.world.obstacles)
@@ -122,7 +122,7 @@ def _change(context: typer.Context, action: str, name: str, obstacle: Obstacle |
     except ValidationError as error:
         raise UserError(f"obstacle {name!r}: {first_fault(error)}") from None
     with session(chosen_link(context)) as bus:
-        reply = bus.ask(OBSTACLE, request, Reply)
+        reply = bus.query(OBSTACLE, request, Reply)
     if not reply.ok:
         raise UserError(f"refused: {reply.reason}")
     done = {"add": "added", "move": "moved", "remove": "removed"}[action]

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from common.bus.bus import Link, open_bus, wait_until
-from common.bus.inbox import Answer, Inbox, Sample
+from common.bus.inbox import Inbox, RequestResult, Sample
 from common.messages.definitions import Health, Scan
 from common.messages.requests import ConfigReply, Request
 from common.messages.topics import CONFIG, TOPICS
@@ -75,7 +75,7 @@ def observe_bus(link: Link, seconds: float) -> BusObservation | list[Finding]:
             bus.subscribe(topic, inbox, keep_all=True)
         # A new zenoh session discovers the others one by one: measure from the first message on, or after 1 s.
         wait_until(lambda: len(inbox) > 0, 1.0)
-        query = bus.ask_each(CONFIG, Request(), answers, timeout=seconds)
+        query = bus.query_all(CONFIG, Request(), answers, timeout=seconds)
         _receive(inbox, tokens, observation)
         observation.robots = {robot for robot, _ in tokens.copy()}
         observation.liveness.set_alive(bus.alive(), seconds)
@@ -129,7 +129,7 @@ def _add_replies(answers: Inbox, observation: BusObservation) -> None:
     observation.replies = {service: list(replies.values()) for service, replies in by_service.items()}
 
 
-def _drain(inbox: Inbox) -> Iterator[Answer]:
+def _drain(inbox: Inbox) -> Iterator[RequestResult]:
     while (entry := inbox.get(0)) is not None:
-        if isinstance(entry, Answer):
+        if isinstance(entry, RequestResult):
             yield entry

@@ -104,7 +104,7 @@ def _next_status(messages: LatestMessages, console: Console) -> Status | None:
 def teleport(link: Link, pose: Pose, console: Console) -> None:
     """Moves the simulated robot; raises UserError with the reason if the simulator refuses."""
     with session(link) as bus:
-        reply = bus.ask(TELEPORT, PoseRequest(pose=pose), Reply)
+        reply = bus.query(TELEPORT, PoseRequest(pose=pose), Reply)
     if not reply.ok:
         raise UserError(f"refused: {reply.reason}")
     console.print(
@@ -224,7 +224,7 @@ def echo(link: Link, name: str, count: int, console: Console, *, full: bool) -> 
 def relocalise(link: Link, pose: Pose | None, console: Console, *, heading_known: bool = True) -> None:
     """Resets the estimator's belief; raises UserError with the reason if the estimator refuses."""
     with session(link) as bus:
-        reply = bus.ask(LOCALISE, LocaliseRequest(pose=pose, heading_known=heading_known), Reply)
+        reply = bus.query(LOCALISE, LocaliseRequest(pose=pose, heading_known=heading_known), Reply)
     if not reply.ok:
         raise UserError(f"refused: {reply.reason}")
     console.print("localising again " + (f"from ({pose.x:g}, {pose.y:g})" if pose else "from the initial pose"))
@@ -236,7 +236,7 @@ def save_map(link: Link, name: str, console: Console) -> None:
         # A session that has just opened does not know the services yet.
         if not wait_until(lambda: SAVE_MAP.server in bus.alive(), DISCOVERY_TIMEOUT_S):
             raise UserError("no mapper is running: start one with `presage up --mapping`, and drive")
-        reply = bus.ask(SAVE_MAP, SaveMapRequest(name=name), SaveMapReply, SAVE_TIMEOUT_S)
+        reply = bus.query(SAVE_MAP, SaveMapRequest(name=name), SaveMapReply, SAVE_TIMEOUT_S)
     if not reply.ok:
         raise UserError(f"not saved: {reply.reason}")
     console.print(f"saved: {reply.file}. Before `presage up --world`, learn its model:", soft_wrap=True)
@@ -246,7 +246,7 @@ def save_map(link: Link, name: str, console: Console) -> None:
 def save_model(link: Link, name: str, console: Console) -> None:
     """Has the estimator write what it learned while driving; raises UserError with the reason if it cannot."""
     with session(link) as bus:
-        reply = bus.ask(SAVE_MODEL, SaveModelRequest(name=name), SaveModelReply, SAVE_TIMEOUT_S)
+        reply = bus.query(SAVE_MODEL, SaveModelRequest(name=name), SaveModelReply, SAVE_TIMEOUT_S)
     if not reply.ok:
         raise UserError(f"not saved: {reply.reason}")
     console.print(f"saved version {reply.version}: {reply.file}. Use it with the same world:", soft_wrap=True)

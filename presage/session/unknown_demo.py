@@ -193,7 +193,7 @@ def carry_off(bus: Bus, seen: Observer) -> None:
     """Carries the robot off to a mapped place, and waits until it has found itself there."""
     before, place = seen.pose, farthest_key_scan(seen)
     place = se2.compose(place, [0.0, 0.0, np.pi])  # with a view that is not the one in the map
-    reply = bus.ask(TELEPORT, PoseRequest(pose=Pose.of(se2.compose(seen.start, place))), Reply)
+    reply = bus.query(TELEPORT, PoseRequest(pose=Pose.of(se2.compose(seen.start, place))), Reply)
     if not reply.ok:
         raise StepError(f"the simulator refuses to carry the robot off: {reply.reason}")
     way_m = distance(place, before)

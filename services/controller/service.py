@@ -189,7 +189,7 @@ class ControllerService(Service):
             self._step(belief, cpu_ns)
             return
         request = PredictRequest(poses=motions.poses().reshape(-1, 3), beams=PREDICTED_BEAMS)
-        self._latest_request = self.request(PREDICT, request, PREDICTION_TIMEOUT_S)
+        self._latest_request = self.send_request(PREDICT, request, PREDICTION_TIMEOUT_S)
         self._wait = AwaitsPredictions(belief, cpu_ns)
 
     def on_reply(self, query: Query, number: int, reply: Reply) -> None:  # noqa: ARG002 - PREDICT is the only query

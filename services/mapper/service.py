@@ -33,7 +33,7 @@ REPEAT_PERIOD_NS = 5_000_000_000  # an unchanged map is published again after th
 
 
 class MapperService(Service):
-    """Publishes a belief for each scan, and the map whenever it has snapshot.
+    """Publishes a belief for each scan, and the map whenever it has grown.
 
     Loop closing and the map take seconds in a large building. They run in a thread, one update at a time; scans that
     are dropped meanwhile are counted in the health message.

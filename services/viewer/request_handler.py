@@ -165,7 +165,7 @@ class RequestHandler:
 
     def _player(self, action: Any, value: float = 0.0) -> PlayerReply:
         request = PlayerRequest(action=action, value=value)
-        return self.context.control.ask(self.context.playback.robot, PLAYER, request, PlayerReply)
+        return self.context.control.send_request(self.context.playback.robot, PLAYER, request, PlayerReply)
 
     # ---- all visitors
 

@@ -97,7 +97,7 @@ def test_learn_save_and_follow(process, bus, worlds, tmp_path):
     options = [f"--{name.replace('_', '-')}={value}" for name, value in settings.items()]
     running = process("estimator", *options, "--learn", "refine", "--saved-models", str(tmp_path / "saved"))
     assert bus.wait_matching(SCAN, WAIT_TIMEOUT_S)
-    assert "nothing was learned" in bus.ask(SAVE_MODEL, SaveModelRequest(name="monday"), SaveModelReply).reason
+    assert "nothing was learned" in bus.query(SAVE_MODEL, SaveModelRequest(name="monday"), SaveModelReply).reason
     sent = []
 
     def send(k):
@@ -120,11 +120,11 @@ def test_learn_save_and_follow(process, bus, worlds, tmp_path):
     parts = list(received_messages(fields, LearnedField))
     assembler = FieldAssembler()
     data = next(data for part in parts if (data := assembler.add(part)) is not None)
-    reply = bus.ask(SAVE_MODEL, SaveModelRequest(name="monday"), SaveModelReply)
+    reply = bus.query(SAVE_MODEL, SaveModelRequest(name="monday"), SaveModelReply)
     assert reply.ok, reply.reason
     assert reply.version == stored[-1].field_version
-    assert "exists already" in bus.ask(SAVE_MODEL, SaveModelRequest(name="monday"), SaveModelReply).reason
-    assert "letters" in bus.ask(SAVE_MODEL, SaveModelRequest(name="../monday"), SaveModelReply).reason
+    assert "exists already" in bus.query(SAVE_MODEL, SaveModelRequest(name="monday"), SaveModelReply).reason
+    assert "letters" in bus.query(SAVE_MODEL, SaveModelRequest(name="../monday"), SaveModelReply).reason
     saved = tmp_path / "saved" / "monday-precise.safetensors"
     model, _, card = weights.load(saved)
     assert "key scans while driving" in card.source

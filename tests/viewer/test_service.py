@@ -14,7 +14,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from common.bus.bus import Link, open_bus, wait_until
-from common.bus.inbox import Call, Inbox, Sample
+from common.bus.inbox import Inbox, IncomingRequest, Sample
 from common.geometry.world import load_world
 from common.messages.definitions import Health
 from common.messages.requests import Reply, WorldReply
@@ -214,7 +214,7 @@ class Servant:
         deadline = time.monotonic() + timeout
         while (left := deadline - time.monotonic()) > 0:
             call = self.inbox.get(left)
-            if not isinstance(call, Call):
+            if not isinstance(call, IncomingRequest):
                 continue
             reply = Reply()
             if call.query is WORLD:
