@@ -29,7 +29,7 @@ from lab.accuracy.tasks import is_at
 from presage.terminal.output import check_file, write_json
 from services.estimator.factory import Geometry
 from services.estimator.shared.interface import Observation
-from services.simulator.odometry import Drift, Odometer
+from services.simulator.odometry import Odometer, OdometryNoise
 
 SCANS = ("instantaneous", "corrected", "uncorrected")
 PRIORS = ("laser only", "odometry")
@@ -83,7 +83,7 @@ def observations(scene: Scene, path: Array, kind: str, prior: str) -> list[Obser
     scanner, rate = scene.scanner, scene.scanner.rate
     increment = 0.0 if kind == "instantaneous" else scanner.turn_per_beam / rate
     shares = beam_times(scanner.beams, increment) * rate
-    odometer, found = Odometer(Drift(), scene.rng), []
+    odometer, found = Odometer(OdometryNoise(), scene.rng), []
     for k, (pose, following) in enumerate(pairwise(path)):
         if k:
             odometer.move(path[k - 1], pose)

@@ -13,7 +13,7 @@ from common.geometry.se2 import Array
 from lab.accuracy import bound
 from lab.accuracy.scenes import Scene, twin_of, twin_path
 from services.estimator.shared.interface import Observation, PoseEstimator, Posterior
-from services.simulator.odometry import Drift, Odometer
+from services.simulator.odometry import Odometer, OdometryNoise
 
 FOUND_DISTANCE, FOUND_YAW = 0.2, np.deg2rad(5)  # m, rad; an estimate with smaller errors counts as found
 STANDING_SCANS = 20
@@ -150,8 +150,8 @@ def tracking(
     """Tracking along a path from a known start, with the simulator's odometry or without."""
     outcome, path = TaskOutcome(independent=False), scene.path(seconds)
     # Without odometry the motion is unknown, so the bound is that of each scan alone.
-    limits = bound.recursive(scene, path, Drift()) if odometry else bound.single(scene, path)
-    odometer = Odometer(Drift(), scene.rng)
+    limits = bound.recursive(scene, path, OdometryNoise()) if odometry else bound.single(scene, path)
+    odometer = Odometer(OdometryNoise(), scene.rng)
     estimator.restart(path[0], np.diag([0.01, 0.01, 0.01]))
     for k, pose in enumerate(progress(path)):
         if k:

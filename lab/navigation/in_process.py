@@ -21,7 +21,7 @@ from services.estimator.factory import EstimatorOptions, Factory, Geometry, prep
 from services.estimator.prediction_query import answer_prediction
 from services.estimator.service import belief_message
 from services.estimator.shared.interface import Observation, PoseEstimator
-from services.simulator.simulation import Setup, Simulation
+from services.simulator.simulation import Simulation, SimulationSetup
 
 SCANS_TO_STAND = 15  # 1 s; when the goal is reached, the robot is about to stop
 
@@ -30,7 +30,7 @@ SCANS_TO_STAND = 15  # 1 s; when the goal is reached, the robot is about to stop
 class NavigationRun:
     """Parameters of a drive; its results depend on nothing else."""
 
-    simulation: Setup
+    simulation: SimulationSetup
     estimator: EstimatorOptions
     goal: tuple[float, float]  # m in map
     odometry: bool  # whether the estimator is given odometry

@@ -79,7 +79,7 @@ def trial(job: SamplesJob) -> dict[str, Any]:
         "no_prediction_share": float(np.isnan(ranges).mean()),
         "position_error_m": [round(_position_error(make(), test_scene, pose, scans), 6) for pose in poses],
         "same_scan_everywhere_m": float(np.abs(held_out.ranges - np.median(held_out.ranges, axis=0)).mean()),
-        "bound_median_m": bound.median(bound.single(test_scene, poses)),
+        "bound_median_m": bound.median_error(bound.single(test_scene, poses)),
     }
 
 

@@ -27,7 +27,7 @@ from common.messages.requests import (
 )
 from common.messages.topics import GOAL, LOCALISE, QUERIES, SAVE_MAP, SAVE_MODEL, STATUS, TELEPORT, TOPICS, Topic
 from common.messages.wire import DecodeError, Message
-from presage.live.latest_messages import LatestMessages, session
+from presage.live.latest_messages import LatestMessages, session_bus
 
 # Measured with the stamps of the messages. A person in the way usually moves on sooner.
 BLOCKED_TIMEOUT_S = 30.0
@@ -48,7 +48,7 @@ def topic_named(name: str) -> Topic:
 
 def send_goal(link: Link, goal: Goal, console: Console, *, wait: bool) -> int:
     """Sends or cancels a goal; returns 0 if it is accepted (with ``wait``: reached), else 1."""
-    with session(link) as bus:
+    with session_bus(link) as bus:
         messages = LatestMessages(bus, STATUS)
         if not bus.wait_matching(GOAL, 3.0):
             raise UserError("no controller receives goals: is it running?")
@@ -103,7 +103,7 @@ def _next_status(messages: LatestMessages, console: Console) -> Status | None:
 
 def teleport(link: Link, pose: Pose, console: Console) -> None:
     """Moves the simulated robot; raises UserError with the reason if the simulator refuses."""
-    with session(link) as bus:
+    with session_bus(link) as bus:
         reply = bus.query(TELEPORT, PoseRequest(pose=pose), Reply)
     if not reply.ok:
         raise UserError(f"refused: {reply.reason}")
@@ -140,7 +140,7 @@ def list_topics(robot: str, console: Console) -> None:
 
 def measure_rates(link: Link, topics: tuple[Topic, ...], seconds: float) -> dict[str, list[int]]:
     """Receives ``topics`` for ``seconds`` s; returns the arrival times (ns of wall time) by key."""
-    with session(link) as bus:
+    with session_bus(link) as bus:
         inbox, times = Inbox(), defaultdict(list)
         for topic in topics:
             bus.subscribe(topic, inbox, keep_all=True)
@@ -201,7 +201,7 @@ def echo(link: Link, name: str, count: int, console: Console, *, full: bool) -> 
     Raises UserError if no first message comes within 5 s.
     """
     topic, printed = topic_named(name), 0
-    with session(link) as bus:
+    with session_bus(link) as bus:
         inbox = Inbox()
         bus.subscribe(topic, inbox, keep_all=True)
         while not count or printed < count:
@@ -223,7 +223,7 @@ def echo(link: Link, name: str, count: int, console: Console, *, full: bool) -> 
 
 def relocalise(link: Link, pose: Pose | None, console: Console, *, heading_known: bool = True) -> None:
     """Resets the estimator's belief; raises UserError with the reason if the estimator refuses."""
-    with session(link) as bus:
+    with session_bus(link) as bus:
         reply = bus.query(LOCALISE, LocaliseRequest(pose=pose, heading_known=heading_known), Reply)
     if not reply.ok:
         raise UserError(f"refused: {reply.reason}")
@@ -232,7 +232,7 @@ def relocalise(link: Link, pose: Pose | None, console: Console, *, heading_known
 
 def save_map(link: Link, name: str, console: Console) -> None:
     """Has the mapper write its map into files; raises UserError with the reason if it cannot."""
-    with session(link) as bus:
+    with session_bus(link) as bus:
         # A session that has just opened does not know the services yet.
         if not wait_until(lambda: SAVE_MAP.server in bus.alive(), DISCOVERY_TIMEOUT_S):
             raise UserError("no mapper is running: start one with `presage up --mapping`, and drive")
@@ -245,7 +245,7 @@ def save_map(link: Link, name: str, console: Console) -> None:
 
 def save_model(link: Link, name: str, console: Console) -> None:
     """Has the estimator write what it learned while driving; raises UserError with the reason if it cannot."""
-    with session(link) as bus:
+    with session_bus(link) as bus:
         reply = bus.query(SAVE_MODEL, SaveModelRequest(name=name), SaveModelReply, SAVE_TIMEOUT_S)
     if not reply.ok:
         raise UserError(f"not saved: {reply.reason}")

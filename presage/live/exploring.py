@@ -10,7 +10,7 @@ from common.bus.bus import Link
 from common.errors import UserError
 from common.messages.definitions import Exploration, Goal, Pose, Status
 from common.messages.topics import GOAL, STATUS
-from presage.live.latest_messages import LatestMessages, session
+from presage.live.latest_messages import LatestMessages, session_bus
 
 ANSWER_TIMEOUT_S = 3.0
 STATUS_TIMEOUT_S = 30.0  # long enough to restart the mapper meanwhile
@@ -18,7 +18,7 @@ STATUS_TIMEOUT_S = 30.0  # long enough to restart the mapper meanwhile
 
 def explore(link: Link, console: Console) -> int:
     """Explores until everything that can be reached is mapped; returns 0 then, and 1 if the robot cannot get back."""
-    with session(link) as bus:
+    with session_bus(link) as bus:
         messages = LatestMessages(bus, STATUS)
         if not bus.wait_matching(GOAL, ANSWER_TIMEOUT_S):
             raise UserError("no controller is running: start one with `presage up --mapping`")

@@ -50,7 +50,7 @@ class LatestMessages:
 
 
 @contextmanager
-def session(link: Link, timeout: float = 3.0) -> Iterator[Bus]:
+def session_bus(link: Link, timeout: float = 3.0) -> Iterator[Bus]:
     """Opens the bus of a running session; raises UserError if no router answers within ``timeout`` s."""
     with open_bus(link, connect_timeout=timeout) as bus:
         if link.connect and not wait_until(bus.linked, timeout):

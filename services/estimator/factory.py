@@ -213,7 +213,7 @@ def field_path(options: EstimatorOptions, world: World) -> Path:
     return path
 
 
-def check(options: EstimatorOptions, world: World) -> None:
+def check_options(options: EstimatorOptions, world: World) -> None:
     """Raises UserError if a model is missing, as `prepare` does, but without compiling anything."""
     check_start(options, world)
     if options.estimator == "precise" and options.model != "exact":
@@ -269,7 +269,7 @@ def _paper(options: EstimatorOptions, world: World) -> Factory:
     from services.estimator.paper import weights as paper_weights
     from services.estimator.paper.beam_fitting import fit
     from services.estimator.paper.decoder import use_one_core
-    from services.estimator.paper.estimator import PaperPerception
+    from services.estimator.paper.estimator import PaperEstimator
 
     use_one_core()
     folder, files, remedy = _paper_weights(options, world)
@@ -288,7 +288,7 @@ def _paper(options: EstimatorOptions, world: World) -> Factory:
         model, card = load(paper_weights.nearest(folder, world.name, "paper", len(geometry.angles)))
         check_mount(geometry, card.scanner)
         converted = fit(card.scanner, geometry.angles, geometry.mount, f"{train_command} {_train_options(geometry)}")
-        return PaperPerception(model, card, options.descent, options.initial_pose, converted)
+        return PaperEstimator(model, card, options.descent, options.initial_pose, converted)
 
     return make
 

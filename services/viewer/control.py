@@ -1,7 +1,7 @@
 """Goals, teleports, obstacles and driving over the bus.
 
 Every action returns an `ActionResult`. An action that cannot be carried out raises UserError with the reason, which
-`Control.do` turns into a result.
+`RobotControl.do` turns into a result.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class RobotLookup:
     stamp_ns: Callable[[str], int]  # stamp of the newest sensor message
 
 
-class Control:
+class RobotControl:
     """Carries out actions on robots."""
 
     def __init__(self, bus: Bus, roster: Roster, lookup: RobotLookup, connect: str = "") -> None:

@@ -18,7 +18,7 @@ from common.errors import UserError
 from common.messages.requests import PlayerReply, PlayerRequest, Request, WorldReply
 from common.messages.topics import PLAYER, WORLD
 from services.viewer import visitor_requests as requests
-from services.viewer.control import ActionResult, Control
+from services.viewer.control import ActionResult, RobotControl
 from services.viewer.playback import Playback
 from services.viewer.state.roster import Roster
 from services.viewer.visitors import Hub, Visitor
@@ -38,7 +38,7 @@ class RequestContext:
     """The objects that requests act on."""
 
     hub: Hub
-    control: Control
+    control: RobotControl
     playback: Playback
     roster: Roster
     pool: Executor

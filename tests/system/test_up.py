@@ -110,9 +110,9 @@ def test_up_with_page_and_dead_service(up):
     assert len(children) == 6  # router, simulator, estimator, controller, viewer and an idle recorder
     (where,) = [line.split()[-1] for line in running.output.splitlines() if line.startswith("page:")]
     with Page(where) as page:
-        assert page.told("world")["world"]["name"] == "corridor"
+        assert page.wait_for("world")["world"]["name"] == "corridor"
         assert page.frame(lambda header: header["belief"] is not None)
-        page.told("services", lambda message: len(message["services"]) == 5 and not message["missing"])
+        page.wait_for("services", lambda message: len(message["services"]) == 5 and not message["missing"])
         assert page.done("record", action="status")["recording"] is False
     next(child for child in children if "services.estimator" in child.cmdline()).kill()
     running.wait_for("estimator ended with status -9", 20)

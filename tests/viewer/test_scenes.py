@@ -229,7 +229,7 @@ def test_zoom_and_joystick(look):
     assert seen.see("store.frame.status.goal") == goal
 
     # The joystick steers the same though the page moves under the thumb.
-    seen.see("presage.connection.request = (action, fields) => ((window.asked ??= []).push({ action, ...fields }), "
+    seen.see("presage.connection.request = (action, fields) => ((window.sent ??= []).push({ action, ...fields }), "
              "Promise.resolve({ ok: true, reason: '' }))")  # fmt: skip
     box = seen.page.locator("#joystick").bounding_box()
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
@@ -237,11 +237,11 @@ def test_zoom_and_joystick(look):
     fingers.do("touchMove", (x, y - 24))
     seen.see("document.getElementById('banner').hidden = false")  # 40 px of something above
     fingers.do("touchMove", (x, y - 25))
-    seen.wait("window.asked.length > 3", 5)
+    seen.wait("window.sent.length > 3", 5)
     fingers.do("touchEnd")
-    seen.wait("window.asked.at(-1).vx === 0", 5)
-    *said, last = seen.see("window.asked.filter((one) => one.action === 'drive')")
-    assert all(one["vx"] > 0.2 for one in said[2:]), said
+    seen.wait("window.sent.at(-1).vx === 0", 5)
+    *before, last = seen.see("window.sent.filter((one) => one.action === 'drive')")
+    assert all(one["vx"] > 0.2 for one in before[2:]), before
     assert (last["vx"], last["wz"]) == (0, 0)
 
 

@@ -27,9 +27,9 @@ from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.local_map import LocalMap, LocalMapScan, LocalScan
 from services.estimator.precise.motion_model import (
     Candidate,
+    clip_to_plausible_velocity,
     fuse,
     limit_to_map,
-    limit_velocity,
     predict_motion,
     reachable_poses,
     widen_unobserved,
@@ -239,7 +239,9 @@ class PreciseEstimator:
         match = self._match(view, motions, period, with_odometry=odom is not None)
         if observation.time_increment:
             # Once more, corrected for the motion that the match has shown.
-            velocity = limit_velocity(self.settings.motion, -se2.between(match.poses[0], self.modes[0].pose) / period)
+            velocity = clip_to_plausible_velocity(
+                self.settings.motion, -se2.between(match.poses[0], self.modes[0].pose) / period
+            )
             view = self._correct_motion(view, observation, velocity)
             poses, evidence = view.descend(match.poses, _prior_of([each[-1] for each in match.motions]))
             match = replace(match, poses=poses, evidence=evidence)

@@ -35,7 +35,7 @@ from services.mapper.slam.registration import (
     register,
 )
 from services.mapper.slam.search import search
-from services.mapper.slam.segments import PosedScans, Segment, compare
+from services.mapper.slam.segments import PosedScans, Segment, compare_segments
 
 KEY_DISTANCE_M, KEY_TURN_RAD = 0.4, 0.5  # from the last key scan, before another one is taken
 KEY_SHARE = 0.1  # of the median range, if that is a larger distance
@@ -235,7 +235,7 @@ class FrontEnd:
             return 0.0
         scans = PosedScans(self.laser.mount[None], self._evenly_spaced(scan)[None], self.laser.angles)
         pose = prior.mean if found is None else found.pose
-        counted = compare(self._local, self._surface, Segment(0, 0, scan.elements, scans), pose)
+        counted = compare_segments(self._local, self._surface, Segment(0, 0, scan.elements, scans), pose)
         return counted.contradicting / (counted.agreeing + PRIOR_AGREEMENT + counted.contradicting)
 
     def _is_doubtful(self, contradiction: float) -> bool:

@@ -19,7 +19,7 @@ from services.mapper.slam.loop_closure import MAX_DISTANCE_M, MIN_MATCHED, RIVAL
 from services.mapper.slam.pose_graph import PoseLink
 from services.mapper.slam.registration import Surface
 from services.mapper.slam.search import search
-from services.mapper.slam.segments import Segment, compare, submap
+from services.mapper.slam.segments import Segment, compare_segments, submap
 
 TARGET_SPACING_M = 2.0  # between segments of the map in which a segment is searched for
 SEARCH_RANGE_M, TURN_STEP = 4.0, 0.06  # m from them, and rad between the headings tried
@@ -193,6 +193,6 @@ def _contradicting_share(
     """Share of contradictions between a segment at a pose (3,) and others."""
     agreeing = contradicting = 0
     for target in (segments[k] for k in others):
-        found = compare(target, Surface(target.elements), moved, se2.between(poses[target.reference], pose))
+        found = compare_segments(target, Surface(target.elements), moved, se2.between(poses[target.reference], pose))
         agreeing, contradicting = agreeing + found.agreeing, contradicting + found.contradicting
     return contradicting / max(MIN_MATCHED, agreeing + contradicting)

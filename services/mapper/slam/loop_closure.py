@@ -16,7 +16,7 @@ from common.geometry.se2 import Array
 from services.mapper.slam.pose_graph import PoseLink, Uncertainty
 from services.mapper.slam.registration import Surface, register
 from services.mapper.slam.search import search
-from services.mapper.slam.segments import Agreement, Segment, compare, submap
+from services.mapper.slam.segments import Agreement, Segment, compare_segments, submap
 
 MAX_DISTANCE_M = 6.0  # between the references of segments that are matched
 MIN_APART = 3  # segments between two that are matched
@@ -116,7 +116,7 @@ def match_segments(first: Segment, surface: Surface, second: Segment, start: Arr
     if found is None:
         return None
     covariance = np.linalg.inv(found.information + np.eye(3)) + np.diag(MATCH_DEVIATION**2)
-    return SegmentMatch(compare(first, surface, second, found.pose), found.pose, np.asarray(covariance, float))
+    return SegmentMatch(compare_segments(first, surface, second, found.pose), found.pose, np.asarray(covariance, float))
 
 
 def _close_loop(

@@ -112,7 +112,7 @@ class Agreement:
         return self.agreeing / max(1, self.agreeing + self.contradicting)
 
 
-def compare(first: Segment, surface: Surface, second: Segment, pose: Array) -> Agreement:
+def compare_segments(first: Segment, surface: Surface, second: Segment, pose: Array) -> Agreement:
     """Compares two segments, the second at ``pose`` (3,) in the first; ``surface`` has the elements of the first."""
     placed = second.elements.transformed(pose)
     second_matches = surface.partner_distances(placed) < MATCHED_M

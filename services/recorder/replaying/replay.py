@@ -24,7 +24,7 @@ from common.messages.requests import PlayerReply, PlayerRequest, WorldReply
 from common.messages.topics import CONFIG, PLAYER, SCAN, WORLD, Topic
 from common.messages.wire import DecodeError
 from common.runtime.protocol_check import build_config_reply
-from services.recorder.reader import Raw, Recording, read_recording
+from services.recorder.reader import RawMessage, Recording, read_recording
 from services.recorder.replaying.player import (
     Player,
     find_conflicts,
@@ -176,7 +176,7 @@ class Replay:
             if isinstance(entry := self.inbox.get(POLL_PERIOD_S), IncomingRequest):
                 self._answer(entry)
 
-    def _send(self, raw: Raw, position: float) -> None:
+    def _send(self, raw: RawMessage, position: float) -> None:
         topic, key = self.topics[raw.key], self.keys[raw.key]
         self.bus.put(topic, raw.payload, key=key)
         self.counts[key] += 1

@@ -9,7 +9,7 @@ import torch
 from common.errors import UserError
 from lab.accuracy.panorama import PanoramaShape, train_panorama
 from services.estimator.paper.decoder import Decoder, DecoderShape, PaperModel, use_one_core
-from services.estimator.paper.estimator import PaperScans
+from services.estimator.paper.estimator import PaperGenerativeModel
 from tests.estimator.models import HEADING, ROOM, SCANNER
 from tests.estimator.paper.training_scans import normalisation
 
@@ -66,7 +66,7 @@ def test_jacobian():
 def test_decoder_of_the_paper():
     torch.manual_seed(0)
     model = PaperModel(Decoder(DecoderShape(SCANNER.beams, 16, 4)).double(), normalisation())
-    scans = PaperScans(model, SCANNER, HEADING, 0.3)
+    scans = PaperGenerativeModel(model, SCANNER, HEADING, 0.3)
     laser = np.array([[2.0, 1.5, HEADING + 1.0]])  # the heading is ignored, because the decoder is trained for one only
     expected = scans.expect(laser, SCANNER.angles())
     base = np.array([2.0, 1.5, 0.0]) - [*(np.array([np.cos(HEADING + 1), np.sin(HEADING + 1)]) * SCANNER.mount[0]), 0]

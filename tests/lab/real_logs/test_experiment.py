@@ -129,10 +129,10 @@ def test_motion_model_of_amcl(folder):
 def test_odometry_of_a_kidnapping():
     rng = np.random.default_rng(0)
     odom = np.cumsum(rng.normal(0, 0.1, (20, 3)), axis=0)
-    told = hide_kidnapping(odom, 12)
-    assert told[:12] == pytest.approx(odom[:12])
-    assert told[12] == pytest.approx(odom[11])
-    assert se2.between(told[12], told[15]) == pytest.approx(se2.between(odom[12], odom[15]))
+    hidden = hide_kidnapping(odom, 12)
+    assert hidden[:12] == pytest.approx(odom[:12])
+    assert hidden[12] == pytest.approx(odom[11])
+    assert se2.between(hidden[12], hidden[15]) == pytest.approx(se2.between(odom[12], odom[15]))
 
 
 def test_time_of_a_kidnapping(folder):

@@ -119,7 +119,7 @@ def _outside_of(measured: Beams, simulated: Beams) -> Beams:
     return simulated.part(~seen_cells(measured).contains(simulated.ends()))
 
 
-def replay(model: GenerativeModel, places: Array, drive: ReferenceDrive, samples: int, seed: int) -> Beams:
+def replay_model(model: GenerativeModel, places: Array, drive: ReferenceDrive, samples: int, seed: int) -> Beams:
     """Scans of the drive's scanner as a model predicts them, at random ``places`` of (S, 2) m that it knows."""
     rng = np.random.default_rng(seed)
     lasers = np.column_stack([rng.choice(places, samples), rng.uniform(-np.pi, np.pi, samples)])

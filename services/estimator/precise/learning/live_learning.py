@@ -17,7 +17,7 @@ from services.estimator.precise.learning.drive_learning import (
     free_places,
     learn_model,
     remove_contradicted,
-    replay,
+    replay_model,
 )
 from services.estimator.precise.learning.field_learning import (
     MAX_ERROR_M,
@@ -69,7 +69,7 @@ def learn_version(
     tracked = remove_moving_objects(keys)
     sigma = estimate_noise(tracked.ranges, tracked.angles)
     error = _estimate_map_error(original, tracked, sigma)
-    replayed = replay(original, places, tracked, min(len(places), MAX_REPLAYED_SCANS), recipe.seed)
+    replayed = replay_model(original, places, tracked, min(len(places), MAX_REPLAYED_SCANS), recipe.seed)
     beside, elsewhere = _split_replayed_beams(replayed, tracked, error, recipe.seed)
     aligned = tracked
     for _ in range(ALIGNMENTS):

@@ -61,7 +61,7 @@ def test_untrusted_poses(changes):
     assert min(key.pose[0] for key in drive.keys.verified.values()) > 8
 
 
-def test_carried_off():
+def test_kidnapped():
     """What was seen at a pose that turns out to be wrong is dropped, and only that."""
     drive = Drive().go(8)
     before = dict(drive.keys.verified)
