@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import structlog
 
-from common.log_capture import Line, capture
+from common.log_capture import CapturedLine, capture
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -105,7 +105,7 @@ def _json_stream() -> TextIO:
     return _original_stderr[0]
 
 
-def _log_line(line: Line) -> None:
+def _log_line(line: CapturedLine) -> None:
     logging.getLogger(line.logger).log(logging.getLevelName(line.level.upper()), "%s", line.text)
 
 

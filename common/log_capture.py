@@ -16,7 +16,7 @@ ZENOH = re.compile(r"\d{4}-\d\d-\d\dT\S+\s+(?P<level>[A-Z]+)\s.*?(?P<logger>zeno
 
 
 @dataclass(frozen=True)
-class Line:
+class CapturedLine:
     """A line that native code wrote to stdout or stderr."""
 
     level: str  # debug, info, warning, error
@@ -24,7 +24,7 @@ class Line:
     text: str
 
 
-def parse_line(raw: str, stream: str) -> Line | None:
+def parse_line(raw: str, stream: str) -> CapturedLine | None:
     """Parse a line: zenoh's lines state level and module; others are warnings on stderr and information on stdout.
 
     Returns None for an empty line.
@@ -32,11 +32,11 @@ def parse_line(raw: str, stream: str) -> Line | None:
     text = COLOUR.sub("", raw).rstrip()
     if (found := ZENOH.fullmatch(text)) is not None:
         level = found["level"].lower()
-        return Line({"warn": "warning", "trace": "debug"}.get(level, level), found["logger"], found["text"])
-    return Line("warning" if stream == "stderr" else "info", stream, text) if text else None
+        return CapturedLine({"warn": "warning", "trace": "debug"}.get(level, level), found["logger"], found["text"])
+    return CapturedLine("warning" if stream == "stderr" else "info", stream, text) if text else None
 
 
-def capture(handle: Callable[[Line], None]) -> TextIO:
+def capture(handle: Callable[[CapturedLine], None]) -> TextIO:
     """Redirect file descriptors 1 and 2 to ``handle``, which is called from other threads.
 
     Returns a stream that writes to the original stderr. Python's `print` still writes to the original stdout. Pending
@@ -60,7 +60,7 @@ def capture(handle: Callable[[Line], None]) -> TextIO:
     return os.fdopen(os.dup(original["stderr"]), "w", buffering=1, encoding="utf-8", errors="backslashreplace")
 
 
-def _redirect(number: int, name: str, handle: Callable[[Line], None]) -> threading.Thread:
+def _redirect(number: int, name: str, handle: Callable[[CapturedLine], None]) -> threading.Thread:
     reading, writing = os.pipe()
     os.dup2(writing, number)
     os.close(writing)

@@ -18,8 +18,7 @@ from services.estimator.paper.perception import Descent
 from services.estimator.precise.gauss_newton import Optimiser
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.shared.generative_models import GenerativeModel
-from services.estimator.shared.interface import Estimator as EstimatorCore
-from services.estimator.shared.interface import Posterior, Predicted
+from services.estimator.shared.interface import PoseEstimator, Posterior, Predicted
 
 Numbers = npt.ArrayLike
 
@@ -86,7 +85,7 @@ class Estimator:
         self.scanner = SCANNERS[scanner] if isinstance(scanner, str) else scanner
         self._mount = None if mount is None else np.asarray(mount, float)
         self._geometry: Geometry | None = None  # of the scans
-        self._core: EstimatorCore | None = None  # made for this geometry
+        self._core: PoseEstimator | None = None  # made for this geometry
         if self.scanner is not None:
             self._core_for(Geometry.of(self.scanner))
 
@@ -151,7 +150,7 @@ class Estimator:
             sigma_relative=scanner.sigma_relative,
         )
 
-    def _core_for(self, geometry: Geometry) -> EstimatorCore:
+    def _core_for(self, geometry: Geometry) -> PoseEstimator:
         """The estimator for scans of this geometry; made for that of the first scan."""
         if self._mount is not None:
             geometry = replace(geometry, mount=self._mount, mount_assumed=False)

@@ -16,9 +16,9 @@ from typing import Any, TypeVar
 import zenoh
 
 from common.bus.endpoints import explain_rejection, refuse_exposure
-from common.bus.inbox import Answer, Call, Inbox, Sample
+from common.bus.inbox import Inbox, IncomingRequest, RequestResult, Sample
 from common.bus.liveliness import Liveliness, published_ns
-from common.bus.security import Credentials, may_ask, may_put
+from common.bus.security import Credentials, may_put, may_query
 from common.bus.session import DEFAULT_ENDPOINT, JOIN_TIMEOUT_S, LOG_FILTER, Link, open_session, wait_until
 from common.errors import UserError
 from common.messages.definitions import Stamped
@@ -111,7 +111,7 @@ class Bus(Liveliness):
         return unsubscribe
 
     def serve(self, query: Query, inbox: Inbox, service: str = "*") -> None:
-        """Put requests into ``inbox``, as `Call`s that have to be answered."""
+        """Put requests into ``inbox`` as `IncomingRequest`s, which the receiver has to answer."""
 
         def on_query(call: zenoh.Query) -> None:
             payload = call.payload.to_bytes() if call.payload is not None else b""
@@ -127,11 +127,11 @@ class Bus(Liveliness):
                     call.reply_err(reason.encode())
                 call.drop()  # type: ignore[no-untyped-call]
 
-            inbox.put(Call(query, payload, reply, refuse))
+            inbox.put(IncomingRequest(query, payload, reply, refuse))
 
         self._declared.append(self._session.declare_queryable(query.key(self.robot, service), on_query, complete=True))
 
-    def ask(
+    def query(
         self,
         query: Query,
         request: Request,
@@ -146,7 +146,7 @@ class Bus(Liveliness):
         """
         key = query.key(robot or self.robot, service)
         if self._security is not None:
-            self._security.check(may_ask, query, robot or self.robot)
+            self._security.check(may_query, query, robot or self.robot)
         deadline = time.monotonic() + timeout
         while (left := deadline - time.monotonic()) > 0:
             answers = list(self._session.get(key, payload=request.encode(), encoding=ENCODING, timeout=left))
@@ -164,19 +164,19 @@ class Bus(Liveliness):
             f"no service answers {key} within {timeout:g} s: is the {server} running? `presage doctor` checks it"
         )
 
-    def request(
+    def send_request(
         self, query: Query, request: Request, number: int, inbox: Inbox, timeout: float = 5.0, service: str = "*"
     ) -> None:
-        """Send a request and return at once; exactly one `Answer` with ``number`` is put into ``inbox``.
+        """Send a request and return at once; exactly one `RequestResult` with ``number`` is put into ``inbox``.
 
         It arrives after about ``timeout`` s at the latest. The request is sent once: if the session has just opened and
-        does not know the queryables yet, the answer is that there is no service.
+        does not know the queryables yet, the result is that there is no service.
         """
         key, unanswered = query.key(self.robot, service), threading.Lock()
 
         def settle(payload: bytes, refusal: str = "") -> None:
-            if unanswered.acquire(blocking=False):  # never released, so only the first answer is used
-                inbox.put(Answer(query, number, payload, refusal))
+            if unanswered.acquire(blocking=False):  # never released, so only the first reply is used
+                inbox.put(RequestResult(query, number, payload, refusal))
 
         def on_reply(answer: zenoh.Reply) -> None:
             if answer.ok is not None:
@@ -190,7 +190,7 @@ class Bus(Liveliness):
         handler = zenoh.handlers.Callback(on_reply, on_end)
         self._session.get(key, handler, payload=request.encode(), encoding=ENCODING, timeout=timeout)
 
-    def ask_each(
+    def query_all(
         self,
         query: Query,
         request: Request,
@@ -201,13 +201,16 @@ class Bus(Liveliness):
     ) -> threading.Event:
         """Send a request to all services that serve the query, including several instances of one service.
 
-        Each reply is put into ``inbox`` as an `Answer`. Returns an event that is set when no more replies will arrive.
+        Each reply is put into ``inbox`` as a `RequestResult`. Returns an event that is set when no more replies will
+        arrive.
         """
         done, number = threading.Event(), itertools.count()
 
         def on_reply(answer: zenoh.Reply) -> None:
             if answer.ok is not None:
-                inbox.put(Answer(query, next(number), answer.ok.payload.to_bytes(), session=str(answer.replier_id)))
+                inbox.put(
+                    RequestResult(query, next(number), answer.ok.payload.to_bytes(), session=str(answer.replier_id))
+                )
 
         self._session.get(
             query.key(robot or self.robot, service),
@@ -245,10 +248,9 @@ def open_bus(
 ) -> Iterator[Bus]:
     """Open a session, and close it at the end of the ``with`` block.
 
-    With credentials, waits until a router accepts them: for ``connect_timeout`` s, then raises UserError, or without
-    limit if
-    it is None. Exits the process if ``give_up()`` returns true while waiting. Raises UserError if the endpoints cannot
-    be used, or if a session without credentials would be reachable from other machines.
+    With credentials, waits until a router accepts them, for at most ``connect_timeout`` s; None means no limit. Exits
+    the process if ``give_up()`` returns true while waiting. Raises UserError if no router accepts the credentials in
+    time, if the endpoints cannot be used, or if a session without credentials would be reachable from other machines.
     """
     if link.security is None and not link.insecure:
         refuse_exposure(link.listen)

@@ -28,7 +28,7 @@ class Sample:
 
 
 @dataclass(frozen=True)
-class Call:
+class IncomingRequest:
     """A received request, not yet decoded. The receiver has to call exactly one of ``reply`` and ``refuse``."""
 
     query: Query
@@ -38,14 +38,14 @@ class Call:
 
 
 @dataclass(frozen=True)
-class Answer:
+class RequestResult:
     """The result of a request that this process sent: a reply, not yet decoded, or the reason why there is none."""
 
     query: Query
     number: int  # of the request
     payload: bytes
     refusal: str = ""  # why there is no payload
-    session: str = ""  # the zenoh session that replied, set by `Bus.ask_each`
+    session: str = ""  # the zenoh session that replied, set by `Bus.query_all`
 
     def reply(self) -> Reply:
         """The decoded reply; one with ok=False and the reason if there is none or it cannot be decoded."""
@@ -74,7 +74,7 @@ class Inbox:
         self.received: Counter[str] = Counter()  # by key
         self.dropped: Counter[str] = Counter()
         self.oversized: Counter[str] = Counter()
-        self._entries: OrderedDict[object, Sample | Call | Answer] = OrderedDict()
+        self._entries: OrderedDict[object, Sample | IncomingRequest | RequestResult] = OrderedDict()
         self._bytes = 0
         self._serial = 0
         self._counted: set[str] = set()
@@ -84,7 +84,7 @@ class Inbox:
         # lock taken for ever.
         self._lock = changed or lock
 
-    def put(self, entry: Sample | Call | Answer, *, newest_only: bool = False) -> None:
+    def put(self, entry: Sample | IncomingRequest | RequestResult, *, newest_only: bool = False) -> None:
         """Add an entry. With ``newest_only``, it replaces a waiting sample of the same key and source.
 
         Entries that are too large or do not fit are dropped and counted; dropped requests are refused.
@@ -96,9 +96,9 @@ class Inbox:
             self.received[key] += 1
             if size > (MAX_BYTES if isinstance(entry, Sample) else 64 * MAX_BYTES):
                 self.oversized[key] += 1
-                if isinstance(entry, Call):
+                if isinstance(entry, IncomingRequest):
                     entry.refuse(f"the request of {size} bytes is too large")
-                if not isinstance(entry, Answer):
+                if not isinstance(entry, RequestResult):
                     return
                 entry, size = replace(entry, payload=b"", refusal=f"the reply of {size} bytes is too large"), 0
             self._serial += 1
@@ -109,9 +109,9 @@ class Inbox:
             if old is not None:
                 self._bytes -= len(old.payload)
                 self.dropped[key] += 1
-            elif full and not isinstance(entry, Answer):  # there are never more answers than requests that were sent
+            elif full and not isinstance(entry, RequestResult):  # there are never more results than requests
                 self.dropped[key] += 1
-                if isinstance(entry, Call):
+                if isinstance(entry, IncomingRequest):
                     entry.refuse("too many requests are waiting")
                 return
             self._entries[slot] = entry
@@ -137,7 +137,7 @@ class Inbox:
         with self._lock:
             return self.received.copy(), self.dropped.copy(), self.oversized.copy()
 
-    def get(self, timeout: float) -> Sample | Call | Answer | None:
+    def get(self, timeout: float) -> Sample | IncomingRequest | RequestResult | None:
         """Take the oldest entry, waiting at most ``timeout`` s for one; returns None if there is none."""
         with self._lock:
             if not self._entries and timeout > 0:

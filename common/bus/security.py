@@ -76,7 +76,7 @@ def may_put(role: str, topic: Topic) -> bool:
     return role in (topic.publisher_roles or (topic.publisher,)) or (role == "replay" and topic.recorded)
 
 
-def may_ask(role: str, query: Query) -> bool:
+def may_query(role: str, query: Query) -> bool:
     """Whether the role may send requests of the query."""
     return role in query.requester_roles
 
@@ -105,7 +105,7 @@ def rules_of(member: Member) -> list[Rule]:
         (READ[:1], [f"{ROOT}/{robot}/**" for robot in member.robots]),
         (READ[1:], [f"{ROOT}/**"]),
         (("put",), keys([t for t in TOPICS if may_put(role, t)], own)),
-        (("query",), keys([*(q for q in QUERIES if may_ask(role, q)), *latched])),
+        (("query",), keys([*(q for q in QUERIES if may_query(role, q)), *latched])),
         (ANSWER, keys([*(q for q in QUERIES if may_answer(role, q)), *latched], service)),
         (
             ("liveliness_token",),

@@ -20,13 +20,13 @@ Point = tuple[Coordinate, Coordinate]
 Ring = Annotated[list[Point], Field(min_length=3, max_length=10_000)]
 
 
-class Model(BaseModel):
+class WorldPart(BaseModel):
     """Base of the parts of a world: immutable, and without unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class Box(Model):
+class Box(WorldPart):
     """A rectangle."""
 
     center: Point  # m
@@ -41,14 +41,14 @@ class Box(Model):
         return np.asarray(half @ turn.T + np.array(self.center))
 
 
-class Circle(Model):
+class Circle(WorldPart):
     """A disc."""
 
     center: Point  # m
     radius: PositiveDistance  # m
 
 
-class Obstacle(Model):
+class Obstacle(WorldPart):
     """One piece of furniture: exactly one of polygon, box, circle."""
 
     name: Annotated[str, Field(max_length=200)] = ""

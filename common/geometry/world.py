@@ -15,7 +15,7 @@ from pydantic import Field, ValidationError, model_validator
 from common.errors import UserError
 from common.geometry import ros_map as map_file
 from common.geometry.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
-from common.geometry.shapes import Box, Circle, Degrees, Model, Obstacle, Ring, check_ring
+from common.geometry.shapes import Box, Circle, Degrees, Obstacle, Ring, WorldPart, check_ring
 from common.geometry.yaml_text import TooLargeError, parse_yaml
 from common.limits import Coordinate
 
@@ -32,7 +32,7 @@ POINTS_PER_BLOCK = 100_000  # a shapely point needs a few hundred bytes
 MAX_SAMPLING_ATTEMPTS = 50  # without a result, before a grid counts as having no suitable place
 
 
-class Start(Model):
+class Start(WorldPart):
     """Initial pose of the robot."""
 
     x: Coordinate  # m
@@ -40,7 +40,7 @@ class Start(Model):
     yaw_deg: Degrees = 0.0
 
 
-class World(Model):
+class World(WorldPart):
     """A world. Free space is the inside of the boundary, or the free cells of the grid, without the obstacles.
 
     The edge of a grid is not a wall.

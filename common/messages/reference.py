@@ -77,7 +77,7 @@ def _models() -> list[type[BaseModel]]:
         found += [
             c
             for c in models
-            if c.__module__ == module.__name__ and not c.__name__.startswith("_") and c is not furniture.Model
+            if c.__module__ == module.__name__ and not c.__name__.startswith("_") and c is not furniture.WorldPart
         ]
     return found
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from math import inf
 
 from common.bus.bus import Bus, wait_until
-from common.bus.inbox import Answer, Inbox
+from common.bus.inbox import Inbox, RequestResult
 from common.errors import UserError
 from common.log import Logger
 from common.messages.requests import ConfigReply, Request
@@ -94,7 +94,7 @@ class ProtocolCheck:
 
     def _query_all(self) -> bool:
         """Query all services; returns whether any replied."""
-        self._bus.ask_each(CONFIG, Request(), self._inbox, START_TIMEOUT_S).wait(2 * START_TIMEOUT_S)
+        self._bus.query_all(CONFIG, Request(), self._inbox, START_TIMEOUT_S).wait(2 * START_TIMEOUT_S)
         return len(self._inbox) > 0
 
     def watch(self) -> None:
@@ -130,11 +130,11 @@ class ProtocolCheck:
                 del self._pending[name]
             elif now - last_query >= REPLY_TIMEOUT_S:
                 self._pending[name] = (now, attempts + 1)
-                self._bus.ask_each(CONFIG, Request(), self._inbox, REPLY_TIMEOUT_S, name)
+                self._bus.query_all(CONFIG, Request(), self._inbox, REPLY_TIMEOUT_S, name)
 
     def _replies(self) -> list[ConfigReply]:
         found = []
-        while isinstance(answer := self._inbox.get(0), Answer):
+        while isinstance(answer := self._inbox.get(0), RequestResult):
             reply = answer.reply()
             if isinstance(reply, ConfigReply) and reply.ok and reply.service:
                 found.append(reply)

@@ -105,12 +105,12 @@ class Service(ABC):
         """Create the loop that runs this service on a session."""
         return Loop(self, bus, Inbox())
 
-    def request(self, query: Query, request: Request, timeout: float = 5.0) -> int:
+    def send_request(self, query: Query, request: Request, timeout: float = 5.0) -> int:
         """Send a request without waiting.
 
         Returns the number with which `on_reply` is called, after about ``timeout`` s at the latest.
         """
-        return self.loop.request(query, request, timeout)
+        return self.loop.send_request(query, request, timeout)
 
 
 class _SignalHandler:

@@ -10,7 +10,7 @@ from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
 from common.bus.bus import Bus
-from common.bus.inbox import Answer, Call, Inbox, Sample
+from common.bus.inbox import Inbox, IncomingRequest, RequestResult, Sample
 from common.bus.instances import SourceSelector
 from common.bus.leader_election import LeaderElection
 from common.errors import UserError
@@ -140,10 +140,10 @@ class Loop:
         if self._metrics is not None:
             self._metrics.published(key, numbered)
 
-    def request(self, query: Query, request: Request, timeout: float) -> int:
+    def send_request(self, query: Query, request: Request, timeout: float) -> int:
         """Send a request and return its number; the reply arrives through the inbox."""
         self._request_number += 1
-        self.bus.request(query, request, self._request_number, self.inbox, timeout)
+        self.bus.send_request(query, request, self._request_number, self.inbox, timeout)
         return self._request_number
 
     def reject(self, key: str, reason: str) -> None:
@@ -162,7 +162,7 @@ class Loop:
             self.guard(self.service.on_timer)
         self.pulse()
 
-    def handle(self, event: Sample | Call | Answer | None) -> None:
+    def handle(self, event: Sample | IncomingRequest | RequestResult | None) -> None:
         """Handle one entry of the inbox; raises UserError if an older instance has become active."""
         if self._election is not None:
             self._election.check()
@@ -170,9 +170,9 @@ class Loop:
             if self._accepts(event):
                 with nullcontext() if self._metrics is None else self._metrics.step(event):
                     self.guard(lambda: self.service.on_sample(event))
-        elif isinstance(event, Call):
+        elif isinstance(event, IncomingRequest):
             self._answer(event)
-        elif isinstance(event, Answer):
+        elif isinstance(event, RequestResult):
             self.guard(lambda: self.service.on_reply(event.query, event.number, event.reply()))
 
     def pulse(self) -> None:
@@ -214,7 +214,7 @@ class Loop:
             if self._may_log("failed"):
                 self.service.log.exception("step failed", so_far=self.failed)
 
-    def _answer(self, call: Call) -> None:
+    def _answer(self, call: IncomingRequest) -> None:
         try:
             request = call.query.request.decode(call.payload)
         except DecodeError as error:

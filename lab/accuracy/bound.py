@@ -8,7 +8,7 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from lab.accuracy.scenes import Scene
 from services.estimator.shared.generative_models import RayCaster
-from services.simulator.odometry import Drift
+from services.simulator.odometry import OdometryNoise
 
 # 1/m², added to the information: a direction that a scan does not constrain gets a very large but finite bound.
 REGULARISATION = 1e-9
@@ -47,14 +47,14 @@ def heading_known(covariance: Array) -> Array:
     return position_bound
 
 
-def median(covariance: Array) -> float:
+def median_error(covariance: Array) -> float:
     """Median distance, m, of Gaussian errors drawn equally often from each of the covariances (N, 3, 3)."""
     spread = np.linalg.cholesky(covariance[:, :2, :2])
     draws = np.random.default_rng(0).standard_normal((2000, 2))
     return float(np.median(np.linalg.norm(np.einsum("nij,kj->nki", spread, draws), axis=-1)))
 
 
-def recursive(scene: Scene, path: Array, drift: Drift, start: Array | None = None) -> Array:
+def recursive(scene: Scene, path: Array, drift: OdometryNoise, start: Array | None = None) -> Array:
     """(N, 3, 3) bound along a path (N, 3) with odometry of the given drift: an information filter at the true poses.
 
     ``start`` (3, 3) is the pose covariance before the first scan. Defaults to no prior knowledge.

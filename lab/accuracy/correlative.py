@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from common.geometry import se2
-from services.estimator.particle_filter.sensor import Explanation, Sensor
-from services.estimator.particle_filter.settings import Settings
+from services.estimator.particle_filter.sensor import ScanFit, Sensor
+from services.estimator.particle_filter.settings import ParticleFilterSettings
 from services.estimator.shared.interface import Hypothesis, Observation, Posterior, Predicted
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class CorrelativeMatcher:
     def __init__(self, world: World, mount: tuple[float, float, float]) -> None:
         """``mount`` (3,) is the laser in base_link, m, m, rad."""
         self.world, self.mount = world, np.array(mount, float)
-        self._sensor = Sensor(world, Settings.tuned())
+        self._sensor = Sensor(world, ParticleFilterSettings.tuned())
         x0, y0, x1, y1 = world.bounds
         margin = self._sensor.settings.laser_likelihood_max_dist
         self._low = np.array([x0, y0]) - margin
@@ -74,22 +74,22 @@ class CorrelativeMatcher:
         found = None if pose is None else self._refine(pose, observation, NEARBY_SIGMAS_M)
         if found is None or found[1].fit < MIN_FIT:
             found = self._refine(self._search(observation), observation, FINAL_SIGMAS_M)
-        pose, explanation = found
-        good = explanation.fit >= MIN_FIT
+        pose, scan_fit = found
+        good = scan_fit.fit >= MIN_FIT
         self._pose = pose if good else None
-        covariance = np.asarray(np.linalg.inv(explanation.curvature + 1e-3 * np.eye(3)), float)
+        covariance = np.asarray(np.linalg.inv(scan_fit.curvature + 1e-3 * np.eye(3)), float)
         laser = se2.compose(pose, self.mount)
         return Posterior(
             state="tracking" if good else "lost",
             hypotheses=(Hypothesis(pose, covariance, 1.0),),
-            accuracy=explanation.accuracy,
+            accuracy=scan_fit.accuracy,
             complexity=0.0,
-            xi=explanation.xi,
-            curvature=explanation.curvature,
+            xi=scan_fit.xi,
+            curvature=scan_fit.curvature,
             predicted=self.world.ray_distances(laser, observation.angles)[0],
         )
 
-    def _refine(self, pose: Array, observation: Observation, sigmas: tuple[float, ...]) -> tuple[Array, Explanation]:
+    def _refine(self, pose: Array, observation: Observation, sigmas: tuple[float, ...]) -> tuple[Array, ScanFit]:
         """The pose (3,) after a Gauss-Newton step for each of ``sigmas`` m, and what it explains."""
         pose = np.array(pose, float)
         for sigma in sigmas:

@@ -14,15 +14,15 @@ from rich.table import Table
 
 from common.geometry.world import load_world
 from common.robot.scanner import SCANNERS
-from lab.accuracy.panorama import Shape, train_panorama
+from lab.accuracy.panorama import PanoramaShape, train_panorama
 from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import Scene
 from presage.terminal.output import check_file, write_json
 from services.estimator.paper import decoder, training
 from services.estimator.paper.decoder import Normalisation
-from services.estimator.paper.estimator import PaperScans
+from services.estimator.paper.estimator import PaperGenerativeModel
 from services.estimator.precise.field import FieldModel
-from services.estimator.precise.learning.evaluation import evaluate
+from services.estimator.precise.learning.evaluation import evaluate_model
 from services.estimator.precise.learning.field_learning import Recipe, learn_field, learn_scales
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.generative_models import GenerativeModel
@@ -71,7 +71,7 @@ def panorama(steps: int, **shape: Any) -> Learn:
     """Returns a function that trains a panorama network for ``steps`` batches of 256 scans."""
 
     def learn(scans: TrainingScans) -> tuple[GenerativeModel, int]:
-        model = train_panorama(Shape(**shape), scans.poses, scans.angles, scans.ranges, steps, 0)
+        model = train_panorama(PanoramaShape(**shape), scans.poses, scans.angles, scans.ranges, steps, 0)
         return model, sum(x.numel() for x in model.network.parameters())
 
     return learn
@@ -83,12 +83,12 @@ def paper(epochs: int) -> Learn:
     def learn(scans: TrainingScans) -> tuple[GenerativeModel, int]:
         norm = Normalisation.of(scans.world.bounds, float(scans.ranges.max()))
         parameters = training.TrainingParameters(epochs=epochs, learning_rate=3e-3)
-        data = training.Data(scans.poses, scans.ranges)
-        held_out = training.Data(scans.calibration, scans.calibration_ranges)
-        trainer = training.Trainer(decoder.Shape(len(scans.angles), 128, 8), norm, parameters, data, held_out)
+        data = training.TrainingData(scans.poses, scans.ranges)
+        held_out = training.TrainingData(scans.calibration, scans.calibration_ranges)
+        trainer = training.Trainer(decoder.DecoderShape(len(scans.angles), 128, 8), norm, parameters, data, held_out)
         model = trainer.run()
         size = sum(x.numel() for x in trainer.decoder.parameters())
-        return PaperScans(model, scans.scanner, HEADING, trainer.progress.test_l1[-1]), size
+        return PaperGenerativeModel(model, scans.scanner, HEADING, trainer.progress.test_l1[-1]), size
 
     return learn
 
@@ -116,17 +116,17 @@ def bench_decoders(world: str, samples: int, steps: int, seed: int, json_file: P
         began = time.monotonic()
         model, size = learn(scans)
         took = time.monotonic() - began
-        quality = evaluate(model, scans.test, np.zeros(3), scans.angles, scans.test_ranges, 25.0, scans.sigma)
+        errors = evaluate_model(model, scans.test, np.zeros(3), scans.angles, scans.test_ranges, 25.0, scans.sigma)
         rows.append(
             {
                 "decoder": name,
                 "learning_s": round(took, 1),
                 "numbers": size,
-                "range_error_median_m": quality.range_error_median,
-                "range_error_mean_m": quality.range_error_mean,
-                "share_above_5_cm": quality.share_above_5_cm,
-                "position_error_median_m": quality.position_error_median,
-                "position_error_rms_m": quality.position_error_rms,
+                "range_error_median_m": errors.range_error_median,
+                "range_error_mean_m": errors.range_error_mean,
+                "share_above_5_cm": errors.share_above_5_cm,
+                "position_error_median_m": errors.position_error_median,
+                "position_error_rms_m": errors.position_error_rms,
             }
         )
     table = Table(title=f"{world}, {samples} scans of 811 beams with noise of 0.02 m", title_justify="left")

@@ -38,14 +38,14 @@ CATALOGUE: tuple[tuple[Shape, Point, Point, bool], ...] = (
 
 
 @dataclass(frozen=True)
-class Piece:
+class FurniturePiece:
     """A piece of furniture as a laser sees it: a box, a disc, or four thin legs at the corners of a box."""
 
     shape: Shape
     size: tuple[float, float]  # m, of the box along its own x and y; of a disc, its diameter twice
     pose: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, m, rad, of the centre in map
 
-    def at(self, pose: Array) -> Piece:
+    def at(self, pose: Array) -> FurniturePiece:
         """The same piece at another pose (3,)."""
         x, y, yaw = map(float, pose)
         return replace(self, pose=(x, y, yaw))
@@ -81,9 +81,9 @@ class Floor:
         self._empty = walls.free_space
         self._taken = keep_free
         self._reachable = shapely.buffer(self._empty, -ROBOT_RADIUS_M)
-        self.pieces: list[Piece] = []
+        self.pieces: list[FurniturePiece] = []
 
-    def put(self, piece: Piece) -> bool:
+    def put(self, piece: FurniturePiece) -> bool:
         """Puts the piece down if there is room for it; returns whether there was."""
         if not shapely.covers(self._empty, piece.footprint) or shapely.intersects(self._taken, piece.footprint):
             return False

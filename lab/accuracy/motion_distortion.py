@@ -22,14 +22,14 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.world import load_world
 from common.robot.motion_distortion import beam_times
-from lab.accuracy.contenders import CONTENDERS, Place
+from lab.accuracy.compared_estimators import COMPARED_ESTIMATORS, EstimatorSetup
 from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import Scene
 from lab.accuracy.tasks import is_at
 from presage.terminal.output import check_file, write_json
 from services.estimator.factory import Geometry
 from services.estimator.shared.interface import Observation
-from services.simulator.odometry import Drift, Odometer
+from services.simulator.odometry import Odometer, OdometryNoise
 
 SCANS = ("instantaneous", "corrected", "uncorrected")
 PRIORS = ("laser only", "odometry")
@@ -60,7 +60,9 @@ def run(job: DistortionJob) -> list[dict[str, Any]]:
         path = scene.path(job.seconds, at_full_speed=True)
         for kind in SCANS:
             scene.rng = np.random.default_rng((job.seed, number, 1))
-            estimator = CONTENDERS[job.estimator].make(Place(world, Geometry.of(scene.scanner), job.seed))
+            estimator = COMPARED_ESTIMATORS[job.estimator].make(
+                EstimatorSetup(world, Geometry.of(scene.scanner), job.seed)
+            )
             estimator.restart(path[0], np.diag([0.01, 0.01, 0.01]))
             estimates = []
             for observation in observations(scene, path, kind, job.prior):
@@ -81,7 +83,7 @@ def observations(scene: Scene, path: Array, kind: str, prior: str) -> list[Obser
     scanner, rate = scene.scanner, scene.scanner.rate
     increment = 0.0 if kind == "instantaneous" else scanner.turn_per_beam / rate
     shares = beam_times(scanner.beams, increment) * rate
-    odometer, found = Odometer(Drift(), scene.rng), []
+    odometer, found = Odometer(OdometryNoise(), scene.rng), []
     for k, (pose, following) in enumerate(pairwise(path)):
         if k:
             odometer.move(path[k - 1], pose)

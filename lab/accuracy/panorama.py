@@ -26,7 +26,7 @@ DIFFERENCE_STEP = 2e-3  # m; finite differences, because torch has no such deriv
 
 
 @dataclass(frozen=True)
-class Shape:
+class PanoramaShape:
     """Hyperparameters of the network."""
 
     inputs: Literal["fourier", "grid"] = "fourier"
@@ -61,7 +61,7 @@ class Grids(nn.Module):
 
     stretch: torch.Tensor
 
-    def __init__(self, shape: Shape, size: tuple[float, float]) -> None:
+    def __init__(self, shape: PanoramaShape, size: tuple[float, float]) -> None:
         super().__init__()
         self.grids = nn.ParameterList(
             nn.Parameter(1e-2 * torch.randn(1, shape.features, int(size[1] / cell) + 2, int(size[0] / cell) + 2))
@@ -80,7 +80,7 @@ class Grids(nn.Module):
 class Panorama(nn.Module):
     """Maps positions (N, 2) to normalised ranges and log scales (N, bins); the world's longer side is [-1, 1]."""
 
-    def __init__(self, shape: Shape, size: tuple[float, float]) -> None:
+    def __init__(self, shape: PanoramaShape, size: tuple[float, float]) -> None:
         super().__init__()
         self.inputs: Fourier | Grids = Fourier(shape.frequencies) if shape.inputs == "fourier" else Grids(shape, size)
         layers: list[nn.Module] = []
@@ -141,7 +141,9 @@ class PanoramaModel:
         return np.full(ranges.shape, np.inf)
 
 
-def train_panorama(shape: Shape, lasers: Array, angles: Array, ranges: Array, steps: int, seed: int) -> PanoramaModel:
+def train_panorama(
+    shape: PanoramaShape, lasers: Array, angles: Array, ranges: Array, steps: int, seed: int
+) -> PanoramaModel:
     """Trains on scans ``ranges`` (N, B), m, taken at ``lasers`` (N, 3), the laser's poses.
 
     Takes ``steps`` steps of 256 scans each; the learning rate decays to zero along a cosine.

@@ -16,7 +16,7 @@ from common.robot.base import Robot
 from common.versions import commit, versions
 from services.estimator.paper import weights
 from services.estimator.paper.decoder import use_one_core
-from services.estimator.paper.perception import PaperEstimator
+from services.estimator.paper.perception import PaperPerception
 from services.estimator.paper.training import usable_ranges
 from services.estimator.shared.model_folder import SHIPPED
 
@@ -38,7 +38,7 @@ def localisation(world: str, beams: int, trials: int, scans: int, seed: int, con
         laser = se2.compose(pose, np.array(scanner.mount))
         clean = card.world.ray_distances(laser, scanner.angles())[0]
         start = np.array([*card.world.center(), card.heading])
-        estimator = PaperEstimator(model, card.test_l1_mean, card.world.bounds, start, metric=model.norm.metric)
+        estimator = PaperPerception(model, card.test_l1_mean, card.world.bounds, start, metric=model.norm.metric)
         for _ in range(scans):
             noisy = usable_ranges(clean + scanner.sigma * rng.standard_normal(beams), scanner.range_max)
             estimate = estimator.update(noisy)

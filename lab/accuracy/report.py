@@ -16,7 +16,7 @@ from common.errors import UserError
 from common.geometry.world import load_world
 from common.robot.scanner import Scanner
 from common.robot.scanner_options import chosen_scanner
-from lab.accuracy.contenders import CONTENDERS
+from lab.accuracy.compared_estimators import COMPARED_ESTIMATORS
 from lab.accuracy.runner import TASKS, AccuracyJob, provenance, run_all
 from lab.accuracy.tasks import FOUND_DISTANCE, FOUND_YAW, TWINS_REQUIRED_FROM_SCAN
 from presage.terminal.output import check_file, write_json
@@ -63,10 +63,10 @@ def bench_accuracy(
 
     Each of ``seeds`` consecutive seeds has its own places, noise and paths; the rows are over all of them.
     """
-    chosen = list(CONTENDERS) if estimators == "all" else estimators.split(",")
-    unknown = [name for name in chosen if name not in CONTENDERS]
+    chosen = list(COMPARED_ESTIMATORS) if estimators == "all" else estimators.split(",")
+    unknown = [name for name in chosen if name not in COMPARED_ESTIMATORS]
     if unknown:
-        raise UserError(f"no estimator {unknown[0]!r} in this benchmark: choose from {', '.join(CONTENDERS)}")
+        raise UserError(f"no estimator {unknown[0]!r} in this benchmark: choose from {', '.join(COMPARED_ESTIMATORS)}")
     scanners = scanners_of(scanner, beams)
     wanted = tuple(tasks.split(",")) if tasks else TASKS
     if missing := [name for name in wanted if name not in TASKS]:

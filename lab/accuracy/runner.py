@@ -17,7 +17,7 @@ from common.geometry.world import World, load_world
 from common.robot.scanner import Scanner
 from common.versions import commit, versions
 from lab.accuracy import tasks
-from lab.accuracy.contenders import CONTENDERS, Place
+from lab.accuracy.compared_estimators import COMPARED_ESTIMATORS, EstimatorSetup
 from lab.accuracy.scenes import TWINS, Scene
 from lab.statistics import bootstrap_interval, median, root_mean_square, wilson_interval
 from lab.workers import pool
@@ -25,7 +25,7 @@ from services.estimator.factory import Geometry
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.learning.field_learning import Recipe, learn_field, learn_scales, measure_ripple
 from services.estimator.precise.learning.surfaces import Beams
-from services.estimator.shared.interface import Estimator
+from services.estimator.shared.interface import PoseEstimator
 
 DEGREES_OF_FREEDOM = 3
 TASKS = ("standing", "blocked", "furnished", "kidnapped", "tracking", "odometry", "twins")
@@ -79,13 +79,13 @@ def run(job: AccuracyJob) -> dict[tuple[str, str], tasks.TaskOutcome]:
     return found
 
 
-def _estimator(job: AccuracyJob, world: World) -> Estimator:
+def _estimator(job: AccuracyJob, world: World) -> PoseEstimator:
     """The job's estimator; for the world of two identical rooms, trains a field from 2000 scans if it needs one."""
-    geometry, contender = Geometry.of(job.scanner), CONTENDERS[job.estimator]
+    geometry, compared = Geometry.of(job.scanner), COMPARED_ESTIMATORS[job.estimator]
     learned = None
-    if world is TWINS and contender.learns:
+    if world is TWINS and compared.learns:
         learned = quick_field(TWINS, geometry, np.random.default_rng(job.seed), limited=True)
-    return contender.make(Place(world, geometry, job.seed, learned))
+    return compared.make(EstimatorSetup(world, geometry, job.seed, learned))
 
 
 def _no_progress(poses: Iterable[Array]) -> Iterator[Array]:

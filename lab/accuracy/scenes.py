@@ -14,7 +14,7 @@ from common.geometry.se2 import Array
 from common.geometry.world import World
 from common.robot.base import Robot
 from common.robot.scanner import SCANNERS, Scanner
-from lab.accuracy.furniture import CATALOGUE, Piece
+from lab.accuracy.furniture import CATALOGUE, FurniturePiece
 from services.estimator.shared.interface import Observation
 
 ROBOT = Robot()
@@ -87,7 +87,7 @@ class Scene:
         while ((nearest < clean) | silent).mean() < share:
             shape, small, large, _ = CATALOGUE[self.rng.integers(len(CATALOGUE))]
             width, depth = self.rng.uniform(small, large)
-            piece = Piece(shape, (width, width if shape == "disc" else depth))
+            piece = FurniturePiece(shape, (width, width if shape == "disc" else depth))
             away = self.rng.uniform(ROBOT.radius + np.hypot(*piece.size) / 2, 4.0)
             bearing, yaw = self.rng.uniform(-np.pi, np.pi, 2)
             piece = piece.at(np.array([*(pose[:2] + away * np.array([np.cos(bearing), np.sin(bearing)])), yaw]))

@@ -13,7 +13,7 @@ from rich.progress import track
 from rich.table import Table
 
 from common.geometry.world import load_world
-from lab.accuracy.contenders import CONTENDERS, Place
+from lab.accuracy.compared_estimators import COMPARED_ESTIMATORS, EstimatorSetup
 from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import Scene
 from lab.workers import pool
@@ -62,7 +62,7 @@ def measure(estimator: str, world_name: str, beams: int, seed: int) -> dict[str,
     scene = Scene.of(load_world(world_name), beams, seed)
     began = time.perf_counter()
     geometry = Geometry.of(scene.scanner)
-    estimator_under_test = CONTENDERS[estimator].make(Place(scene.world, geometry, seed))
+    estimator_under_test = COMPARED_ESTIMATORS[estimator].make(EstimatorSetup(scene.world, geometry, seed))
     ready = time.perf_counter() - began
     searches = []
     for clean in scene.clean(scene.poses(20)):

@@ -12,8 +12,8 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from lab.accuracy import bound
 from lab.accuracy.scenes import Scene, twin_of, twin_path
-from services.estimator.shared.interface import Estimator, Observation, Posterior
-from services.simulator.odometry import Drift, Odometer
+from services.estimator.shared.interface import Observation, PoseEstimator, Posterior
+from services.simulator.odometry import Odometer, OdometryNoise
 
 FOUND_DISTANCE, FOUND_YAW = 0.2, np.deg2rad(5)  # m, rad; an estimate with smaller errors counts as found
 STANDING_SCANS = 20
@@ -85,7 +85,7 @@ class TaskOutcome:
         return found_here
 
 
-def _timed_update(estimator: Estimator, observation: Observation, outcome: TaskOutcome | None = None) -> Posterior:
+def _timed_update(estimator: PoseEstimator, observation: Observation, outcome: TaskOutcome | None = None) -> Posterior:
     began = time.process_time()
     posterior = estimator.update(observation)
     if outcome is not None:
@@ -93,7 +93,7 @@ def _timed_update(estimator: Estimator, observation: Observation, outcome: TaskO
     return posterior
 
 
-def standing(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, TaskOutcome]:
+def standing(estimator: PoseEstimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, TaskOutcome]:
     """Global localisation of a standing robot, without odometry: after one scan and after twenty."""
     one, many = TaskOutcome(), TaskOutcome()
     poses = scene.poses(trials)
@@ -104,7 +104,7 @@ def standing(estimator: Estimator, scene: Scene, trials: int, progress: Progress
 
 
 def _stand(
-    estimator: Estimator,
+    estimator: PoseEstimator,
     scene: Scene,
     pose: Array,
     clean: Array,
@@ -124,7 +124,7 @@ def _stand(
     many.add(posterior, pose, None if limit is None else limit / np.sqrt(STANDING_SCANS))
 
 
-def blocked(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, TaskOutcome]:
+def blocked(estimator: PoseEstimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, TaskOutcome]:
     """Global localisation with 30 % of the beams shortened by unknown obstacles: after one scan and after twenty.
 
     The obstacles are drawn once per trial.
@@ -136,7 +136,7 @@ def blocked(estimator: Estimator, scene: Scene, trials: int, progress: ProgressW
     return {"30 % blocked, 1 scan": one, "30 % blocked, 20 scans": many}
 
 
-def furnished(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, TaskOutcome]:
+def furnished(estimator: PoseEstimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, TaskOutcome]:
     """Global localisation with 30 % of the beams changed by furniture and glass that the map lacks."""
     one, many = TaskOutcome(), TaskOutcome()
     for pose in progress(scene.poses(trials)):
@@ -145,13 +145,13 @@ def furnished(estimator: Estimator, scene: Scene, trials: int, progress: Progres
 
 
 def tracking(
-    estimator: Estimator, scene: Scene, seconds: float, progress: ProgressWrapper, *, odometry: bool
+    estimator: PoseEstimator, scene: Scene, seconds: float, progress: ProgressWrapper, *, odometry: bool
 ) -> dict[str, TaskOutcome]:
     """Tracking along a path from a known start, with the simulator's odometry or without."""
     outcome, path = TaskOutcome(independent=False), scene.path(seconds)
     # Without odometry the motion is unknown, so the bound is that of each scan alone.
-    limits = bound.recursive(scene, path, Drift()) if odometry else bound.single(scene, path)
-    odometer = Odometer(Drift(), scene.rng)
+    limits = bound.recursive(scene, path, OdometryNoise()) if odometry else bound.single(scene, path)
+    odometer = Odometer(OdometryNoise(), scene.rng)
     estimator.restart(path[0], np.diag([0.01, 0.01, 0.01]))
     for k, pose in enumerate(progress(path)):
         if k:
@@ -163,7 +163,7 @@ def tracking(
     return {"tracking, odometry" if odometry else "tracking, no odometry": outcome}
 
 
-def kidnapped(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, TaskOutcome]:
+def kidnapped(estimator: PoseEstimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, TaskOutcome]:
     """Teleports of a standing robot every 20 scans: whether it is found after one, three and twenty scans."""
     after = {1: TaskOutcome(), 3: TaskOutcome(), 20: TaskOutcome()}
     poses, stamp = scene.poses(trials + 1), 0
@@ -182,7 +182,7 @@ def holds_both(posterior: Posterior, pose: Array) -> bool:
     return all(any(is_at(h.pose, place) for h in posterior.hypotheses) for place in (pose, twin_of(pose)))
 
 
-def twins(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, TaskOutcome]:
+def twins(estimator: PoseEstimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, TaskOutcome]:
     """A path out of one of two identical rooms: both kept while ambiguous, and the right one believed at the end.
 
     "Both kept" counts trials in which every belief from the 20th scan until the first scan that distinguishes the rooms

@@ -28,7 +28,7 @@ from services.estimator.precise.field import DistanceField, FieldModel
 from services.estimator.precise.gauss_newton import View, difference
 from services.estimator.precise.global_seeds import Seeds
 from services.estimator.precise.learning.field_learning import seed_places
-from services.estimator.precise.settings import Settings
+from services.estimator.precise.settings import PreciseSettings
 from services.estimator.shared.interface import Observation
 
 SCANNER = TIM571.with_beams(622)
@@ -194,7 +194,7 @@ def _trial(estimator: PreciseEstimator, observation: Observation, truth: Array) 
         observation.range_max,
     )
     began = time.process_time()
-    ranked = estimator.seeds.rank(view, Settings().ranked_seeds)
+    ranked = estimator.seeds.rank(view, PreciseSettings().ranked_seeds)
     ranking = time.process_time() - began
     off = difference(ranked, truth)
     seeded = bool(((np.hypot(off[:, 0], off[:, 1]) < SEED_POSITION_M) & (np.abs(off[:, 2]) < SEED_HEADING_RAD)).any())

@@ -20,8 +20,8 @@ from common.bus.bus import open_bus
 from common.messages.definitions import Belief, Goal, Pose, Status
 from common.messages.topics import BELIEF, GOAL, STATUS
 from common.versions import commit, versions
-from lab.benchmarks.viewer import ROBOT, Visitor
-from presage.live.bus_watch import Watch
+from lab.benchmarks.viewer import ROBOT, FrameCounter
+from presage.live.latest_messages import LatestMessages
 from presage.session.ports import free_port
 from presage.session.stack import Stack
 from presage.terminal.output import check_file, write_json
@@ -44,10 +44,10 @@ def measure(seconds: float, beams: int) -> dict[str, Any]:
         stack.start("simulator", "--beams", str(beams))
         with open_bus(stack.link()) as bus:
             stack.wait_alive(bus)
-            visitor, watch, goals = Visitor(port), Watch(bus, STATUS, BELIEF), cycle(GOALS)
-            _drive(stack, watch, goals, WARM_UP_S)
+            visitor, messages, goals = FrameCounter(port), LatestMessages(bus, STATUS, BELIEF), cycle(GOALS)
+            _drive(stack, messages, goals, WARM_UP_S)
             before, began = cpu_seconds(stack, SERVICES), time.monotonic()
-            beliefs = _drive(stack, watch, goals, seconds)
+            beliefs = _drive(stack, messages, goals, seconds)
             elapsed, after = time.monotonic() - began, cpu_seconds(stack, SERVICES)
             memory = {name: _process(stack, name).memory_info().rss / 1e6 for name in SERVICES}
             visitor.close()
@@ -57,16 +57,16 @@ def measure(seconds: float, beams: int) -> dict[str, Any]:
     return {"beliefs_hz": beliefs / elapsed, "cpu_share": cpu, "memory_mb": memory}
 
 
-def _drive(stack: Stack, watch: Watch, goals: Iterator[Pose], seconds: float) -> int:
+def _drive(stack: Stack, messages: LatestMessages, goals: Iterator[Pose], seconds: float) -> int:
     """Sends the next goal whenever the robot has none; returns the number of beliefs."""
     beliefs, end = 0, time.monotonic() + seconds
     while (left := end - time.monotonic()) > 0:
         stack.check()
-        message = watch.next(min(0.5, left))
+        message = messages.next(min(0.5, left))
         beliefs += isinstance(message, Belief)
         if isinstance(message, Status) and message.state in {"idle", "reached"}:
             goal = Goal(stamp_ns=message.stamp_ns, seq=message.goal_seq + 1, pose=next(goals))
-            watch.bus.put(GOAL, goal.encode())
+            messages.bus.put(GOAL, goal.encode())
     return beliefs
 
 

@@ -18,7 +18,7 @@ from common.bus.bus import open_bus
 from common.errors import UserError
 from common.geometry.world import load_world
 from common.versions import commit, versions
-from lab.benchmarks.fleet_load import FleetLoad, Window
+from lab.benchmarks.fleet_load import AnswerStatistics, FleetLoad
 from lab.benchmarks.fleet_table import DEPLOYMENTS, show
 from presage.session.stack import Stack
 from presage.terminal.output import check_file, write_json
@@ -154,7 +154,7 @@ class EstimatorDeployment:
         return sum(t.user + t.system for t in (process.cpu_times() for process in self.processes()))
 
 
-def _row(window: Window, cpu_s: float, plan: FleetPlan) -> dict[str, Any]:
+def _row(window: AnswerStatistics, cpu_s: float, plan: FleetPlan) -> dict[str, Any]:
     return {
         "robots": window.robots,
         "sent": window.sent,

@@ -40,7 +40,7 @@ class CirclingRobot:
 
 
 @dataclass(frozen=True)
-class Window:
+class AnswerStatistics:
     """Answers to the scans of one measurement."""
 
     robots: int
@@ -95,7 +95,9 @@ class FleetLoad:
             found[sample.topic.name] = max(found.get(sample.topic.name, 0), len(sample.payload))
         return found
 
-    def play(self, count: int, seconds: float, rate: float | None = None, *, searching: bool = False) -> Window:
+    def play(
+        self, count: int, seconds: float, rate: float | None = None, *, searching: bool = False
+    ) -> AnswerStatistics:
         """Sends scans of the first ``count`` robots for ``seconds`` s, and returns how they were answered.
 
         ``rate`` in Hz defaults to the load's rate. With ``searching``, the first robot requests a global localisation
@@ -121,7 +123,7 @@ class FleetLoad:
             if robot is not searching_robot:
                 sent[BELIEF.key(robot.name), self._stamp(k)] = time.time_ns()
             elif k % round(rate) == 0:
-                self._buses[robot.name].request(LOCALISE, LocaliseRequest(), k, Inbox())
+                self._buses[robot.name].send_request(LOCALISE, LocaliseRequest(), k, Inbox())
             self._buses[robot.name].put(SCAN, payload)
             robot.scans = k + 1
         return self._window(count, sent)
@@ -144,7 +146,7 @@ class FleetLoad:
             scan_time=1 / self.rate,
         ).encode()
 
-    def _window(self, count: int, sent: dict[tuple[str, int], int]) -> Window:
+    def _window(self, count: int, sent: dict[tuple[str, int], int]) -> AnswerStatistics:
         """Matches the received answers to the scans in ``sent``, waiting up to `ANSWER_TIMEOUT_S` for the last ones."""
         deadline, latency, states = (
             time.monotonic() + ANSWER_TIMEOUT_S,
@@ -166,4 +168,4 @@ class FleetLoad:
         values = np.array(list(latency.values()))
         in_time = int((values <= 1e3 / self.rate).sum()) if len(values) else 0
         tracking = sum(state == "tracking" for state in states.values())
-        return Window(count, len(sent), len(latency), in_time, values, tracking)
+        return AnswerStatistics(count, len(sent), len(latency), in_time, values, tracking)

@@ -19,7 +19,7 @@ from common.messages.definitions import Belief, Drive, Health, Map, Truth, Twist
 from common.messages.topics import BELIEF, DRIVE, HEALTH, MAP, TRUTH
 from lab.accuracy.scenes import Scene
 from lab.benchmarks.mapping import trajectory_errors
-from presage.live.bus_watch import Watch
+from presage.live.latest_messages import LatestMessages
 from presage.session.running import link_of
 
 GAIN, REACH_M = 3.0, 0.25  # 1/s, of the distance from a point of the path; where the next one is due
@@ -38,10 +38,10 @@ def drive_path(bus: Bus, path: Array) -> tuple[Array, Array]:
 
     Returns beliefs and true poses (M, 3) of the same scans, each in its own frame. Raises UserError if no truth comes.
     """
-    watch, truths, pairs, k = Watch(bus, TRUTH, BELIEF), dict[int, Array](), [], 0
+    messages, truths, pairs, k = LatestMessages(bus, TRUTH, BELIEF), dict[int, Array](), [], 0
     progress_ns = 0  # stamp at which the robot was last near a new point of the path
     while k + 1 < len(path):
-        message = watch.next(TIMEOUT_S)
+        message = messages.next(TIMEOUT_S)
         if message is None:
             raise UserError(f"no message came for {TIMEOUT_S:g} s: is a simulator running?")
         if isinstance(message, Belief) and message.stamp_ns in truths:
@@ -72,7 +72,7 @@ def main() -> None:
     args = parser.parse_args()
     with open_bus(link_of(args.connect, "")) as bus:
         began = time.monotonic()
-        first = Watch(bus, TRUTH).until(Truth, lambda _: True, TIMEOUT_S)
+        first = LatestMessages(bus, TRUTH).wait_for(Truth, lambda _: True, TIMEOUT_S)
         if first is None:
             raise UserError("no truth comes: is a simulator running?")
         path = random_path(args.world, args.seconds, args.seed, first.pose.array())
@@ -82,12 +82,12 @@ def main() -> None:
             f"{np.sqrt((position**2).mean()) * 1e3:.1f} mm RMS, at most {position.max() * 1e3:.0f} mm; "
             f"{np.rad2deg(heading).mean():.3f} degrees in the mean"
         )
-        watch = Watch(bus, MAP, HEALTH)
-        health = watch.until(Health, lambda message: message.service == "mapper", TIMEOUT_S)
+        messages = LatestMessages(bus, MAP, HEALTH)
+        health = messages.wait_for(Health, lambda message: message.service == "mapper", TIMEOUT_S)
         if health is not None:
             dropped = {row.key.rpartition("/")[2]: row.dropped for row in health.topics if row.dropped}
             print(f"mapper: dropped {dropped or 'nothing'}, counters {health.counters}")
-        grown = watch.until(Map, lambda _: True, 2 * TIMEOUT_S)
+        grown = messages.wait_for(Map, lambda _: True, 2 * TIMEOUT_S)
         if grown is not None:
             print(f"{len(grown.poses)} key scans, {len(grown.closures) // 2} loop closures")
 

@@ -27,8 +27,8 @@ from presage.terminal.output import check_file, write_json
 from services.estimator.factory import EstimatorOptions, Geometry, prepare
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.learning import weights
-from services.estimator.precise.learning.key_scans import KeyScans
-from services.estimator.precise.learning.live_learning import Version, learn_version
+from services.estimator.precise.learning.key_scans import KeyScanCollector
+from services.estimator.precise.learning.live_learning import ModelVersion, learn_version
 
 DELAY_S = 15.0  # of the drive, in which a version is learned
 TEST_SECONDS = 40.0
@@ -43,11 +43,11 @@ def start_estimator(rough: World, scene: Scene, start: Array) -> PreciseEstimato
     return made
 
 
-def drive_and_learn(rough: World, scene: Scene, path: Array) -> tuple[dict[str, Any], Version | None]:
+def drive_and_learn(rough: World, scene: Scene, path: Array) -> tuple[dict[str, Any], ModelVersion | None]:
     """Drives along poses (N, 3); returns what was learned when, at what cost, and the last version."""
     estimator = start_estimator(rough, scene, path[0])
     original, places = estimator.model, estimator.seeds.places
-    keys = KeyScans(scene.scanner.angles(), np.array(scene.scanner.mount), scene.scanner.range_max)
+    keys = KeyScanCollector(scene.scanner.angles(), np.array(scene.scanner.mount), scene.scanner.range_max)
     versions: list[dict[str, Any]] = []
     update_ms: list[tuple[float, float]] = []  # of tracking and of the collection of key scans, CPU time
     version, pending, errors, since = None, None, [], 0.0
@@ -88,12 +88,12 @@ def drive_and_learn(rough: World, scene: Scene, path: Array) -> tuple[dict[str, 
     }, version
 
 
-def key_scan_bytes(keys: KeyScans) -> int:
+def key_scan_bytes(keys: KeyScanCollector) -> int:
     """Size of the ranges of all key scans."""
     return sum(key.ranges.nbytes for key in keys.verified.values())
 
 
-def test_errors(rough: World, scene: Scene, version: Version | None) -> dict[str, float]:
+def test_errors(rough: World, scene: Scene, version: ModelVersion | None) -> dict[str, float]:
     """Position errors of another drive, with a version or with the rough map.
 
     Those that are aligned do not count where the map as a whole lies.

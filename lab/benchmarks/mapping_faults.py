@@ -32,13 +32,13 @@ from presage.terminal.output import check_file, write_json
 from services.mapper.slam.drive import Laser, RawDrive
 from services.mapper.slam.grid import grid_of_scans
 from services.mapper.slam.trajectory import build_trajectory
-from services.simulator.odometry import Drift, Odometer
+from services.simulator.odometry import Odometer, OdometryNoise
 
 CELL_M = 0.05
 FALSE_WALL_M = 0.15  # an occupied cell farther than this in front of all surfaces is no surface
 PEOPLE_PER_M2 = 0.08
 
-CarryOff = Callable[[Scene, Array], Array]  # returns the pose (3,) to which the robot is carried after a path (N, 3)
+Kidnapping = Callable[[Scene, Array], Array]  # returns the pose (3,) to which the robot is carried after a path (N, 3)
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class MappingFault:
     """What could deceive the mapper in a drive."""
 
     world: Literal["office", "symmetric", "twins"] = "office"
-    carry_off: CarryOff | None = None  # in the middle of the drive
+    kidnapping: Kidnapping | None = None  # in the middle of the drive
     crowd: bool = False
 
 
@@ -77,11 +77,11 @@ def to_nearby(scene: Scene, path: Array) -> Array:
 CASES = {
     "undisturbed": MappingFault(),
     "crowd": MappingFault(crowd=True),
-    "carried to a mapped place": MappingFault(carry_off=to_mapped_place),
-    "carried to an unmapped place": MappingFault(carry_off=to_unmapped_place),
-    "carried to a similar place": MappingFault(carry_off=to_similar_place),
-    "carried nearby": MappingFault(carry_off=to_nearby),
-    "carried in a crowd": MappingFault(carry_off=to_mapped_place, crowd=True),
+    "carried to a mapped place": MappingFault(kidnapping=to_mapped_place),
+    "carried to an unmapped place": MappingFault(kidnapping=to_unmapped_place),
+    "carried to a similar place": MappingFault(kidnapping=to_similar_place),
+    "carried nearby": MappingFault(kidnapping=to_nearby),
+    "carried in a crowd": MappingFault(kidnapping=to_mapped_place, crowd=True),
     "look-alike rooms": MappingFault("symmetric"),
     "carried among look-alike rooms": MappingFault("symmetric", to_unmapped_place),
     "twins": MappingFault("twins"),
@@ -96,7 +96,7 @@ class DisturbedDrive:
     drive: RawDrive
     truth: Array  # (N, 3)
     world: World
-    undisturbed: int  # number of scans before the robot is carried off
+    undisturbed: int  # number of scans before the robot is kidnapped
 
 
 def make_drive(case: str, seed: int, seconds: float) -> DisturbedDrive:
@@ -105,11 +105,11 @@ def make_drive(case: str, seed: int, seconds: float) -> DisturbedDrive:
     world = TWINS if fault.world == "twins" else make_building(seed, fault.world).world
     scene = Scene.of(world, BEAMS, [seed, 30])
     scanner = scene.scanner
-    if fault.carry_off is None:
+    if fault.kidnapping is None:
         parts = [scene.path(seconds)]
     else:
         before = scene.path(seconds / 2)
-        parts = [before, scene.path(seconds / 2, start=fault.carry_off(scene, before))]
+        parts = [before, scene.path(seconds / 2, start=fault.kidnapping(scene, before))]
     truth, odom = np.concatenate(parts), _odometry(parts, scene.rng)
     clean = _ranges_in_crowd(scene, truth) if fault.crowd else scene.clean(truth)
     ranges = np.array([scene.observe(each, 0.0).ranges for each in clean])
@@ -120,7 +120,7 @@ def make_drive(case: str, seed: int, seconds: float) -> DisturbedDrive:
 
 def _odometry(parts: list[Array], rng: np.random.Generator) -> Array:
     """Poses (N, 3) in odom; between the parts of the drive the robot is carried, and its wheels do not turn."""
-    odometer, poses = Odometer(Drift(), rng), []
+    odometer, poses = Odometer(OdometryNoise(), rng), []
     for part in parts:
         poses.append(odometer.pose)
         for before, after in pairwise(part):

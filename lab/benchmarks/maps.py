@@ -25,7 +25,7 @@ from services.controller.policies.free_space import FreeSpace
 from services.controller.policies.geodesic_field import FreeSpaceGraph
 from services.estimator.particle_filter.likelihood_field import SurfaceDistances
 from services.simulator.people import People
-from services.simulator.simulation import Setup, Simulation
+from services.simulator.simulation import Simulation, SimulationSetup
 
 SCANS = 100
 ROOM_WIDTH_M, DOOR_WIDTH_M = 6.0, 1.2
@@ -66,14 +66,14 @@ def measure(path: str, beams: int, seed: int) -> list[tuple[str, float, str]]:
     rows.append(("message WORLD", len(WorldReply(world=world).encode()) / 1e3, "kB"))
     rows.append(("straight walls", float(len(timed("walls out of the cells", lambda: world.segments))), ""))
     scanner, rng = SCANNERS["tim571"].with_beams(beams), np.random.default_rng(seed)
-    simulation = timed("simulator: start", lambda: Simulation(Setup(world, scanner)))
+    simulation = timed("simulator: start", lambda: Simulation(SimulationSetup(world, scanner)))
     timed("simulator: drive and scan", lambda: _drive(simulation), SCANS)
     places = timed("5000 random places", lambda: world.sample_free(5000, rng, Robot().radius))
     poses = np.column_stack([places, rng.uniform(-np.pi, np.pi, len(places))])[:SCANS]
     timed("simulator: scans to learn from", lambda: simulation.sample(poses, None, None), SCANS)
     simulation.close()
     lasers, angles = se2.compose(poses, np.array(scanner.mount)), scanner.angles()
-    world.ray_distances(lasers[:1], angles)  # compiles
+    world.ray_distances(lasers[:1], angles)  # compiles with numba, before the time is measured
     timed("exact rays", lambda: world.ray_distances(lasers, angles), SCANS)
     free = timed("controller: free space", lambda: FreeSpace.of(world))
     timed("controller: graph of free space", lambda: FreeSpaceGraph(free, Robot().radius))

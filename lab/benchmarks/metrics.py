@@ -34,7 +34,7 @@ MESSAGES = 20_000  # for the cost of one message's histograms
 
 
 @dataclass
-class Cost:
+class ScrapeCost:
     """Totals over all rounds with, or all rounds without, scrapes."""
 
     seconds: float = 0.0
@@ -47,9 +47,9 @@ class Cost:
         return self.cpu_s[service] / self.seconds
 
 
-def measure(seconds: float, rounds: int, console: Console) -> tuple[Cost, Cost]:
+def measure(seconds: float, rounds: int, console: Console) -> tuple[ScrapeCost, ScrapeCost]:
     """Costs unscraped, and with one scrape per second of each service; rounds alternate between the two."""
-    unscraped, scraped = Cost(), Cost()
+    unscraped, scraped = ScrapeCost(), ScrapeCost()
     ports = {name: free_port() for name in SERVICES}
     with Stack("bench", quiet=True) as stack:
         stack.start_router()
@@ -64,7 +64,7 @@ def measure(seconds: float, rounds: int, console: Console) -> tuple[Cost, Cost]:
     return unscraped, scraped
 
 
-def _round(stack: Stack, seconds: float, cost: Cost, ports: dict[str, int]) -> None:
+def _round(stack: Stack, seconds: float, cost: ScrapeCost, ports: dict[str, int]) -> None:
     before, began = cpu_seconds(stack, SERVICES), time.monotonic()
     for second in range(int(seconds)):
         for port in ports.values():

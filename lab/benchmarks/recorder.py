@@ -24,7 +24,7 @@ from common.errors import UserError
 from common.messages.definitions import Health, Scan
 from common.messages.topics import HEALTH, TOPICS, Topic
 from common.versions import commit, versions
-from presage.live.bus_watch import Watch
+from presage.live.latest_messages import LatestMessages
 from presage.session.stack import Stack
 from presage.terminal.output import check_file, make_folder, write_json
 from services.recorder.files.message_counts import from_metadata
@@ -99,17 +99,17 @@ def measure(load: RecorderLoad, folder: Path, console: Console) -> dict[str, Any
         stack.start("recorder", "--directory", str(folder), "--file", "bench.mcap")
         with open_bus(stack.link()) as bus:
             stack.wait_alive(bus)
-            watch = Watch(bus, HEALTH)
+            messages = LatestMessages(bus, HEALTH)
             recorder = psutil.Process(stack.processes["recorder"].child.pid)
             stack.start_python("publisher", "from lab.benchmarks.recorder import publish_main; publish_main()")
-            used = _observe(stack, watch, recorder, load, result, console)
+            used = _observe(stack, messages, recorder, load, result, console)
             if (status := stack.stop("recorder")) != 0:
                 raise UserError(f"the recorder ended with status {status}")
     return _compare(json.loads(result.read_text(encoding="utf-8")), folder / "bench.mcap") | used
 
 
 def _observe(
-    stack: Stack, watch: Watch, recorder: psutil.Process, load: RecorderLoad, result: Path, console: Console
+    stack: Stack, messages: LatestMessages, recorder: psutil.Process, load: RecorderLoad, result: Path, console: Console
 ) -> dict[str, Any]:
     """Processor share and memory of the recorder until its health message reports that it received everything."""
     columns = TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
@@ -122,7 +122,7 @@ def _observe(
             stack.check()
             if time.monotonic() - began > 60 + 4 * load.seconds:
                 raise UserError(f"only {received} of {load.count} messages arrived: is this machine busy?")
-            health = watch.next(0.5)
+            health = messages.next(0.5)
             memory = max(memory, recorder.memory_info().rss)
             if isinstance(health, Health) and health.service == "recorder":
                 received = sum(row.received for row in health.topics if "/health/" not in row.key)

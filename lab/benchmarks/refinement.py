@@ -19,7 +19,7 @@ from common.geometry.world import World, load_world
 from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import Scene
 from lab.benchmarks.mapping import alignment
-from lab.benchmarks.visits import PERIOD_S, drive_through_rooms, office_building
+from lab.benchmarks.visits import PERIOD_S, drive_through_rooms, office_building, write_drive_log
 from lab.experiments.results import markdown, millimetres, number
 from lab.experiments.trials import run_trials
 from lab.integrity.buildings import Building, make_building
@@ -79,9 +79,9 @@ def refine_and_test(job: RefinementJob) -> dict[str, Any]:
     drive, test = (Scene.of(world, BEAMS, [job.seed, number]) for number in (DRIVE_SEED, TEST_SEED))
     poses, log = drive_for(drive, building, job.seconds), out / "drive.npz"
     reading = Reading(mount=np.array(drive.scanner.mount))
-    _log_drive(drive, poses, log)
+    write_drive_log(drive, poses, log)
     path = drive_for(test, building, TEST_SECONDS)
-    check = Check(drive, poses[::WALLS_EVERY], test, path, test.clean(path))
+    check = ModelTest(drive, poses[::WALLS_EVERY], test, path, test.clean(path))
     true = TrainDriveOptions(log, str(_write(out, world)), out / "true-poses", reading=reading)
     at_true_poses = check.learned(train_from_drive(true, QUIET), world, IN_MAP)
     rows = []
@@ -110,7 +110,7 @@ def refine_and_test(job: RefinementJob) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Check:
+class ModelTest:
     """Compares a model with the true world: its walls along one drive, and poses found in it on another one."""
 
     drive: Scene
@@ -186,18 +186,6 @@ def drive_for(scene: Scene, building: Building, seconds: float) -> Array:
     path = drive_through_rooms(scene, building, 1.0)
     laps = [path, path[::-1]]  # forth and back
     return np.concatenate([laps[k % 2] for k in range(1 + count // len(path))])[:count]
-
-
-def _log_drive(scene: Scene, poses: Array, log: Path) -> None:
-    """Writes the scans of a drive with noise, and its true poses (N, 3)."""
-    np.savez(
-        log,
-        ranges=np.array([scene.observe(clean, 0.0).ranges for clean in scene.clean(poses)]),
-        angles=scene.scanner.angles(),
-        range_max=np.array(scene.scanner.range_max),
-        stamps=np.arange(len(poses)) * PERIOD_S,
-        reference=poses,
-    )
 
 
 def _write(folder: Path, world: World) -> Path:

@@ -35,7 +35,7 @@ TIMEOUT_S = 60.0
 ROBOT = "bench"
 
 
-class Visitor:
+class FrameCounter:
     """A client that receives every frame, as a browser would, and only counts them."""
 
     def __init__(self, port: int) -> None:
@@ -66,7 +66,7 @@ class Visitor:
 
 
 @dataclass
-class Cost:
+class ViewerCost:
     """Totals over all rounds with, or all rounds without, the viewer."""
 
     latency_ms: list[float] = field(default_factory=list)
@@ -80,7 +80,7 @@ class Cost:
 
 def measure(seconds: float, rounds: int, beams: int, console: Console) -> dict[str, Any]:
     """Runs rounds of ``seconds`` s without and with the viewer, alternating, in one session. Returns the results."""
-    without, viewed = Cost(), Cost()
+    without, viewed = ViewerCost(), ViewerCost()
     with Stack(ROBOT, quiet=True) as stack:
         stack.start_router()
         stack.start("controller")
@@ -104,16 +104,16 @@ def _first_command(bus: Bus, stack: Stack) -> None:
             raise UserError(f"the controller sent no velocity command within {TIMEOUT_S:g} s")
 
 
-def _without(bus: Bus, stack: Stack, seconds: float, cost: Cost) -> None:
+def _without(bus: Bus, stack: Stack, seconds: float, cost: ViewerCost) -> None:
     time.sleep(WARM_UP_S)
     _measure_latency(bus, stack, seconds, cost)
 
 
-def _with_viewer(bus: Bus, stack: Stack, seconds: float, cost: Cost) -> None:
+def _with_viewer(bus: Bus, stack: Stack, seconds: float, cost: ViewerCost) -> None:
     port = free_port()
     stack.start("viewer", "--port", str(port))
     stack.wait_alive(bus)
-    visitor = Visitor(port)
+    visitor = FrameCounter(port)
     try:
         if not wait_until(lambda: visitor.frames > 0, TIMEOUT_S):
             raise UserError(f"the viewer sent no frame within {TIMEOUT_S:g} s")
@@ -130,7 +130,7 @@ def _with_viewer(bus: Bus, stack: Stack, seconds: float, cost: Cost) -> None:
     stack.stop("viewer")
 
 
-def _measure_latency(bus: Bus, stack: Stack, seconds: float, cost: Cost) -> None:
+def _measure_latency(bus: Bus, stack: Stack, seconds: float, cost: ViewerCost) -> None:
     """Records the time from each scan's publication to its command's. All publishers use this machine's clock."""
     inbox, scans = Inbox(), dict[int, int]()
     ends = [bus.subscribe(topic, inbox, keep_all=True) for topic in (SCAN, CMD_VEL)]
@@ -151,7 +151,7 @@ def _measure_latency(bus: Bus, stack: Stack, seconds: float, cost: Cost) -> None
         end()
 
 
-def _report(without: Cost, viewed: Cost, seconds: float, rounds: int, beams: int) -> dict[str, Any]:
+def _report(without: ViewerCost, viewed: ViewerCost, seconds: float, rounds: int, beams: int) -> dict[str, Any]:
     numbers: dict[str, Any] = {}
     for name, cost in (("without", without), ("with", viewed)):
         if not cost.latency_ms:

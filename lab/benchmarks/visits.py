@@ -22,7 +22,7 @@ from common.geometry.se2 import Array
 from common.geometry.shapes import Obstacle
 from common.geometry.world import load_world
 from common.robot.scanner import Scanner
-from lab.accuracy.furniture import Piece
+from lab.accuracy.furniture import FurniturePiece
 from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import ROBOT, Scene
 from lab.accuracy.tasks import is_at
@@ -129,10 +129,12 @@ def _visit(
     poses = scene.poses(count)
     scans = [scene.observe(ranges, float(k)) for k, ranges in enumerate(scene.clean(poses))]
     path = drive_through_rooms(scene, building, 1.0 if number == 1 else ENTERED_SHARE)
-    log = _log_drive(scene, path, after)
+    log = after.with_suffix(".npz")
+    write_drive_log(scene, path, log)
+    options = MapOptions(log, after, reading=Reading(mount=np.array(scene.scanner.mount)), models=after.parent)
     if number == 1:  # built at true poses
-        return _map_drive(path, replace(log, poses="reference"))
-    row = _map_drive(path, replace(log, refine=str(before)))
+        return _map_drive(path, replace(options, poses="reference"))
+    row = _map_drive(path, replace(options, refine=str(before)))
     entered = [room for room in building.rooms if contains(room, path[:, :2]).any()]
     row["in_changed_room"], row["in_entered_room"] = (
         np.any([contains(room, poses[:, :2]) for room in rooms], axis=0).tolist() for rooms in (changing, entered)
@@ -187,18 +189,16 @@ def drive_through_rooms(scene: Scene, building: Building, share: float) -> Array
     return np.column_stack([driven, se2.wrap(TURN_RATE * PERIOD_S * np.arange(len(driven)))])
 
 
-def _log_drive(scene: Scene, path: Array, out: Path) -> MapOptions:
-    """Writes a log of a drive with its true poses; returns the options that make the map ``out`` of it."""
-    scanner, log = scene.scanner, out.with_suffix(".npz")
+def write_drive_log(scene: Scene, poses: Array, log: Path) -> None:
+    """Writes the noisy scans of a drive, `PERIOD_S` apart, with its true poses (N, 3) as reference."""
     np.savez(
         log,
-        ranges=np.array([scene.observe(clean, 0.0).ranges for clean in scene.clean(path)]),
-        angles=scanner.angles(),
-        range_max=np.array(scanner.range_max),
-        stamps=PERIOD_S * np.arange(len(path)),
-        reference=path,
+        ranges=np.array([scene.observe(clean, 0.0).ranges for clean in scene.clean(poses)]),
+        angles=scene.scanner.angles(),
+        range_max=np.array(scene.scanner.range_max),
+        stamps=PERIOD_S * np.arange(len(poses)),
+        reference=poses,
     )
-    return MapOptions(log, out, reading=Reading(mount=np.array(scanner.mount)), models=out.parent)
 
 
 def _map_drive(path: Array, options: MapOptions) -> dict[str, Any]:
@@ -245,10 +245,10 @@ def office_building() -> Building:
     for obstacle in world.obstacles:
         if obstacle.box is not None:
             (x, y), yaw = obstacle.box.center, float(np.deg2rad(obstacle.box.yaw_deg))
-            furniture.append(Piece("box", obstacle.box.size, (x, y, yaw)))
+            furniture.append(FurniturePiece("box", obstacle.box.size, (x, y, yaw)))
         elif obstacle.circle is not None:
             size = 2 * obstacle.circle.radius
-            furniture.append(Piece("disc", (size, size), (*obstacle.circle.center, 0.0)))
+            furniture.append(FurniturePiece("disc", (size, size), (*obstacle.circle.center, 0.0)))
         else:
             walls.append(obstacle)
     rooms = (

@@ -120,7 +120,7 @@ def bench_mapping_faults(
     seconds: Annotated[float, typer.Option(min=10, help="Length of a drive.")] = 120.0,
     json_file: Json = None,
 ) -> None:
-    """Errors of mapping if the robot is carried off, among a crowd, and in look-alike rooms.
+    """Errors of mapping if the robot is kidnapped, among a crowd, and in look-alike rooms.
 
     Examples: `presage bench mapping-faults --worlds 1 --seconds 60`;
     `presage bench mapping-faults --json mapping-faults.json`.

@@ -87,7 +87,7 @@ def e3(
     from lab.paper import e3_navigation as navigation
 
     seed, out = context.obj
-    job = navigation.NavigationJob(0, seed, free=free)
+    job = navigation.JourneyJob(0, seed, free=free)
     job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
     show(navigation, lambda: navigation.run(job, trials, out, worker_count(), console), out)
 
@@ -221,7 +221,7 @@ def peers(
     from lab.peers import experiment
 
     seed, out = context.obj
-    names = parse_estimators(estimators, experiment.CONTENDERS) if estimators else tuple(experiment.CONTENDERS)
+    names = parse_estimators(estimators, experiment.ESTIMATORS) if estimators else tuple(experiment.ESTIMATORS)
     show(experiment, lambda: experiment.run(folder, names, trials, seed, out, worker_count(), console), out)
 
 

@@ -15,8 +15,8 @@ from lab.accuracy.scenes import Scene
 from services.estimator.factory import EstimatorOptions, Factory, Geometry, prepare
 from services.estimator.paper.perception import Descent
 from services.estimator.particle_filter.filter import ParticleFilter
-from services.estimator.particle_filter.settings import Settings as ParticleSettings
-from services.estimator.shared.interface import Estimator
+from services.estimator.particle_filter.settings import ParticleFilterSettings
+from services.estimator.shared.interface import PoseEstimator
 
 TEN_STEPS = "10 steps a scan"  # variant of the paper's estimator with the service's defaults, for a moving robot
 NAMES = (
@@ -81,7 +81,7 @@ def uses_odometry(name: str) -> bool:
 
 def create_estimator(
     name: str, field: ExperimentWorld, scene: Scene, seed: int, descent: Descent = PAPER_DESCENT
-) -> Estimator:
+) -> PoseEstimator:
     """A new estimator without a start pose. The paper's starts at the map's centre, as in the paper."""
     scanner, kind = scene.scanner, name.split(",", maxsplit=1)[0]
     geometry = Geometry.of(scanner)
@@ -91,7 +91,9 @@ def create_estimator(
         return _factory(field.world, "precise", descent)(geometry)
     # AMCL's default motion model is differential and cannot follow a base that moves sideways, so any user would
     # change it.
-    settings = ParticleSettings(robot_model_type="omni") if kind == "amcl-defaults" else ParticleSettings.tuned()
+    settings = (
+        ParticleFilterSettings(robot_model_type="omni") if kind == "amcl-defaults" else ParticleFilterSettings.tuned()
+    )
     heading = field.heading if name.endswith("heading known") else None
     return ParticleFilter(scene.world, settings, scanner.mount, seed, heading)
 

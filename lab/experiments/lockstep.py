@@ -22,7 +22,7 @@ from common.messages.definitions import Belief, Goal, Health, Pose, Stamped, Sta
 from common.messages.topics import BELIEF, GOAL, HEALTH, STATUS, TRUTH
 from lab.experiments.journeys import ARRIVAL_DISTANCE, Journey
 from lab.workers import THREAD_COUNT_VARIABLES
-from presage.live.bus_watch import Watch
+from presage.live.latest_messages import LatestMessages
 from presage.session.stack import Stack
 
 # This process's liveliness token. The simulator waits for it, so that the goal is set before the first scan.
@@ -120,7 +120,7 @@ def run(params: LockstepRun, stack: Stack) -> RunTrace:
     (x, y), yaw = params.journey.start, float(np.rad2deg(params.yaw))
     pose, world, seed = f"{x!r},{y!r},{yaw!r}", ("--world", params.world), ("--seed", str(params.seed))
     with open_bus(stack.link()) as bus:
-        watch = Watch(bus, TRUTH, BELIEF, STATUS, *((HEALTH,) if params.ends_with_status else ()))
+        messages = LatestMessages(bus, TRUTH, BELIEF, STATUS, *((HEALTH,) if params.ends_with_status else ()))
         start_pose = ("--initial-pose", pose) if params.start_known else ()
         stack.start("controller", *world, *params.controller, "--belief-timeout", "60")
         stack.start("estimator", *world, *seed, *start_pose, *params.estimator)
@@ -141,13 +141,13 @@ def run(params: LockstepRun, stack: Stack) -> RunTrace:
         )
         stack.wait_alive(bus)
         x, y = params.journey.goal
-        answer = _send_goal(watch, stack, params.goal or Goal(stamp_ns=0, seq=1, pose=Pose(x=x, y=y)))
+        answer = _send_goal(messages, stack, params.goal or Goal(stamp_ns=0, seq=1, pose=Pose(x=x, y=y)))
         if answer.state == "blocked" and not params.ends_with_status:
             raise UserError(answer.reason)
         bus.declare_alive(HARNESS_NAME)
         trace = RunTrace()
         try:
-            _record(watch, stack, params, trace)
+            _record(messages, stack, params, trace)
         except UserError as error:
             if not params.ends_with_status or not trace.truths:
                 raise
@@ -157,7 +157,7 @@ def run(params: LockstepRun, stack: Stack) -> RunTrace:
     return trace
 
 
-def _send_goal(watch: Watch, stack: Stack, goal: Goal) -> Status:
+def _send_goal(messages: LatestMessages, stack: Stack, goal: Goal) -> Status:
     """Sends the goal repeatedly until the controller's status confirms it: the first message on a new key may be lost.
 
     Returns that status.
@@ -166,22 +166,22 @@ def _send_goal(watch: Watch, stack: Stack, goal: Goal) -> Status:
 
     def accepted() -> bool:
         stack.check()
-        watch.bus.put(GOAL, goal.encode())
-        status = watch.until(Status, lambda s: s.goal_seq == goal.seq, 1.0)
+        messages.bus.put(GOAL, goal.encode())
+        status = messages.wait_for(Status, lambda s: s.goal_seq == goal.seq, 1.0)
         answers.extend([status] if status is not None else [])
         return bool(answers)
 
-    watch.bus.wait_matching(GOAL, 10.0)
+    messages.bus.wait_matching(GOAL, 10.0)
     if not wait_until(accepted, TIMEOUT_S, 0.0):
         raise UserError(f"the controller did not confirm the goal within {TIMEOUT_S:g} s")
     return answers[-1]
 
 
-def _record(watch: Watch, stack: Stack, params: LockstepRun, trace: RunTrace) -> None:
+def _record(messages: LatestMessages, stack: Stack, params: LockstepRun, trace: RunTrace) -> None:
     """Appends messages to the trace until the run ends. Skips repeated messages, which have a known stamp."""
     last_progress, end = time.monotonic(), None  # end: stamp of the last scan, ns
     while end is None or not trace.has(end):
-        message, count = watch.next(0.5), len(trace.truths) + len(trace.beliefs)
+        message, count = messages.next(0.5), len(trace.truths) + len(trace.beliefs)
         if message is not None:
             _append(message, trace, end)
             if end is None and _is_final(message, trace, params):

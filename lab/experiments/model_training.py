@@ -12,10 +12,10 @@ from common.geometry.se2 import Array
 from common.versions import commit, versions
 from lab.accuracy.scenes import Scene
 from services.estimator.paper import training
-from services.estimator.paper.decoder import Normalisation, PaperModel, Shape, use_one_core
-from services.estimator.paper.estimator import PaperPerception
+from services.estimator.paper.decoder import DecoderShape, Normalisation, PaperModel, use_one_core
+from services.estimator.paper.estimator import PaperEstimator
 from services.estimator.paper.perception import Descent
-from services.estimator.paper.training import Data, usable_ranges
+from services.estimator.paper.training import TrainingData, usable_ranges
 from services.estimator.paper.weights import ModelCard
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.field import FieldModel
@@ -45,9 +45,9 @@ class TrainedDecoder:
     model: PaperModel
     card: ModelCard
 
-    def estimator(self, descent: Descent) -> PaperPerception:
+    def estimator(self, descent: Descent) -> PaperEstimator:
         """A new estimator that starts at the map's centre."""
-        return PaperPerception(self.model, self.card, descent)
+        return PaperEstimator(self.model, self.card, descent)
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class TrainedField:
         return PreciseEstimator(self.model, self.seeds, np.array(scanner.mount), Likelihood(scanner.sigma))
 
 
-def sample_scans(scene: Scene, count: int, heading: float | None, *, noise: bool = True) -> Data:
+def sample_scans(scene: Scene, count: int, heading: float | None, *, noise: bool = True) -> TrainingData:
     """Scans (count, B) from random places where the robot fits, at the given heading (rad) or at random headings.
 
     Ranges are in m: +inf means no return, -inf too close.
@@ -75,7 +75,7 @@ def sample_scans(scene: Scene, count: int, heading: float | None, *, noise: bool
     ranges = scene.clean(poses)
     if noise:
         ranges += scene.scanner.sigma * scene.rng.standard_normal(ranges.shape)
-    return Data(poses, scene.scanner.limit(ranges))
+    return TrainingData(poses, scene.scanner.limit(ranges))
 
 
 def train_paper(scene: Scene, heading: float, samples: int, steps: int, seed: int) -> TrainedDecoder:
@@ -87,13 +87,15 @@ def train_paper(scene: Scene, heading: float, samples: int, steps: int, seed: in
     use_one_core()  # floating-point sums depend on the number of threads
     train = _usable(sample_scans(scene, samples, heading), scene)
     judge = _usable(sample_scans(scene, TEST_SCANS, heading, noise=False), scene)
-    watch = Data(judge.poses[:CURVE_SCANS], judge.ranges[:CURVE_SCANS])
+    watch = TrainingData(judge.poses[:CURVE_SCANS], judge.ranges[:CURVE_SCANS])
     parameters = training.TrainingParameters(
         max(1, -(-steps // -(-samples // BATCH_SIZE))), BATCH_SIZE, LEARNING_RATE, seed
     )
     norm = Normalisation.of(scene.world.bounds, float(train.ranges.max()))
     began = time.process_time()
-    trainer = training.Trainer(Shape(scene.scanner.beams, HIDDEN_UNITS, CHANNELS), norm, parameters, train, watch)
+    trainer = training.Trainer(
+        DecoderShape(scene.scanner.beams, HIDDEN_UNITS, CHANNELS), norm, parameters, train, watch
+    )
     model = trainer.run()
     took = time.process_time() - began
     error = np.abs(model.ranges(judge.poses) - judge.ranges)
@@ -146,7 +148,7 @@ def steps_of(card: ModelCard) -> int:
     return card.epochs * -(-card.samples // card.batch)
 
 
-def range_errors(model: PaperModel | FieldModel, scene: Scene, data: Data) -> Array:
+def range_errors(model: PaperModel | FieldModel, scene: Scene, data: TrainingData) -> Array:
     """Absolute errors (N, B), m, of the ranges that a model predicts; NaN where a return is missing in either."""
     if isinstance(model, PaperModel):
         return np.asarray(np.abs(model.ranges(data.poses) - usable_ranges(data.ranges, scene.scanner.range_max)))
@@ -156,5 +158,5 @@ def range_errors(model: PaperModel | FieldModel, scene: Scene, data: Data) -> Ar
     return np.asarray(np.abs(off))
 
 
-def _usable(data: Data, scene: Scene) -> Data:
-    return Data(data.poses, usable_ranges(data.ranges, scene.scanner.range_max))
+def _usable(data: TrainingData, scene: Scene) -> TrainingData:
+    return TrainingData(data.poses, usable_ranges(data.ranges, scene.scanner.range_max))

@@ -20,14 +20,14 @@ from common.robot.scanner import SCANNERS
 from lab.benchmarks.mapping import trajectory_errors
 from services.controller.growing_map import PlannedMap
 from services.controller.navigator import Navigator
-from services.controller.policies.exploration import Survey, Viewpoint
+from services.controller.policies.exploration import ExplorationState, Viewpoint
 from services.controller.policies.planner import GeodesicPolicy
 from services.mapper.service import belief_message, map_message
 from services.mapper.slam.drive import Laser
 from services.mapper.slam.mapper import Mapper
-from services.simulator.simulation import Setup, Simulation
+from services.simulator.simulation import Simulation, SimulationSetup
 
-ChooseViewpoint = Callable[[Survey], Viewpoint | None]
+ChooseViewpoint = Callable[[ExplorationState], Viewpoint | None]
 CELL_M = 0.05  # of the map
 MAP_PERIOD_NS = 1_000_000_000  # between two versions of the map, as in the mapper's service
 LAST_SCANS = 15  # while the robot comes to a stand
@@ -98,15 +98,15 @@ class RobotWithMapper:
         self._navigator.on_map(planned)
 
     def _choose_viewpoint(self) -> None:
-        survey = self._navigator.take_survey()
-        if survey is None:
+        exploration_state = self._navigator.take_exploration_state()
+        if exploration_state is None:
             return
         began = time.perf_counter()
-        viewpoint = self._choose(survey)
+        viewpoint = self._choose(exploration_state)
         self.run.choice_ms.append(1e3 * (time.perf_counter() - began))
         if viewpoint is not None:
             self.run.targets.append(viewpoint.pose)
-        self._navigator.use_viewpoint(viewpoint, survey)
+        self._navigator.use_viewpoint(viewpoint, exploration_state)
 
 
 def explore(
@@ -116,7 +116,7 @@ def explore(
     explorer, scanner = RobotWithMapper(robot, choose), SCANNERS["tim571"].with_beams(beams)
     x, y, yaw = start.tolist()
     run, last_scans = explorer.run, 0
-    with closing(Simulation(Setup(world, scanner, robot, (x, y, yaw), seed, sweep=True))) as simulation:
+    with closing(Simulation(SimulationSetup(world, scanner, robot, (x, y, yaw), seed, sweep=True))) as simulation:
         while simulation.stamp_ns < limit_s * 1e9 and last_scans < LAST_SCANS:
             odom, truth, scan = simulation.observe()
             run.truths.append(truth.pose.array())

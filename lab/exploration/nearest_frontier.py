@@ -14,7 +14,7 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from services.controller.policies.exploration import (
     UNREACHABLE_RANGE_M,
-    Survey,
+    ExplorationState,
     Viewpoint,
     find_frontier,
     known_space,
@@ -26,38 +26,38 @@ MIN_FRONTIER_CELLS = 5  # cells of 0.1 m; a robot of 0.54 m may just pass
 MAX_DISTANCE_M = 1.0  # from the frontier of the place that is driven to, if the robot cannot stand at the frontier
 
 
-def nearest_frontier(survey: Survey) -> Viewpoint | None:
+def nearest_frontier(state: ExplorationState) -> Viewpoint | None:
     """The place at the nearest part of the frontier; None if none can be reached."""
-    known = known_space(survey.graph)
-    field = known.cost_field(survey.pose[:2], known.min_clearance)
+    known = known_space(state.graph)
+    field = known.cost_field(state.pose[:2], known.min_clearance)
     if field is None:
         return None
-    places, cost = _reachable_places(survey, field)
+    places, cost = _reachable_places(state, field)
     nearest: tuple[float, Viewpoint] | None = None
-    for cells in _parts_of_frontier(survey, known.grid):
+    for cells in _parts_of_frontier(state, known.grid):
         at = _place_at(cells, places, cost, known.grid.resolution)
         if at is not None and (nearest is None or cost[at] < nearest[0]):
             offset = cells.mean(axis=0) - places[at]
-            heading = float(se2.wrap(np.arctan2(offset[1], offset[0]) - survey.field_of_view.sector.centre))
+            heading = float(se2.wrap(np.arctan2(offset[1], offset[0]) - state.field_of_view.sector.centre))
             nearest = float(cost[at]), Viewpoint(np.array([*places[at], heading]), float(len(cells)), places[at][None])
     return None if nearest is None else nearest[1]
 
 
-def _reachable_places(survey: Survey, field: CostField) -> tuple[Array, Array]:
+def _reachable_places(state: ExplorationState, field: CostField) -> tuple[Array, Array]:
     """Places (P, 2) m where the robot has not been yet, and the costs (P,) of the paths to them."""
     reachable = np.flatnonzero(np.isfinite(field.cost))
     places, cost = field.graph.grid.centres(reachable), field.cost.ravel()[reachable]
-    done = np.concatenate([survey.unreachable, survey.arrivals[:, :2]])
+    done = np.concatenate([state.unreachable, state.arrivals[:, :2]])
     if not len(done):
         return places, cost
     away = np.hypot(*np.moveaxis(places[:, None] - done, -1, 0)).min(axis=1) > UNREACHABLE_RANGE_M
     return places[away], cost[away]
 
 
-def _parts_of_frontier(survey: Survey, grid: Grid) -> list[Array]:
+def _parts_of_frontier(state: ExplorationState, grid: Grid) -> list[Array]:
     """The cells (F, 2) m of each connected part of the frontier that is large enough."""
     mask = np.zeros(grid.shape, bool)
-    mask.ravel()[find_frontier(survey).cells] = True
+    mask.ravel()[find_frontier(state).cells] = True
     label, count = ndimage.label(mask, np.ones((3, 3)))
     parts = [np.flatnonzero(label == number) for number in range(1, count + 1)]
     return [grid.centres(cells) for cells in parts if len(cells) >= MIN_FRONTIER_CELLS]

@@ -69,7 +69,7 @@ def bench_chaos(
                     outcomes.append(measure(system, fault))
                 problem = outcomes[-1].deviations
                 console.print(f"{'[red]no[/]' if problem else '[green]ok[/]'} {fault.name} {problem}", highlight=False)
-    print(markdown(outcomes))
+    print(faults_table(outcomes))
     data = {
         "command": "presage bench chaos",
         "arguments": {"faults": list(names), "repeats": repeats},
@@ -88,7 +88,7 @@ def bench_chaos(
 HEAD = ("fault", "detected (s)", "stopped (s)", "restarted (s)", "recovered (s)", "lowest speed (m/s)", "as expected")
 
 
-def rows_of(outcomes: Sequence[FaultOutcome]) -> list[tuple[str, ...]]:
+def fault_rows(outcomes: Sequence[FaultOutcome]) -> list[tuple[str, ...]]:
     """Rows of the table: for each fault the worst of its repeats."""
     table_rows = []
     for name in dict.fromkeys(outcome.fault for outcome in outcomes):
@@ -106,7 +106,7 @@ def rows_of(outcomes: Sequence[FaultOutcome]) -> list[tuple[str, ...]]:
     return table_rows
 
 
-def markdown(outcomes: Sequence[FaultOutcome]) -> str:
+def faults_table(outcomes: Sequence[FaultOutcome]) -> str:
     """The table as Markdown."""
-    lines = [HEAD, ("---",) * len(HEAD), *rows_of(outcomes)]
+    lines = [HEAD, ("---",) * len(HEAD), *fault_rows(outcomes)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)

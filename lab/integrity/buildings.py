@@ -15,7 +15,7 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.shapes import Box, Obstacle
 from common.geometry.world import World
-from lab.accuracy.furniture import CATALOGUE, Floor, Piece, Point, Shape
+from lab.accuracy.furniture import CATALOGUE, Floor, FurniturePiece, Point, Shape
 
 Kind = Literal["office", "symmetric", "corridor"]
 
@@ -62,7 +62,7 @@ class Building:
     boundary: tuple[Point, ...]
     walls: tuple[Obstacle, ...]
     rooms: tuple[Room, ...]  # with the corridors, whose door is None
-    furniture: tuple[Piece, ...] = ()
+    furniture: tuple[FurniturePiece, ...] = ()
 
     @cached_property
     def world(self) -> World:
@@ -79,7 +79,7 @@ class Building:
         doors = shapely.union_all([room.door_area() for room in self.rooms])
         return Floor(World(name=self.name, boundary=list(self.boundary), obstacles=list(self.walls)), doors)
 
-    def furnished(self, pieces: Sequence[Piece]) -> Building:
+    def furnished(self, pieces: Sequence[FurniturePiece]) -> Building:
         """The same walls with other furniture."""
         return replace(self, furniture=tuple(pieces))
 
@@ -229,10 +229,10 @@ def _rectangle(length: float, height: float) -> list[Point]:
 
 
 @dataclass(frozen=True)
-class Item:
+class TemplateItem:
     """A piece in a set of furniture, placed relative to the size of any room."""
 
-    piece: Piece
+    piece: FurniturePiece
     side: int | None  # the wall, counter-clockwise from y = 0; None for a free-standing piece
     place: Point  # from 0 to 1, along the room's width and depth; only the first, if it stands against a wall
     yaw: float  # rad, of a free-standing piece
@@ -240,30 +240,32 @@ class Item:
 
 def _template(
     rng: np.random.Generator, count: int, catalogue: Sequence[tuple[Shape, Point, Point, bool]] = CATALOGUE
-) -> list[Item]:
+) -> list[TemplateItem]:
     """A set of furniture; large pieces first, because they need more room."""
     items = [_item(rng, catalogue) for _ in range(count)]
     return sorted(items, key=lambda item: -item.piece.size[0])
 
 
-def _item(rng: np.random.Generator, catalogue: Sequence[tuple[Shape, Point, Point, bool]]) -> Item:
+def _item(rng: np.random.Generator, catalogue: Sequence[tuple[Shape, Point, Point, bool]]) -> TemplateItem:
     shape, small, large, at_wall = catalogue[int(rng.integers(len(catalogue)))]
     size = rng.uniform(small, large).tolist()
     if shape == "disc":
         size[1] = size[0]
     yaw = rng.integers(4) * np.pi / 2 if rng.random() < 0.5 else rng.uniform(-np.pi, np.pi)
     side = int(rng.integers(4)) if at_wall else None
-    return Item(Piece(shape, (size[0], size[1])), side, tuple(rng.random(2)), yaw)
+    return TemplateItem(FurniturePiece(shape, (size[0], size[1])), side, tuple(rng.random(2)), yaw)
 
 
-def _furnish(floor: Floor, room: Room, items: Sequence[Item], rng: np.random.Generator, deviation: float) -> None:
+def _furnish(
+    floor: Floor, room: Room, items: Sequence[TemplateItem], rng: np.random.Generator, deviation: float
+) -> None:
     """Puts down those items for which there is room, with ``deviation`` times the usual differences between rooms."""
     for item in items:
         offset = deviation * rng.standard_normal(3) * [PLACE_DEVIATION_M, PLACE_DEVIATION_M, YAW_DEVIATION]
         floor.put(item.piece.at(se2.compose(room.corner, _pose_of(item, room, offset))))
 
 
-def _pose_of(item: Item, room: Room, offset: Array) -> Array:
+def _pose_of(item: TemplateItem, room: Room, offset: Array) -> Array:
     """Pose (3,) of an item in the room's frame, with an offset (3,) that leaves it at its wall."""
     width, depth = item.piece.size
     inner = np.array([room.width, room.depth]) - WALL_M - 0.06  # pieces stand 3 cm from a wall
@@ -282,16 +284,16 @@ def _pose_of(item: Item, room: Room, offset: Array) -> Array:
     return np.array([x + WALL_M / 2 + 0.03, y + WALL_M / 2 + 0.03, yaw])
 
 
-def random_place(building: Building, piece: Piece, rng: np.random.Generator) -> Piece:
+def random_place(building: Building, piece: FurniturePiece, rng: np.random.Generator) -> FurniturePiece:
     """The piece at a random place of a random room, against a wall or not; it may overlap other pieces."""
     rooms = building.rooms
     areas = np.array([room.width * room.depth for room in rooms])
     room = rooms[rng.choice(len(rooms), p=areas / areas.sum())]
     side = int(rng.integers(4)) if rng.random() < 0.5 else None
-    item = Item(piece, side, tuple(rng.random(2)), rng.uniform(-np.pi, np.pi))
+    item = TemplateItem(piece, side, tuple(rng.random(2)), rng.uniform(-np.pi, np.pi))
     return piece.at(se2.compose(room.corner, _pose_of(item, room, np.zeros(3))))
 
 
-def random_piece(building: Building, rng: np.random.Generator) -> Piece:
+def random_piece(building: Building, rng: np.random.Generator) -> FurniturePiece:
     """A new piece at a random place."""
     return random_place(building, _item(rng, CATALOGUE).piece, rng)

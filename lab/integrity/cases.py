@@ -18,7 +18,7 @@ from lab.accuracy.scenes import TIM571, Scene
 from lab.integrity import changes, maps
 from lab.integrity.buildings import Building, Kind, make_building
 from services.estimator.shared.interface import Observation
-from services.simulator.odometry import Drift, Odometer
+from services.simulator.odometry import Odometer, OdometryNoise
 
 BEAMS = 622
 KIDNAPPING_PERIOD_S = 2.0
@@ -209,8 +209,8 @@ def _odometry(case: Case, path: Array, rate: float, rng: np.random.Generator) ->
     """Poses (N, 3) in odom, or None without odometry."""
     if case.odometry is None:
         return None
-    usual = Drift()
-    odometer = Odometer(Drift(*(value * case.odometry**2 for value in vars(usual).values())), rng)
+    usual = OdometryNoise()
+    odometer = Odometer(OdometryNoise(*(value * case.odometry**2 for value in vars(usual).values())), rng)
     poses, slips_until = [odometer.pose], -np.inf
     for k in range(1, len(path)):
         after = path[k]

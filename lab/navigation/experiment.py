@@ -29,7 +29,7 @@ from lab.navigation.shortest_path import START_GOAL_MARGIN, WALL_GAP, Trip, draw
 from lab.navigation.worlds import GENERATED, seed_of, world_of
 from lab.statistics import bootstrap_interval, median, wilson_interval
 from services.estimator.factory import EstimatorOptions, Name
-from services.simulator.simulation import Setup
+from services.simulator.simulation import SimulationSetup
 
 EXPERIMENT_ID = 7  # part of the random seeds
 WORLDS, DRIVES = ("maze", "office"), ("holonomic", "differential")
@@ -100,7 +100,7 @@ class NavigationJob:
         """Parameters of the drive. In a generated world the estimator predicts scans by casting rays in it."""
         world, seed = world_of(self.world, self.world_seed), (self.seed * 100_003 + self.index) % 2**31
         scanner = {**SCANNERS["tim571"].with_beams(self.beams).model_dump(), "range_max": self.range_max}
-        setup = Setup(
+        setup = SimulationSetup(
             world,
             Scanner.model_validate(scanner),
             self.robot,

@@ -20,8 +20,8 @@ from services.controller.service import PREDICTED_BEAMS
 from services.estimator.factory import EstimatorOptions, Factory, Geometry, prepare
 from services.estimator.prediction_query import answer_prediction
 from services.estimator.service import belief_message
-from services.estimator.shared.interface import Estimator, Observation
-from services.simulator.simulation import Setup, Simulation
+from services.estimator.shared.interface import Observation, PoseEstimator
+from services.simulator.simulation import Simulation, SimulationSetup
 
 SCANS_TO_STAND = 15  # 1 s; when the goal is reached, the robot is about to stop
 
@@ -30,7 +30,7 @@ SCANS_TO_STAND = 15  # 1 s; when the goal is reached, the robot is about to stop
 class NavigationRun:
     """Parameters of a drive; its results depend on nothing else."""
 
-    simulation: Setup
+    simulation: SimulationSetup
     estimator: EstimatorOptions
     goal: tuple[float, float]  # m in map
     odometry: bool  # whether the estimator is given odometry
@@ -48,7 +48,7 @@ class LocalisedRobot:
     odometry: bool
     trace: RunTrace = field(default_factory=RunTrace)
     step_us: list[int] = field(default_factory=list)  # processor time of the controller's steps
-    _estimator: Estimator | None = None  # built for the first scan
+    _estimator: PoseEstimator | None = None  # built for the first scan
 
     def step(self, odom: Odom, scan: Scan) -> Twist:
         """The velocity that answers a scan."""
@@ -81,7 +81,7 @@ class LocalisedRobot:
             time_increment=scan.time_increment,
         )
 
-    def _predict(self, belief: Belief, estimator: Estimator, geometry: Geometry) -> int:
+    def _predict(self, belief: Belief, estimator: PoseEstimator, geometry: Geometry) -> int:
         """Give the policy the scans that it needs predicted. Returns the microseconds that the controller spent."""
         if not self.navigator.goal_state.active:
             return 0

@@ -27,8 +27,8 @@ from lab.paper.e1_localisation import CLOSE_DISTANCE, FOUND_DISTANCE
 from presage.plotting import style as drawing
 from services.estimator.paper.perception import Descent
 from services.estimator.particle_filter.filter import ParticleFilter
-from services.estimator.particle_filter.settings import Settings as ParticleSettings
-from services.estimator.shared.interface import Estimator, Posterior
+from services.estimator.particle_filter.settings import ParticleFilterSettings
+from services.estimator.shared.interface import PoseEstimator, Posterior
 
 EXPERIMENT_ID = 5  # part of the random seeds
 PLACES_SEED, LEARNING_SEED, SCANS_SEED = 0, 1, 2  # parts of the random seeds
@@ -105,7 +105,7 @@ def trial(job: AliasingJob) -> dict[str, Any]:
     return {"world": job.world, "estimator": job.estimator, "places": rows}
 
 
-def _estimator_factory(job: AliasingJob) -> Callable[[int], Estimator]:
+def _estimator_factory(job: AliasingJob) -> Callable[[int], PoseEstimator]:
     """Trains the model. Returns a function that makes a new estimator, without start pose, for a place's number."""
     scene = scene_of(job, LEARNING_SEED, ESTIMATORS.index(job.estimator))
     if job.estimator == "paper":
@@ -114,7 +114,7 @@ def _estimator_factory(job: AliasingJob) -> Callable[[int], Estimator]:
     if job.estimator == "precise":
         field = learning.learn_precise(scene, job.scans)
         return lambda _: field.estimator(scene)
-    settings, mount = ParticleSettings.tuned(), scene.scanner.mount
+    settings, mount = ParticleFilterSettings.tuned(), scene.scanner.mount
     return lambda number: ParticleFilter(scene.world, settings, mount, job.seed * 100_003 + number)
 
 

@@ -34,7 +34,7 @@ from lab.experiments.estimators import (
 from lab.experiments.trials import run_trials
 from presage.plotting import style as drawing
 from services.estimator.paper.perception import Descent
-from services.simulator.odometry import Drift, Odometer
+from services.simulator.odometry import Odometer, OdometryNoise
 
 EXPERIMENT_ID = 2  # part of the random seeds
 START_COVARIANCE = np.diag([0.01, 0.01, 0.01])  # m², m², rad²: 10 cm and 6 degrees
@@ -79,14 +79,14 @@ def trial(job: CrossingJob) -> dict[str, Any]:
     """Runs one crossing. Returns each estimator's error (m) at every scan, and the bounds."""
     scene = job.field.scene(job.seed, EXPERIMENT_ID, job.index)
     path = path_of(scene, job.field.heading, job.step)
-    odometer, scans = Odometer(Drift(), np.random.default_rng((job.seed, EXPERIMENT_ID, job.index, 1))), []
+    odometer, scans = Odometer(OdometryNoise(), np.random.default_rng((job.seed, EXPERIMENT_ID, job.index, 1))), []
     for k, clean in enumerate(scene.clean(path)):
         if k:
             odometer.move(path[k - 1], path[k])
         scans.append(scene.observe(clean, k / scene.scanner.rate, odometer.pose.copy()))
     outcome: dict[str, Any] = {"y": float(path[0, 1]), "error_m": {}, "lost": {}}
     one = bound.single(scene, path)
-    limits = one, bound.heading_known(one), bound.recursive(scene, path, Drift(), START_COVARIANCE)
+    limits = one, bound.heading_known(one), bound.recursive(scene, path, OdometryNoise(), START_COVARIANCE)
     outcome["bound_m"] = {
         name: np.round(bound.position(each), 7).tolist() for name, each in zip(BOUND_NAMES, limits, strict=True)
     }

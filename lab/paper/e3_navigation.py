@@ -44,7 +44,7 @@ ESTIMATORS = (f"paper, {TEN_STEPS}", "precise", "particle-filter")
 
 
 @dataclass(frozen=True)
-class NavigationJob:
+class JourneyJob:
     """One start and goal, the same for every estimator."""
 
     index: int
@@ -69,7 +69,7 @@ def arguments(name: str, descent: Descent) -> tuple[str, ...]:
     return ("--estimator", kind, *(("--prior", "odometry") if uses_odometry(name) else ()), *steps)
 
 
-def trial(job: NavigationJob) -> dict[str, Any]:
+def trial(job: JourneyJob) -> dict[str, Any]:
     """Runs one journey with every estimator. Returns the journey and each estimator's results."""
     world = load_world(job.field.world)
     journey = draw_journey(
@@ -146,7 +146,7 @@ def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
     }
 
 
-def run(job: NavigationJob, trials: int, out: Path, workers: int, console: Console) -> results.Result:
+def run(job: JourneyJob, trials: int, out: Path, workers: int, console: Console) -> results.Result:
     """Runs all trials. Writes e3.json, .csv, .trials.jsonl, .pdf and .png into ``out``."""
     for name in job.estimators:
         arguments(name, job.descent)
@@ -198,7 +198,7 @@ def _rows(rows: Sequence[dict[str, Any]], name: str, quantity: str, names: Seque
     return drawing.pad_with_last([row["estimators"][name][quantity] for row in rows], longest)
 
 
-def draw(rows: Sequence[dict[str, Any]], job: NavigationJob) -> Figure:
+def draw(rows: Sequence[dict[str, Any]], job: JourneyJob) -> Figure:
     """Distance to the goal and error over iterations, as in the paper's figure 3, and the paths below."""
     figure = drawing.empty_figure(13.0, 7.2)
     grid = figure.add_gridspec(2, 2, height_ratios=(1.25, 1))

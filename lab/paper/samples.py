@@ -27,7 +27,7 @@ from lab.experiments.trials import run_trials
 from lab.paper.e1_localisation import CLOSE_DISTANCE
 from presage.plotting import style as drawing
 from services.estimator.paper.perception import Descent
-from services.estimator.shared.interface import Estimator
+from services.estimator.shared.interface import PoseEstimator
 
 EXPERIMENT_ID = 4  # part of the random seeds
 SIZES = (100, 500, 1000, 2000, 5000, 13_000)
@@ -56,7 +56,7 @@ def trial(job: SamplesJob) -> dict[str, Any]:
         job.seed, EXPERIMENT_ID, LEARNING_SEED, ESTIMATORS.index(job.estimator), job.samples
     )
     test_scene = job.field.scene(job.seed, EXPERIMENT_ID, SHARED_SEED)
-    make: Callable[[], Estimator]
+    make: Callable[[], PoseEstimator]
     if job.estimator == "paper":
         decoder = learning.train_paper(training_scene, job.field.heading, job.samples, job.steps, job.seed)
         model, steps, seconds = decoder.model, learning.steps_of(decoder.card), decoder.card.training_s
@@ -79,11 +79,11 @@ def trial(job: SamplesJob) -> dict[str, Any]:
         "no_prediction_share": float(np.isnan(ranges).mean()),
         "position_error_m": [round(_position_error(make(), test_scene, pose, scans), 6) for pose in poses],
         "same_scan_everywhere_m": float(np.abs(held_out.ranges - np.median(held_out.ranges, axis=0)).mean()),
-        "bound_median_m": bound.median(bound.single(test_scene, poses)),
+        "bound_median_m": bound.median_error(bound.single(test_scene, poses)),
     }
 
 
-def _position_error(estimator: Estimator, scene: Scene, pose: Array, scans: int) -> float:
+def _position_error(estimator: PoseEstimator, scene: Scene, pose: Array, scans: int) -> float:
     """Position error in m after ``scans`` scans of a robot that stands at ``pose`` (3,)."""
     clean = scene.clean(pose[None])[0]
     for k in range(scans):

@@ -29,13 +29,13 @@ from lab.experiments.estimators import ExperimentWorld
 from lab.experiments.journeys import ARRIVAL_DISTANCE, Journey, draw_journey, least_time
 from lab.experiments.trials import run_trials
 from lab.paper import e3_navigation as navigation
-from lab.paper.teleports import Steps, travel
+from lab.paper.teleports import StepSizes, travel
 from presage.plotting import style as drawing
 from services.controller.navigator import Navigator
 from services.controller.policies.paper_action import ActionParameters
 from services.estimator.paper import weights
 from services.estimator.paper.decoder import PaperModel, use_one_core
-from services.estimator.paper.estimator import PaperPerception
+from services.estimator.paper.estimator import PaperEstimator
 from services.estimator.paper.perception import Descent
 from services.estimator.paper.training import usable_ranges
 from services.estimator.shared.interface import Observation
@@ -56,7 +56,7 @@ class Setting:
     """One setting of the sweep. The velocity loop uses only beta and gamma, and gamma has no unit there."""
 
     loop: Literal["displacement", "velocity"]
-    steps: Steps
+    steps: StepSizes
 
     @property
     def name(self) -> str:
@@ -77,17 +77,17 @@ class StepSizeJob:
     limit: int = 150  # maximum number of iterations in the displacement loop
     velocity_limit: int = 900  # maximum number of iterations in the velocity loop
     field: ExperimentWorld = ExperimentWorld()  # noqa: RUF009 - frozen
-    setting: Setting = Setting("displacement", Steps())
+    setting: Setting = Setting("displacement", StepSizes())
 
 
 def settings() -> list[Setting]:
     """All settings of the sweep."""
-    every = [Steps(ALPHA, beta, gamma) for beta in BETAS for gamma in GAMMAS]
-    every += [Steps(ALPHA, 1.0, gamma, "sum") for gamma in SUMS]
+    every = [StepSizes(ALPHA, beta, gamma) for beta in BETAS for gamma in GAMMAS]
+    every += [StepSizes(ALPHA, 1.0, gamma, "sum") for gamma in SUMS]
     # With equal step sizes along both axes, alpha is limited by the short axis, along which the scan changes most.
-    every += [Steps(5e-4, 1.0, 1e-3, normalised=False), Steps(ALPHA, 1.0, 1e-3, "printed")]
-    driven = [Steps(beta=0.0, gamma=gamma) for gamma in VELOCITY_GAMMAS]
-    driven += [Steps(beta=beta, gamma=ActionParameters().gamma) for beta in VELOCITY_BETAS]
+    every += [StepSizes(5e-4, 1.0, 1e-3, normalised=False), StepSizes(ALPHA, 1.0, 1e-3, "printed")]
+    driven = [StepSizes(beta=0.0, gamma=gamma) for gamma in VELOCITY_GAMMAS]
+    driven += [StepSizes(beta=beta, gamma=ActionParameters().gamma) for beta in VELOCITY_BETAS]
     return [Setting("displacement", each) for each in every] + [Setting("velocity", each) for each in driven]
 
 
@@ -123,15 +123,15 @@ def _run_displacement(job: StepSizeJob, world: World, journey: Journey) -> dict[
 
 def _run_velocity(job: StepSizeJob, world: World, journey: Journey) -> dict[str, Any]:
     """Runs the journey as in E3, but in one process and with the job's step sizes."""
-    from services.simulator.simulation import Setup, Simulation  # pybullet, for this alone
+    from services.simulator.simulation import Simulation, SimulationSetup  # pybullet, for this alone
 
     scanner, steps = job.field.scene(0).scanner, job.setting.steps
     pose, goal = (*journey.start, job.field.heading), np.array([*journey.goal, job.field.heading])
     model, card = _model(job.field)
-    perception = PaperPerception(model, card, Descent(beta=steps.beta), np.array(pose))
+    perception = PaperEstimator(model, card, Descent(beta=steps.beta), np.array(pose))
     navigator = Navigator(Robot(), ActionParameters(gamma=steps.gamma), world)
     navigator.on_goal(Goal(stamp_ns=0, pose=Pose.of(goal)))
-    simulation = Simulation(Setup(world, scanner, Robot(), pose, job.seed * 100_003 + job.index))
+    simulation = Simulation(SimulationSetup(world, scanner, Robot(), pose, job.seed * 100_003 + job.index))
     errors, contacts = [], 0
     try:
         while True:

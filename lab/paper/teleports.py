@@ -26,7 +26,7 @@ Form = Literal["step", "sum", "printed"]
 
 
 @dataclass(frozen=True)
-class Steps:
+class StepSizes:
     """Step sizes; alpha and gamma in m², with Sigma = 1 m².
 
     The paper's network and its gradients use coordinates in which the map is 2 x 2. In metres, a step along an axis is
@@ -62,7 +62,7 @@ class JourneyOutcome:
 
 def travel(
     journey: Journey,
-    steps: Steps,
+    steps: StepSizes,
     model: PaperModel,
     look: Callable[[Array], Array],
     world: World,
@@ -93,7 +93,7 @@ def travel(
     return JourneyOutcome(np.array(distances), np.array(errors), stopped)
 
 
-def _perceive(o: Array, belief: Array, g_goal: Array, model: PaperModel, steps: Steps, yaw: float) -> Array:
+def _perceive(o: Array, belief: Array, g_goal: Array, model: PaperModel, steps: StepSizes, yaw: float) -> Array:
     """The bracket of equation 3, (2,)."""
     g, dg = model.predict(np.array([*belief, yaw]))
     if steps.form == "printed":
@@ -101,7 +101,9 @@ def _perceive(o: Array, belief: Array, g_goal: Array, model: PaperModel, steps: 
     return FreeEnergy(o, g, dg, np.ones(len(o)), g_goal, steps.beta).descent[:2]
 
 
-def _act(action: Array, o: Array, belief: Array, model: PaperModel, steps: Steps, yaw: float, metric: Array) -> Array:
+def _act(
+    action: Array, o: Array, belief: Array, model: PaperModel, steps: StepSizes, yaw: float, metric: Array
+) -> Array:
     """The action (2,), m, of equation 4 at the updated belief.
 
     The heading is fixed, so the derivative of the belief by the displacement is the identity.

@@ -23,7 +23,7 @@ from common.geometry.world import load_world
 from lab.experiments import results
 from lab.experiments.trials import run_trials
 from lab.integrity.models import field_file
-from lab.peers.scans import BUILDING, DRIVES, PLACES, PosedScans, map_file, read_posed_scans
+from lab.peers.scans import BUILDING, DRIVES, PLACES, TrialScans, map_file, read_trial_scans
 from lab.statistics import bootstrap_interval, median, root_mean_square, wilson_interval
 from presage.learning.train_drive import TrainDriveOptions, card_of, rectangle
 from services.estimator.factory import EstimatorOptions, Factory, Geometry, prepare
@@ -44,42 +44,42 @@ SETTLED_SCANS = 50  # of a drive, before its errors count
 
 
 @dataclass(frozen=True)
-class Contender:
-    """An estimator with its map, and what it is told that a robot would not know."""
+class EstimatorWithMap:
+    """An estimator, its map, and what it is given that a robot would not know."""
 
-    estimator: str
+    estimator: str  # preset
     map: str
     knows: str
 
 
-CONTENDERS = {
-    "presage, polygons": Contender("precise", POLYGONS, "σ, exact map"),
-    "presage, 5 cm map": Contender("precise", CELLS, "σ"),
-    "presage, learned from 5 cm map": Contender("precise", FIELD, "σ"),
-    "presage, learned from posed scans": Contender(
+ESTIMATORS = {
+    "presage, polygons": EstimatorWithMap("precise", POLYGONS, "σ, exact map"),
+    "presage, 5 cm map": EstimatorWithMap("precise", CELLS, "σ"),
+    "presage, learned from 5 cm map": EstimatorWithMap("precise", FIELD, "σ"),
+    "presage, learned from posed scans": EstimatorWithMap(
         "precise", POSED, "true poses of other drives; learns σ, drift, base limits"
     ),
-    "particle-filter, polygons": Contender("particle-filter", POLYGONS, "exact map"),
-    "particle-filter, 5 cm map": Contender("particle-filter", CELLS, "–"),
-    "amcl-defaults, 5 cm map": Contender("amcl-defaults", CELLS, "–"),
+    "particle-filter, polygons": EstimatorWithMap("particle-filter", POLYGONS, "exact map"),
+    "particle-filter, 5 cm map": EstimatorWithMap("particle-filter", CELLS, "–"),
+    "amcl-defaults, 5 cm map": EstimatorWithMap("amcl-defaults", CELLS, "–"),
 }
 
 
 @dataclass(frozen=True)
 class PeersJob:
-    """One trial of one contender; the values are plain, so that they can be compared."""
+    """One trial of one estimator."""
 
     folder: str  # of the scans
     out: str  # folder of the learned models
-    contender: str
+    estimator: str  # its name in `ESTIMATORS`
     task: str
     number: int  # of the place or drive
     seed: int
 
     @property
-    def scans(self) -> PosedScans:
+    def scans(self) -> TrialScans:
         """All trials of the job's task."""
-        return read_posed_scans(Path(self.folder) / (PLACES if self.task == STANDING else DRIVES))
+        return read_trial_scans(Path(self.folder) / (PLACES if self.task == STANDING else DRIVES))
 
     @property
     def teachers(self) -> str:
@@ -90,33 +90,33 @@ class PeersJob:
 
 
 def run(
-    folder: Path, contenders: Sequence[str], trials: int, seed: int, out: Path, workers: int, console: Console
+    folder: Path, estimators: Sequence[str], trials: int, seed: int, out: Path, workers: int, console: Console
 ) -> results.Result:
     """Localises the scans of ``folder``, at most ``trials`` of each task. Writes peers.json into ``out``."""
     map_file(folder)
     jobs = [
-        PeersJob(str(folder), str(out), contender, task, number, seed)
-        for contender in contenders
+        PeersJob(str(folder), str(out), estimator, task, number, seed)
+        for estimator in estimators
         for task in TASKS
-        for number in range(min(trials, len(PeersJob(str(folder), "", contender, task, 0, seed).scans.truth)))
+        for number in range(min(trials, len(PeersJob(str(folder), "", estimator, task, 0, seed).scans.truth)))
     ]
     learned = {_model_file(job): job for job in jobs if _model_file(job)}
     run_trials("learning", learn, list(learned.values()), out, workers, console)
     rows = run_trials("peers", trial, jobs, out, workers, console)
     summary = {
-        f"{TASKS[task]}, {name}": summarise([row for row in rows if (row["task"], row["contender"]) == (task, name)])
+        f"{TASKS[task]}, {name}": summarise([row for row in rows if (row["task"], row["estimator"]) == (task, name)])
         for task in TASKS
-        for name in contenders
+        for name in estimators
     }
-    parameters = {"trials": trials, "knows": {name: CONTENDERS[name].knows for name in contenders}}
+    parameters = {"trials": trials, "knows": {name: ESTIMATORS[name].knows for name in estimators}}
     result = results.Result("peers", "The scans on which other programs were measured", seed, parameters, summary)
     result.write(out, None)
     return result
 
 
 def _model_file(job: PeersJob) -> str:
-    """The weights that the job's contender learns; empty if it learns none."""
-    kind = CONTENDERS[job.contender].map
+    """The weights that the job's estimator learns; empty if it learns none."""
+    kind = ESTIMATORS[job.estimator].map
     if kind == FIELD:
         return str(weights.path_of(Path(job.out), load_world(str(map_file(Path(job.folder)))).name))
     return str(weights.path_of(Path(job.out), f"posed-{job.teachers}")) if kind == POSED else ""
@@ -125,10 +125,10 @@ def _model_file(job: PeersJob) -> str:
 def learn(job: PeersJob) -> dict[str, Any]:
     """Learns the job's model, unless an interrupted run has: from the map, or from drives on which it is not tested."""
     path = Path(_model_file(job))
-    if CONTENDERS[job.contender].map == FIELD:
+    if ESTIMATORS[job.estimator].map == FIELD:
         field_file(path.parent, load_world(str(map_file(Path(job.folder)))), job.scans.scanner)
     elif not path.exists():
-        scans = read_posed_scans(Path(job.folder) / DRIVES)
+        scans = read_trial_scans(Path(job.folder) / DRIVES)
         numbers = range(len(scans.truth))
         drive = scans.drive({"all": numbers, "odd": numbers[1::2], "even": numbers[::2]}[job.teachers])
         options = TrainDriveOptions(Path(DRIVES))
@@ -141,17 +141,17 @@ def learn(job: PeersJob) -> dict[str, Any]:
 
 
 @functools.lru_cache(maxsize=4)
-def _factory(folder: str, contender: str, model: str, seed: int) -> Factory:
-    """Estimators of a contender, compiled by one update; cached per process."""
-    chosen = CONTENDERS[contender]
+def _factory(folder: str, estimator: str, model: str, seed: int) -> Factory:
+    """Makes estimators of one kind, compiled by a first update; cached per process."""
+    chosen = ESTIMATORS[estimator]
     world = str(Path(folder) / BUILDING if chosen.map in (POLYGONS, POSED) else map_file(Path(folder)))
     factory = prepare(EstimatorOptions(world, chosen.estimator, model or "exact", seed=seed))  # type: ignore[arg-type]
-    scans = read_posed_scans(Path(folder) / PLACES)
+    scans = read_trial_scans(Path(folder) / PLACES)
     factory(Geometry.of(scans.scanner)).update(_observation(scans, 0, 0, None))
     return factory
 
 
-def _observation(scans: PosedScans, number: int, k: int, odom: Array | None) -> Observation:
+def _observation(scans: TrialScans, number: int, k: int, odom: Array | None) -> Observation:
     scanner = scans.scanner
     return Observation(scans.ranges[number, k], scanner.angles(), scanner.range_max, float(scans.stamps[k]), odom)
 
@@ -159,7 +159,7 @@ def _observation(scans: PosedScans, number: int, k: int, odom: Array | None) -> 
 def trial(job: PeersJob) -> dict[str, Any]:
     """Errors, states and processor times of all scans of one trial."""
     scans, number = job.scans, job.number
-    estimator = _factory(job.folder, job.contender, _model_file(job), job.seed)(Geometry.of(scans.scanner))
+    estimator = _factory(job.folder, job.estimator, _model_file(job), job.seed)(Geometry.of(scans.scanner))
     truth = scans.truth[number]
     if job.task != STANDING:
         rng = np.random.default_rng([job.seed, number])
@@ -179,7 +179,7 @@ def trial(job: PeersJob) -> dict[str, Any]:
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Statistics of one contender in one task."""
+    """Statistics of one estimator in one task."""
     standing = rows[0]["task"] == STANDING
     converged = [row for row in rows if np.median(row["error_m"][-LAST_SCANS:]) < CONVERGED_M]
 
@@ -253,7 +253,7 @@ def _cells(name: str, row: dict[str, Any]) -> list[str]:
     heading = row["yaw_error_median_rad"]
     return [
         name,
-        CONTENDERS[name.partition(", ")[2]].knows,
+        ESTIMATORS[name.partition(", ")[2]].knows,
         f"{row['converged']}/{row['trials']} ({low:.0f} to {high:.0f} %)",
         " / ".join(
             [

@@ -20,7 +20,7 @@ PAUSE_S = 60.0  # between the stamps of two drives
 
 
 @dataclass(frozen=True)
-class PosedScans:
+class TrialScans:
     """K trials of N scans each; base_link is the laser."""
 
     ranges: Array  # (K, N, B) m; +inf: no return
@@ -49,7 +49,7 @@ class PosedScans:
 
 
 @functools.lru_cache(maxsize=4)
-def read_posed_scans(path: Path) -> PosedScans:
+def read_trial_scans(path: Path) -> TrialScans:
     """Reads ranges_mm (0: no return), truth, odom, angles, range_max and sigma of an .npz file; cached per process."""
     with np.load(path) as stored:
         missing = {"ranges_mm", "truth", "odom", "angles", "range_max", "sigma"} - set(stored.files)
@@ -68,7 +68,7 @@ def read_posed_scans(path: Path) -> PosedScans:
             rate=RATE_HZ,
             mount=(0.0, 0.0, 0.0),
         )
-        return PosedScans(ranges, stored["truth"].astype(float), stored["odom"].astype(float), scanner)
+        return TrialScans(ranges, stored["truth"].astype(float), stored["odom"].astype(float), scanner)
 
 
 def map_file(folder: Path) -> Path:

@@ -18,16 +18,16 @@ from presage.logs.scan_files import read_scans
 from services.estimator.factory import EstimatorOptions, Factory, Geometry, prepare
 from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.particle_filter.sensor import Sensor
-from services.estimator.particle_filter.settings import Settings as ParticleSettings
+from services.estimator.particle_filter.settings import ParticleFilterSettings
 from services.estimator.precise.learning.calibration import ReferenceDrive
-from services.estimator.shared.interface import Estimator, Observation
+from services.estimator.shared.interface import Observation, PoseEstimator
 
 MAX_SEARCH_SCANS = 40
 SCANS_BEFORE_KIDNAPPING = 10  # scans for which the robot is tracked before it is kidnapped
 START_COVARIANCE = np.diag([0.01, 0.01, 0.0025])  # m², m², rad²; of the given start pose
 TRACKED_DISTANCE = 0.5  # m; a scan with a smaller error counts as tracked
 # AMCL's default motion model is differential and cannot follow every base, so its omnidirectional model is used.
-AMCL_SETTINGS = ParticleSettings(robot_model_type="omni")
+AMCL_SETTINGS = ParticleFilterSettings(robot_model_type="omni")
 ODOMETRY, LASER, GLOBAL, KIDNAPPED = "odometry", "laser", "global", "kidnapped"
 
 
@@ -128,7 +128,7 @@ def hide_kidnapping(odom: Array, carried: int) -> Array:
     return np.asarray(moved)
 
 
-def create_estimator(job: StretchJob) -> Estimator:
+def create_estimator(job: StretchJob) -> PoseEstimator:
     """A new estimator for the job's map, without a start pose."""
     drive = job.drive
     if job.estimator == "precise":
@@ -139,11 +139,11 @@ def create_estimator(job: StretchJob) -> Estimator:
     return ParticleFilter(load_world(job.map), settings, (x, y, yaw), job.seed, sensor=_sensor(job.map, settings))
 
 
-def particle_settings(changed: tuple[tuple[str, float], ...]) -> ParticleSettings:
+def particle_settings(changed: tuple[tuple[str, float], ...]) -> ParticleFilterSettings:
     """Settings of the particle filter: the tuned set, or AMCL's if "amcl_defaults" is 1, with the given changes."""
     kinds = {"max_beams": int, "keep_initial_pose": bool}
     values = {name: kinds[name](value) if name in kinds else value for name, value in changed}
-    base = AMCL_SETTINGS if values.pop("amcl_defaults", 0.0) else ParticleSettings.tuned()
+    base = AMCL_SETTINGS if values.pop("amcl_defaults", 0.0) else ParticleFilterSettings.tuned()
     return replace(base, **values)  # type: ignore[arg-type]
 
 
@@ -153,5 +153,5 @@ def _precise(world: str, model: str) -> Factory:
 
 
 @functools.lru_cache(maxsize=4)
-def _sensor(world: str, settings: ParticleSettings) -> Sensor:
+def _sensor(world: str, settings: ParticleFilterSettings) -> Sensor:
     return Sensor(load_world(world), settings)

@@ -35,7 +35,7 @@ from lab.real_logs.drive import (
     trial,
 )
 from lab.real_logs.figure import draw
-from lab.real_logs.filter_tuning import Settings, TunedSettings, starting_point, tune
+from lab.real_logs.filter_tuning import ParameterValues, TunedSettings, starting_point, tune
 from presage.learning.train_drive import TrainDriveOptions as Training
 from presage.learning.train_drive import card_of
 from services.estimator.precise.learning import weights
@@ -180,11 +180,11 @@ def _train_and_tune(
     return path, card, tuned
 
 
-def _settings(tuned: TunedSettings, task: str) -> Settings:
+def _settings(tuned: TunedSettings, task: str) -> ParameterValues:
     return _settings_by_task(tuned).get(task, tuned.finding)
 
 
-def _settings_by_task(tuned: TunedSettings) -> dict[str, Settings]:
+def _settings_by_task(tuned: TunedSettings) -> dict[str, ParameterValues]:
     return {ODOMETRY: tuned.odometry, LASER: tuned.laser, "finding": tuned.finding}
 
 
@@ -295,7 +295,7 @@ def notes(job: RealLogJob, card: weights.FieldCard, tuned: TunedSettings) -> lis
     return lines
 
 
-def _format_settings(settings: Settings) -> str:
+def _format_settings(settings: ParameterValues) -> str:
     return ", ".join(f"{name} {value:.3g}" for name, value in settings)
 
 

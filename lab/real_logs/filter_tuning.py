@@ -22,7 +22,7 @@ import numpy as np
 
 from common.geometry.ros_map_writer import write_grid
 from common.geometry.world import load_world
-from lab.accuracy.contenders import amcl_noise
+from lab.accuracy.compared_estimators import amcl_noise
 from lab.real_logs.drive import (
     GLOBAL,
     KIDNAPPED,
@@ -60,27 +60,27 @@ SEARCH_CANDIDATES: dict[str, tuple[float, ...]] = {
 MAX_STRETCHES, MAX_STRETCH_SCANS = 3, 150  # of the second quarter, for tracking
 SEARCH_STARTS, SEARCH_SCANS = 4, 15  # starts to find, and scans allowed for global localisation
 CELL_SIZE = 0.05  # m, of the first quarter's map if the drive's own map is not a grid
-Settings = tuple[tuple[str, float], ...]
+ParameterValues = tuple[tuple[str, float], ...]
 
 
 @dataclass(frozen=True)
 class TunedSettings:
     """Tuned settings of the particle filter."""
 
-    odometry: Settings  # for tracking with odometry
-    laser: Settings  # for tracking without
-    finding: Settings  # for global localisation and kidnapping
+    odometry: ParameterValues  # for tracking with odometry
+    laser: ParameterValues  # for tracking without
+    finding: ParameterValues  # for global localisation and kidnapping
     # A line per trial: task and setting, share of scans kept or starts found, median error (m) or mean number of scans.
     tried: list[str]
 
 
-def starting_point(motion: MotionNoise) -> Settings:
+def starting_point(motion: MotionNoise) -> ParameterValues:
     """Odometry noise of AMCL's omnidirectional model, from the noise learned on the first half."""
     return tuple(amcl_noise(motion).items())
 
 
 def tune(
-    job: StretchJob, half: int, start: Settings, folder: Path, report: Callable[[str, float], None]
+    job: StretchJob, half: int, start: ParameterValues, folder: Path, report: Callable[[str, float], None]
 ) -> TunedSettings:
     """Tunes the settings by coordinate search. Writes the map of the first quarter into ``folder``.
 
@@ -96,12 +96,12 @@ def tune(
 
     starts = _evenly_spaced(job, quarter, half - MAX_SEARCH_SCANS, SEARCH_STARTS)
 
-    def tracking(task: str, settings: Settings) -> tuple[float, float]:
+    def tracking(task: str, settings: ParameterValues) -> tuple[float, float]:
         return _tracking_score(
             [trial(replace(job, task=task, first=first, count=length, particles=settings)) for first in firsts]
         )
 
-    def finding(settings: Settings) -> tuple[float, float]:
+    def finding(settings: ParameterValues) -> tuple[float, float]:
         rows = [trial(replace(job, task=GLOBAL, first=k, count=SEARCH_SCANS, particles=settings)) for k in starts]
         kidnappings = zip(starts, starts[len(starts) // 2 :] + starts[: len(starts) // 2], strict=True)
         rows += [trial(replace(job, task=KIDNAPPED, first=k, to=to, particles=settings)) for k, to in kidnappings]
@@ -109,10 +109,10 @@ def tune(
 
     def coordinate_search(
         title: str,
-        settings: Settings,
+        settings: ParameterValues,
         tried: dict[str, tuple[float, ...]],
-        score: Callable[[Settings], tuple[float, float]],
-    ) -> Settings:
+        score: Callable[[ParameterValues], tuple[float, float]],
+    ) -> ParameterValues:
         best, best_score = settings, score(settings)
         lines.append(f"{title}, initial settings: {best_score[0]:.0%}, {-best_score[1]:.3g}")
         for name, values in tried.items():
@@ -152,7 +152,7 @@ def _evenly_spaced(job: StretchJob, first: int, last: int, count: int) -> list[i
     return [int(k) for k in indices[np.linspace(0, len(indices) - 1, count).astype(int)]]
 
 
-def _with(settings: Settings, name: str, value: float) -> Settings:
+def _with(settings: ParameterValues, name: str, value: float) -> ParameterValues:
     values = dict(settings)
     if name == "alpha":
         return tuple({**values, **{f"alpha{k}": values[f"alpha{k}"] * value for k in range(1, 6)}}.items())

@@ -140,7 +140,7 @@ def up(
 def demo(
     unknown: Annotated[
         bool,
-        typer.Option("--unknown", help="In an unknown building: explore, be carried off, drive to a goal, return."),
+        typer.Option("--unknown", help="In an unknown building: explore, be kidnapped, drive to a goal, return."),
     ] = False,
     world: WorldName = "",
     goal: Annotated[
@@ -160,9 +160,9 @@ def demo(
 ) -> None:
     """Run the whole loop once: localise without a start pose, drive to a goal, record, draw and summarise.
 
-    With --unknown, the robot maps a building that it has never seen, by default `office`: it explores, is carried off,
-    finds itself in its map, drives to a goal given meanwhile, explores the rest and returns. This takes two and a half
-    minutes.
+    With --unknown, the robot maps a building that it has never seen, by default `office`: it explores, is kidnapped,
+    localises itself in its map, drives to a goal given meanwhile, explores the rest and returns. This takes two and a
+    half minutes.
 
     The live page shows it while it runs. Exits with status 1 if the goal is not reached, or a step fails.
 

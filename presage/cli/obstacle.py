@@ -82,10 +82,10 @@ def list_(context: typer.Context) -> None:
 def _obstacles(context: typer.Context) -> list[Obstacle]:
     from common.messages.requests import Request, WorldReply
     from common.messages.topics import WORLD
-    from presage.live.bus_watch import session
+    from presage.live.latest_messages import session_bus
 
-    with session(chosen_link(context, OBSERVER)) as bus:
-        reply = bus.ask(WORLD, Request(), WorldReply)
+    with session_bus(chosen_link(context, OBSERVER)) as bus:
+        reply = bus.query(WORLD, Request(), WorldReply)
     if reply.world is None:
         raise UserError(f"refused: {reply.reason}")
     return list(reply.world.obstacles)
@@ -115,14 +115,14 @@ def _shape(x: float, y: float, size: tuple[float, float], yaw: float, radius: fl
 def _change(context: typer.Context, action: str, name: str, obstacle: Obstacle | None) -> None:
     from common.messages.requests import ObstacleRequest, Reply
     from common.messages.topics import OBSTACLE
-    from presage.live.bus_watch import session
+    from presage.live.latest_messages import session_bus
 
     try:
         request = ObstacleRequest.model_validate({"action": action, "name": name, "obstacle": obstacle})
     except ValidationError as error:
         raise UserError(f"obstacle {name!r}: {first_fault(error)}") from None
-    with session(chosen_link(context)) as bus:
-        reply = bus.ask(OBSTACLE, request, Reply)
+    with session_bus(chosen_link(context)) as bus:
+        reply = bus.query(OBSTACLE, request, Reply)
     if not reply.ok:
         raise UserError(f"refused: {reply.reason}")
     done = {"add": "added", "move": "moved", "remove": "removed"}[action]

@@ -10,14 +10,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from common.bus.bus import Link, open_bus, wait_until
-from common.bus.inbox import Answer, Inbox, Sample
+from common.bus.inbox import Inbox, RequestResult, Sample
 from common.messages.definitions import Health, Scan
 from common.messages.requests import ConfigReply, Request
 from common.messages.topics import CONFIG, TOPICS
 from common.messages.wire import DecodeError
 from common.runtime.liveness import RobotLiveness
 from presage.diagnosis.findings import Finding
-from services.recorder.files.message_counts import Sequence
+from services.recorder.files.message_counts import SequenceNumbers
 
 ZENOH_TIMEOUT_S = 3.0
 TCP_TIMEOUT_S = 2.0  # a port that does not answer within this time is taken to be blocked
@@ -35,7 +35,7 @@ class BusObservation:
     replies: dict[str, list[ConfigReply]] = field(default_factory=dict)  # by service; several if it runs several times
     health: dict[str, list[tuple[int, Health]]] = field(default_factory=dict)  # by service, with the time of arrival
     arrivals: Counter[str] = field(default_factory=Counter)  # number of messages, by key
-    sequences: dict[str, Sequence] = field(default_factory=dict)  # sequence numbers, by key with one publisher
+    sequences: dict[str, SequenceNumbers] = field(default_factory=dict)  # sequence numbers, by key with one publisher
     undecodable: dict[str, str] = field(default_factory=dict)  # first decoding error, by key
     scan: Scan | None = None  # the last one
 
@@ -75,7 +75,7 @@ def observe_bus(link: Link, seconds: float) -> BusObservation | list[Finding]:
             bus.subscribe(topic, inbox, keep_all=True)
         # A new zenoh session discovers the others one by one: measure from the first message on, or after 1 s.
         wait_until(lambda: len(inbox) > 0, 1.0)
-        query = bus.ask_each(CONFIG, Request(), answers, timeout=seconds)
+        query = bus.query_all(CONFIG, Request(), answers, timeout=seconds)
         _receive(inbox, tokens, observation)
         observation.robots = {robot for robot, _ in tokens.copy()}
         observation.liveness.set_alive(bus.alive(), seconds)
@@ -117,7 +117,7 @@ def _add_sample(sample: Sample, observation: BusObservation, now: float) -> None
         if isinstance(message, Scan) and sample.key == sample.topic.key(observation.robot):
             observation.scan = message
             observation.liveness.add_scan(now)
-        observation.sequences.setdefault(sample.key, Sequence()).see(message.seq)
+        observation.sequences.setdefault(sample.key, SequenceNumbers()).add(message.seq)
 
 
 def _add_replies(answers: Inbox, observation: BusObservation) -> None:
@@ -129,7 +129,7 @@ def _add_replies(answers: Inbox, observation: BusObservation) -> None:
     observation.replies = {service: list(replies.values()) for service, replies in by_service.items()}
 
 
-def _drain(inbox: Inbox) -> Iterator[Answer]:
+def _drain(inbox: Inbox) -> Iterator[RequestResult]:
     while (entry := inbox.get(0)) is not None:
-        if isinstance(entry, Answer):
+        if isinstance(entry, RequestResult):
             yield entry

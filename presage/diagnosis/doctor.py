@@ -18,8 +18,8 @@ from presage.diagnosis.bus_observation import BusObservation, observe_bus
 from presage.diagnosis.findings import Finding
 from presage.diagnosis.installation import check_installation
 from presage.diagnosis.machine import check_machine, find_stopped_processes
-from presage.diagnosis.rules import evaluate
-from presage.terminal.output import check_file, write_json
+from presage.diagnosis.rules import evaluate_observation
+from presage.terminal.output import check_file, printable, write_json
 
 MARKS = {True: "[green]ok[/]", False: "[bold red]no[/]", None: "[yellow]-[/]"}
 
@@ -30,7 +30,7 @@ def check_session(link: Link, seconds: float) -> Iterator[Finding]:
     if isinstance(observation, BusObservation):
         where = ", ".join(link.connect)
         yield Finding("no_router", True, f"session at {where}", where)
-        for finding in evaluate(observation, build_config_reply("doctor", "{}")):
+        for finding in evaluate_observation(observation, build_config_reply("doctor", "{}")):
             yield finding
             if finding.code == "missing" and not finding.ok:
                 yield from find_stopped_processes(finding.where)
@@ -47,7 +47,7 @@ def run_doctor(
         findings = [*check_installation(world), *check_machine(recordings), *check_session(link, seconds)]
     table = Table(show_header=False, box=None)
     for finding in findings:
-        table.add_row(MARKS[finding.ok], *(escape(_printable(text)) for text in (finding.what, finding.advice)))
+        table.add_row(MARKS[finding.ok], *(escape(printable(text)) for text in (finding.what, finding.advice)))
     console.print(table)
     local_versions = {"protocol": str(PROTOCOL), **versions()}
     console.print(
@@ -66,8 +66,3 @@ def run_doctor(
         },
     )
     return 1 if any(finding.ok is False for finding in findings) else 0
-
-
-def _printable(text: str) -> str:
-    """Removes control characters, which could change the state of the terminal, from text received on the bus."""
-    return "".join(c if c.isprintable() else "?" for c in text)

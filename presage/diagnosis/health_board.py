@@ -17,7 +17,7 @@ WATCHED = (HEALTH, SCAN, BELIEF, CMD_VEL)
 
 
 @dataclass(frozen=True)
-class Rate:
+class TopicRate:
     """The rate of one topic, as counted by one service."""
 
     topic: str
@@ -31,13 +31,13 @@ class Rate:
 
 
 @dataclass(frozen=True)
-class Row:
+class ServiceRow:
     """State of one service."""
 
     service: ServiceLiveness
     state: str  # a word for the user
-    published: tuple[Rate, ...] = ()
-    received: tuple[Rate, ...] = ()
+    published: tuple[TopicRate, ...] = ()
+    received: tuple[TopicRate, ...] = ()
     latency_ms: float | None = None  # between the publication of its input and of its output
     note: str = ""  # its problem and note; for an absent service, how to start it
 
@@ -72,22 +72,22 @@ class HealthBoard:
                 latencies = self._latencies.setdefault(service, deque(maxlen=LATENCY_WINDOW))
                 latencies.append(max(0.0, (published_ns - input_ns) * 1e-6))
 
-    def rows(self, now: float) -> list[Row]:
+    def rows(self, now: float) -> list[ServiceRow]:
         """One row for each service: first those that every session has, then the others by name."""
         return [self._row(service) for service in self.liveness.services(now)]
 
-    def _row(self, service: ServiceLiveness) -> Row:
+    def _row(self, service: ServiceLiveness) -> ServiceRow:
         if service.state == "absent":
             word = "gone" if service.since is not None else "missing" if service.problem else "not running"
             start = f"start it: {start_command(service.name, self.robot, self.connect)}"
-            return Row(service, word, note=start)
+            return ServiceRow(service, word, note=start)
         if service.state == "late":
-            return Row(service, "silent", note=service.text)
+            return ServiceRow(service, "silent", note=service.text)
         if service.health is None:
-            return Row(service, "alive" if service.reported else "starting", note=service.text)
+            return ServiceRow(service, "alive" if service.reported else "starting", note=service.text)
         rows = [(row, rate) for row in service.health.topics if (rate := self._rate(row.key, row.rate)) is not None]
         latencies = self._latencies.get(service.name)
-        return Row(
+        return ServiceRow(
             service,
             "alive",
             published=tuple(rate for row, rate in rows if row.published),
@@ -96,9 +96,9 @@ class HealthBoard:
             note=service.text,
         )
 
-    def _rate(self, key: str, hz: float) -> Rate | None:
+    def _rate(self, key: str, hz: float) -> TopicRate | None:
         """The rate of a topic in a health message; None for other keys and topics that need not be shown."""
         topic = topic_of(key)
         if topic is None or topic is HEALTH or (not topic.rate and not hz):
             return None
-        return Rate(topic.name, hz, expected_rate(topic, self._scan_time))
+        return TopicRate(topic.name, hz, expected_rate(topic, self._scan_time))

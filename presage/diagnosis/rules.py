@@ -22,7 +22,7 @@ MAX_DROPPED_SHARE = 0.1  # of the received messages; a service that drops more c
 MAY_SKIP_MESSAGES = {"viewer"}  # it shows only the newest messages
 
 
-def evaluate(observation: BusObservation, own_config: ConfigReply) -> Iterator[Finding]:
+def evaluate_observation(observation: BusObservation, own_config: ConfigReply) -> Iterator[Finding]:
     """Yields all findings about the services of one robot; ``own_config`` holds the versions of this program."""
     yield from _presence(observation)
     yield from _duplicates(observation)

@@ -15,8 +15,9 @@ from common.bus.inbox import Inbox, Sample
 from common.messages.definitions import Health
 from common.messages.topics import topic_of
 from common.messages.wire import DecodeError
-from presage.diagnosis.health_board import WATCHED, HealthBoard, Rate, Row
-from presage.live.bus_watch import session
+from presage.diagnosis.health_board import WATCHED, HealthBoard, ServiceRow, TopicRate
+from presage.live.latest_messages import session_bus
+from presage.terminal.output import printable
 
 REFRESH_PERIOD_S = 0.5
 LIVELINESS_TIMEOUT_S = 5.0  # for the router's list of tokens; it answers at once unless the machine is busy
@@ -52,7 +53,7 @@ def run_top(link: Link, robots: list[str], console: Console, *, once: bool) -> i
     if there is no session.
     """
     boards = {robot: HealthBoard(robot, link.connect_option) for robot in robots}
-    with session(link) as bus:
+    with session_bus(link) as bus:
         feed = BoardFeed(bus, boards)
         if once or not console.is_terminal:
             return _once(feed, console)
@@ -128,10 +129,10 @@ def _table(board: HealthBoard, now: float) -> Table:
     return table
 
 
-def _cells(row: Row) -> list[Text]:
+def _cells(row: ServiceRow) -> list[Text]:
     health, age = row.service.health, row.service.age
     return [
-        _plain(row.service.name),
+        Text(printable(row.service.name)),
         Text(row.state, COLOURS[row.state]),
         Text(f"{age:.1f} s" if age is not None else ""),
         Text(_duration(health.uptime) if health is not None else ""),
@@ -139,7 +140,7 @@ def _cells(row: Row) -> list[Text]:
         _rates(row.received),
         *_counts(health),
         Text(f"{row.latency_ms:.1f} ms" if row.latency_ms is not None else ""),
-        _plain(row.note),
+        Text(printable(row.note)),
     ]
 
 
@@ -152,12 +153,7 @@ def _counts(health: Health | None) -> list[Text]:
     return [Text(f"{count}", colour if count else "") for count, colour in counts]
 
 
-def _plain(text: str) -> Text:
-    """Removes control characters, which could change the state of the terminal, from text received on the bus."""
-    return Text("".join(c if c.isprintable() else "?" for c in text))
-
-
-def _rates(rates: tuple[Rate, ...]) -> Text:
+def _rates(rates: tuple[TopicRate, ...]) -> Text:
     words = [Text(f"{rate.topic} {rate.hz:.1f}", "yellow" if rate.slow else "") for rate in rates]
     return Text("  ").join(words)
 

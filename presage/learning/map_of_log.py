@@ -17,7 +17,7 @@ from common.geometry.se2 import Array
 from common.geometry.tum import write_tum
 from common.geometry.world import World, load_world
 from presage.learning.map_picture import draw_map
-from presage.learning.placement import place
+from presage.learning.placement import place_drive
 from presage.learning.pose_refinement import refine_poses
 from presage.learning.train_drive import TrainDriveOptions, drive_of, enough_scans, split, train_on_drive, usable_scans
 from presage.logs.log import Reading
@@ -151,7 +151,7 @@ def _build_poses(
     if unplaced:
         console.print(
             f"{unplaced:.1%} of the scans are left out: they contradict what was seen just before, and were not found "
-            "elsewhere in the map; the robot was carried off, or its view was blocked",
+            "elsewhere in the map; the robot was kidnapped, or its view was blocked",
             soft_wrap=True,
         )
     posed = drive_of(replace(scans, truth=built.poses), options.log)
@@ -165,7 +165,7 @@ def _build_poses(
     posed = replace(posed, poses=poses[used])
     keys = np.intersect1d(built.keys, used)
     with working(f"finding the drive in {rough.name}", progress):
-        placement = place(rough, posed.part(np.searchsorted(used, keys)), former)
+        placement = place_drive(rough, posed.part(np.searchsorted(used, keys)), former)
     console.print(
         f"{placement.found:.0%} of the key scans found in {rough.name}, with a median deviation of "
         f"{placement.deviation * 1e3:.0f} mm",

@@ -33,26 +33,28 @@ DRIFT, MODEL = np.array([0.003, 0.003, 0.001]), np.array([0.002, 0.002, 0.001])
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a drive is in a map."""
+    """The pose of a drive in a map."""
 
     poses: Array  # (N, 3) of the key scans in map
     found: float  # share of the key scans that the estimator found there
     deviation: float  # m, median distance between the poses found and those of the placed drive
 
 
-def place(world: World, keys: ReferenceDrive, model: Path | None = None) -> Placement:
-    """Where key scans, with poses in the frame of their drive, are in the map ``world``.
+def place_drive(world: World, keys: ReferenceDrive, model: Path | None = None) -> Placement:
+    """Finds the poses in the map ``world`` of key scans, whose poses in the frame of their drive are given.
 
-    The drive is moved as a whole. If the map has a ``model``, it is exact to some millimetres, and the drive is bent to
-    it as well. Raises UserError if too few key scans are found in the map at places that agree.
+    The drive is moved as a whole. If the map has a ``model``, which is exact to some millimetres, the drive is also
+    deformed to fit it. Raises UserError if too few key scans are found in the map at places that agree.
     """
     searched = np.arange(len(keys.poses))
     if model is None:
         searched = np.unique(np.linspace(0, len(keys.poses) - 1, MAX_KEYS).round().astype(int))
     found, covariances = _localise(world, keys.part(searched), model)
-    middle = np.array([*keys.poses[:, :2].mean(axis=0), 0.0])  # turned about it, a drive hardly moves
+    middle = np.array(
+        [*keys.poses[:, :2].mean(axis=0), 0.0]
+    )  # about which the drive is turned, so that it hardly moves
     local = se2.between(middle, keys.poses[searched])
-    origins = se2.compose(found, se2.inverse(local))  # the middle in map, according to each key scan
+    origins = se2.compose(found, se2.inverse(local))  # pose of the middle in map, according to each key scan
     agreeing = [_distance(se2.compose(origin, local), found) < SAME_M for origin in origins]
     best = int(np.argmax([np.count_nonzero(each) for each in agreeing]))
     share = float(agreeing[best].mean())
@@ -64,14 +66,14 @@ def place(world: World, keys: ReferenceDrive, model: Path | None = None) -> Plac
     origin = se2.compose(origins[best], np.median(off, axis=0))
     placed = se2.compose(origin, se2.between(middle, keys.poses))
     if model is not None:
-        placed = _bent(placed, found, covariances)
+        placed = _fit_to_found_poses(placed, found, covariances)
     elif world.grid is not None:
         placed = move_into_cells(world, replace(keys, poses=placed))
     return Placement(placed, share, float(np.median(_distance(placed[searched], found))))
 
 
-def _bent(placed: Array, found: Array, covariances: Array) -> Array:
-    """Poses (N, 3) of key scans by their relative poses and by those ``found`` in the map, some of which are wrong."""
+def _fit_to_found_poses(placed: Array, found: Array, covariances: Array) -> Array:
+    """Poses (N, 3) of key scans that fit both their relative poses and those ``found``, some of which are wrong."""
     drift = np.diag(1 / DRIFT**2)
     steps = se2.between(placed[:-1], placed[1:])
     links = [PoseLink(k + 1, k + 2, step, drift) for k, step in enumerate(steps)]
@@ -84,7 +86,7 @@ def _localise(world: World, keys: ReferenceDrive, model: Path | None) -> tuple[A
     """Poses (N, 3) of key scans in the map with covariances; some are wrong, at first and where much has changed."""
     if model is not None:
         options = EstimatorOptions(world, model=str(model))
-    else:  # In a learned field, oblique walls are no staircases, which would bias the headings.
+    else:  # a learned field, because the cells of oblique walls are staircases, which would bias the headings
         beams = simulated_beams(world, keys, enough_scans(world), seed=0)
         options = EstimatorOptions(world, generative_model=FieldModel(learn_field(beams, Recipe(0.05))))
     estimator = prepare(options)(Geometry(keys.angles, keys.mount, keys.range_max))

@@ -1,4 +1,4 @@
-"""Refines the poses of a drive: learns the field at them, finds the scans in it, and repeats.
+"""Refines the poses of a drive: learns the field from its scans, matches the scans to the field, and repeats.
 
 Mapping registers each scan to a few others. Here it is compared with all surfaces that any scan saw, so that errors
 which differ from scan to scan average out.
@@ -23,14 +23,14 @@ from services.mapper.slam.trajectory import distribute_corrections
 
 ROUNDS = 4
 RECIPE = Recipe(resolution=0.05, sweeps=1)
-PERIOD_S = 0.2  # between scans that are found in the field; those between them follow
-PRIOR = np.array([0.01, 0.01, 0.005])  # m, m, rad, standard deviations of a round's corrections
+PERIOD_S = 0.2  # between scans that are matched to the field; the poses between them are interpolated
+PRIOR = np.array([0.01, 0.01, 0.005])  # m, m, rad: standard deviations of the corrections in one round
 
 
 def refine_poses(drive: ReferenceDrive, report: Callable[[float], None]) -> Array:
-    """Poses (N, 3) of the scans of a drive whose poses are wrong by up to some centimetres; reports the share done.
+    """Refines the poses (N, 3) of a drive, which may be wrong by some centimetres; reports the share that is done.
 
-    In each round, a scan takes one Gauss-Newton step from where it was; its position along a plain wall stays.
+    In each round, the pose of a scan takes one Gauss-Newton step; its position along a plain wall hardly changes.
     """
     _, numbers = np.unique(np.round((drive.stamps - drive.stamps[0]) / PERIOD_S), return_index=True)
     part, likelihood = drive.part(numbers), Likelihood(estimate_noise(drive.ranges, drive.angles))
@@ -39,14 +39,14 @@ def refine_poses(drive: ReferenceDrive, report: Callable[[float], None]) -> Arra
         beams = Beams.of(part.poses, part.mount, part.angles, part.ranges)
         model = FieldModel(learn_field(beams, RECIPE), seen=seen_cells(beams))
         poses = [
-            _stepped(View(model, likelihood, part.mount, part.angles, ranges, part.range_max), pose)
+            _take_step(View(model, likelihood, part.mount, part.angles, ranges, part.range_max), pose)
             for pose, ranges in zip(part.poses, part.ranges, strict=True)
         ]
         part = replace(part, poses=np.array(poses))
     return distribute_corrections(drive.poses, numbers, part.poses, np.zeros(len(numbers), int))
 
 
-def _stepped(view: View, pose: Array) -> Array:
-    """The pose (3,) after a step to where the model explains the scan best."""
+def _take_step(view: View, pose: Array) -> Array:
+    """The pose (3,) after a step towards where the model explains the scan best."""
     evidence = view.evidence(pose[None])
     return np.asarray(pose + np.linalg.solve(evidence.curvature[0] + np.diag(PRIOR**-2.0), evidence.xi[0]))

@@ -50,7 +50,7 @@ def scanner_on_bus(
 def _is_suitable(bus: Bus, world: World, scanner: Scanner, console: Console) -> bool:
     """Whether the session has the wanted scanner and world; prints the result if there is a session."""
     try:
-        session = bus.ask(WORLD, Request(), WorldReply, timeout=1.0)
+        session = bus.query(WORLD, Request(), WorldReply, timeout=1.0)
     except UserError:
         return False
     if session.world is not None and same_walls(session.world, world) and session.scanner is not None:
@@ -81,7 +81,7 @@ def collect(
         request = SampleRequest(
             poses=block, beams=scanner.beams, noise=seed is not None, seed=(seed or 0) * 100_003 + number
         )
-        reply = bus.ask(SAMPLE, request, SampleReply, timeout=60.0)
+        reply = bus.query(SAMPLE, request, SampleReply, timeout=60.0)
         if not reply.ok or reply.scanner is None:
             raise UserError(f"the scanner refuses the request: {reply.reason or 'it sends no description of itself'}")
         if len(reply.ranges) != len(block) * scanner.beams:

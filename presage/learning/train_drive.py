@@ -29,7 +29,7 @@ from presage.logs.scan_files import Scans, read_scans
 from services.estimator.factory import Geometry
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.calibration import ReferenceDrive
-from services.estimator.precise.learning.drive_learning import MIN_SCANS, Learned, learn_drive, replay
+from services.estimator.precise.learning.drive_learning import MIN_SCANS, LearningResult, learn_drive, replay_model
 from services.estimator.precise.learning.field_learning import Recipe
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.generative_models import RayCaster
@@ -177,7 +177,7 @@ def simulated_beams(world: World, drive: ReferenceDrive, samples: int, seed: int
 def replayed_beams(former: Path, drive: ReferenceDrive, samples: int, seed: int) -> Beams:
     """Scans of the drive's scanner as a former model predicts them, at random places that it knows."""
     model, seeds, _ = weights.load(former)
-    return replay(model, seeds.places, drive, samples, seed)
+    return replay_model(model, seeds.places, drive, samples, seed)
 
 
 def scanner_of(drive: ReferenceDrive, sigma: float, name: str) -> Scanner:
@@ -187,7 +187,7 @@ def scanner_of(drive: ReferenceDrive, sigma: float, name: str) -> Scanner:
 
 
 def card_of(
-    options: TrainDriveOptions, world: World, drive: ReferenceDrive, learned: Learned, seconds: float
+    options: TrainDriveOptions, world: World, drive: ReferenceDrive, learned: LearningResult, seconds: float
 ) -> weights.FieldCard:
     """The model card: the origin of the model and the results of its calibration."""
     calibration, errors = learned.calibration, learned.errors

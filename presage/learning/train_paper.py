@@ -21,8 +21,8 @@ from common.versions import commit, versions
 from presage.learning.simulated_scans import collect, scanner_on_bus
 from services.estimator.paper import training, weights
 from services.estimator.paper.checkpoint import Checkpoint
-from services.estimator.paper.decoder import Normalisation, PaperModel, Shape
-from services.estimator.paper.training import Data, Trainer, TrainingParameters, usable_ranges
+from services.estimator.paper.decoder import DecoderShape, Normalisation, PaperModel
+from services.estimator.paper.training import Trainer, TrainingData, TrainingParameters, usable_ranges
 
 TEST_SAMPLES = 1000
 
@@ -68,7 +68,7 @@ def train(options: TrainPaperOptions, link: Link, console: Console) -> Path:
                 with scanner_on_bus(link, options.world, options.simulator_arguments, world, scanner, console) as bus:
                     noise_seed = options.parameters.seed if name == "train" else None  # test scans have no noise
                     ranges = collect(bus, poses, scanner, noise_seed, bar, f"{name} samples")
-                samples = Data(poses, usable_ranges(ranges, scanner.range_max))
+                samples = TrainingData(poses, usable_ranges(ranges, scanner.range_max))
                 checkpoint.keep_samples(name, samples)
             data[name] = samples
         trainer, seconds = _fit(options, world, scanner, data, checkpoint, bar)
@@ -87,12 +87,12 @@ def _fit(
     options: TrainPaperOptions,
     world: World,
     scanner: Scanner,
-    data: dict[str, Data],
+    data: dict[str, TrainingData],
     checkpoint: Checkpoint,
     bar: Progress,
 ) -> tuple[Trainer, float]:
     norm = Normalisation.of(world.bounds, float(data["train"].ranges.max()))
-    shape = Shape(scanner.beams, options.shape_hidden, options.shape_channels)
+    shape = DecoderShape(scanner.beams, options.shape_hidden, options.shape_channels)
     trainer = Trainer(shape, norm, options.parameters, data["train"], data["test"])
     if checkpoint.restore(trainer):
         bar.console.print(f"resuming an interrupted run after epoch {trainer.progress.epoch}")
@@ -108,7 +108,7 @@ def _fit(
     return trainer, time.monotonic() - start
 
 
-def _warn_if_nothing_learned(data: dict[str, Data], trainer: Trainer, console: Console) -> None:
+def _warn_if_nothing_learned(data: dict[str, TrainingData], trainer: Trainer, console: Console) -> None:
     """Prints a warning if the network predicts the same scan everywhere, as with ReLUs that are never active."""
     constant = float(np.abs(data["test"].ranges - np.median(data["train"].ranges, axis=0)).mean())
     if trainer.progress.test_l1[-1] > 0.9 * constant:
@@ -124,7 +124,7 @@ def _save(
     world: World,
     scanner: Scanner,
     heading: float,
-    data: dict[str, Data],
+    data: dict[str, TrainingData],
     trainer: Trainer,
     seconds: float,
     path: Path,

@@ -23,7 +23,7 @@ from presage.learning.simulated_scans import collect, scanner_on_bus
 from services.estimator.factory import MIN_SIGMA_M
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.learning import weights
-from services.estimator.precise.learning.evaluation import Quality, evaluate
+from services.estimator.precise.learning.evaluation import ModelErrors, evaluate_model
 from services.estimator.precise.learning.field_learning import (
     Recipe,
     learn_field,
@@ -95,18 +95,18 @@ def learn_and_save(
     The test scans have no noise. Returns the model card.
     """
     start = time.monotonic()
-    model, quality = _train(options, poses, scans, bar)
+    model, errors = _train(options, poses, scans, bar)
     seconds = time.monotonic() - start
     visited = se2.compose(poses["train"], np.array(options.scanner.mount))[:, :2]
     places = seed_places(model.field, visited)
-    card = _card(options, world, len(poses["train"]), model, quality, seconds)
+    card = _card(options, world, len(poses["train"]), model, errors, seconds)
     weights.save(path, model, places, card)
     return card
 
 
 def _train(
     options: TrainPreciseOptions, poses: dict[str, se2.Array], scans: dict[str, se2.Array], bar: Progress
-) -> tuple[FieldModel, Quality]:
+) -> tuple[FieldModel, ModelErrors]:
     scanner = options.scanner
     mount, angles = np.array(scanner.mount), scanner.angles()
     task: TaskID = bar.add_task("training", total=1.0)
@@ -124,7 +124,7 @@ def _train(
     scales = learn_scales(field, poses["test"][:half], mount, angles, scans["test"][:half], 0.0)
     ripple = measure_ripple(field, se2.compose(poses["test"][:half], mount), angles)
     model = FieldModel(field, scales, ripple)
-    quality = evaluate(
+    errors = evaluate_model(
         model,
         poses["test"][half:],
         mount,
@@ -135,11 +135,11 @@ def _train(
         scanner.sigma_relative,
     )
     bar.update(task, description="trained", completed=1.0)
-    return model, quality
+    return model, errors
 
 
 def _card(
-    options: TrainPreciseOptions, world: World, samples: int, model: FieldModel, quality: Quality, seconds: float
+    options: TrainPreciseOptions, world: World, samples: int, model: FieldModel, errors: ModelErrors, seconds: float
 ) -> weights.FieldCard:
     return weights.FieldCard(
         world=world,
@@ -150,12 +150,12 @@ def _card(
         origin=model.field.origin,
         sweeps=options.recipe.sweeps,
         ripple=model.ripple,
-        inflation=round(quality.inflation, 3),
+        inflation=round(errors.inflation, 3),
         test_samples=TEST_SAMPLES // 2,
-        test_range_error_median_m=quality.range_error_median,
-        test_range_error_mean_m=quality.range_error_mean,
-        test_share_above_5_cm=quality.share_above_5_cm,
-        test_position_error_rms_m=quality.position_error_rms,
+        test_range_error_median_m=errors.range_error_median,
+        test_range_error_mean_m=errors.range_error_mean,
+        test_share_above_5_cm=errors.share_above_5_cm,
+        test_position_error_rms_m=errors.position_error_rms,
         learning_s=round(seconds, 1),
         commit=commit(),
         command="presage " + " ".join(sys.argv[1:]),

@@ -27,7 +27,7 @@ from common.messages.requests import (
 )
 from common.messages.topics import GOAL, LOCALISE, QUERIES, SAVE_MAP, SAVE_MODEL, STATUS, TELEPORT, TOPICS, Topic
 from common.messages.wire import DecodeError, Message
-from presage.live.bus_watch import Watch, session
+from presage.live.latest_messages import LatestMessages, session_bus
 
 # Measured with the stamps of the messages. A person in the way usually moves on sooner.
 BLOCKED_TIMEOUT_S = 30.0
@@ -48,33 +48,33 @@ def topic_named(name: str) -> Topic:
 
 def send_goal(link: Link, goal: Goal, console: Console, *, wait: bool) -> int:
     """Sends or cancels a goal; returns 0 if it is accepted (with ``wait``: reached), else 1."""
-    with session(link) as bus:
-        watch = Watch(bus, STATUS)
+    with session_bus(link) as bus:
+        messages = LatestMessages(bus, STATUS)
         if not bus.wait_matching(GOAL, 3.0):
             raise UserError("no controller receives goals: is it running?")
-        status = watch.until(Status, lambda _: True, 3.0)
+        status = messages.wait_for(Status, lambda _: True, 3.0)
         if status is None:
             raise UserError(
                 "the controller publishes no status: does it receive beliefs? `presage doctor` finds the cause"
             )
         bus.put(GOAL, goal.model_copy(update={"stamp_ns": status.stamp_ns}).encode())
         if goal.cancel:
-            done = watch.until(Status, lambda s: s.state == "idle", 3.0)
+            done = messages.wait_for(Status, lambda s: s.state == "idle", 3.0)
             console.print("cancelled; the robot stops" if done else "sent, but not confirmed by the controller")
             return 0 if done else 1
-        if (status := watch.until(Status, lambda s: s.goal_seq == goal.seq, 3.0)) is None:
+        if (status := messages.wait_for(Status, lambda s: s.goal_seq == goal.seq, 3.0)) is None:
             raise UserError("the controller did not acknowledge the goal within 3 s")
         if status.state == "blocked":
             raise UserError(status.reason)
         console.print(f"going to ({goal.pose.x:g}, {goal.pose.y:g})")
-        return _follow(watch, goal, console) if wait else 0
+        return _follow(messages, goal, console) if wait else 0
 
 
-def _follow(watch: Watch, goal: Goal, console: Console) -> int:
+def _follow(messages: LatestMessages, goal: Goal, console: Console) -> int:
     """Waits until the goal is reached (returns 0), or refused or blocked for too long (returns 1)."""
     least_distance, blocked_ns, previous_ns = np.inf, 0, None
     with console.status("navigating") as line:
-        while (status := _next_status(watch, console)) is not None:
+        while (status := _next_status(messages, console)) is not None:
             if status.goal_seq != goal.seq:
                 raise UserError("the goal was replaced by another" if status.goal else "the goal was cancelled")
             to_go = f"{status.distance:.2f} m to go" if status.distance is not None else ""
@@ -90,21 +90,21 @@ def _follow(watch: Watch, goal: Goal, console: Console) -> int:
     raise UserError(f"the controller has published no status for {STATUS_TIMEOUT_S:g} s")
 
 
-def _next_status(watch: Watch, console: Console) -> Status | None:
+def _next_status(messages: LatestMessages, console: Console) -> Status | None:
     """Returns the next status, or None after a timeout.
 
     The timeout is long enough to restart the estimator meanwhile: without beliefs the controller publishes no status.
     """
-    if (status := watch.until(Status, lambda _: True, STATUS_WARNING_S)) is None:
+    if (status := messages.wait_for(Status, lambda _: True, STATUS_WARNING_S)) is None:
         console.print(f"the controller publishes no status; waiting up to {STATUS_TIMEOUT_S:g} s for it")
-        status = watch.until(Status, lambda _: True, STATUS_TIMEOUT_S - STATUS_WARNING_S)
+        status = messages.wait_for(Status, lambda _: True, STATUS_TIMEOUT_S - STATUS_WARNING_S)
     return status
 
 
 def teleport(link: Link, pose: Pose, console: Console) -> None:
     """Moves the simulated robot; raises UserError with the reason if the simulator refuses."""
-    with session(link) as bus:
-        reply = bus.ask(TELEPORT, PoseRequest(pose=pose), Reply)
+    with session_bus(link) as bus:
+        reply = bus.query(TELEPORT, PoseRequest(pose=pose), Reply)
     if not reply.ok:
         raise UserError(f"refused: {reply.reason}")
     console.print(
@@ -140,7 +140,7 @@ def list_topics(robot: str, console: Console) -> None:
 
 def measure_rates(link: Link, topics: tuple[Topic, ...], seconds: float) -> dict[str, list[int]]:
     """Receives ``topics`` for ``seconds`` s; returns the arrival times (ns of wall time) by key."""
-    with session(link) as bus:
+    with session_bus(link) as bus:
         inbox, times = Inbox(), defaultdict(list)
         for topic in topics:
             bus.subscribe(topic, inbox, keep_all=True)
@@ -201,7 +201,7 @@ def echo(link: Link, name: str, count: int, console: Console, *, full: bool) -> 
     Raises UserError if no first message comes within 5 s.
     """
     topic, printed = topic_named(name), 0
-    with session(link) as bus:
+    with session_bus(link) as bus:
         inbox = Inbox()
         bus.subscribe(topic, inbox, keep_all=True)
         while not count or printed < count:
@@ -223,8 +223,8 @@ def echo(link: Link, name: str, count: int, console: Console, *, full: bool) -> 
 
 def relocalise(link: Link, pose: Pose | None, console: Console, *, heading_known: bool = True) -> None:
     """Resets the estimator's belief; raises UserError with the reason if the estimator refuses."""
-    with session(link) as bus:
-        reply = bus.ask(LOCALISE, LocaliseRequest(pose=pose, heading_known=heading_known), Reply)
+    with session_bus(link) as bus:
+        reply = bus.query(LOCALISE, LocaliseRequest(pose=pose, heading_known=heading_known), Reply)
     if not reply.ok:
         raise UserError(f"refused: {reply.reason}")
     console.print("localising again " + (f"from ({pose.x:g}, {pose.y:g})" if pose else "from the initial pose"))
@@ -232,11 +232,11 @@ def relocalise(link: Link, pose: Pose | None, console: Console, *, heading_known
 
 def save_map(link: Link, name: str, console: Console) -> None:
     """Has the mapper write its map into files; raises UserError with the reason if it cannot."""
-    with session(link) as bus:
+    with session_bus(link) as bus:
         # A session that has just opened does not know the services yet.
         if not wait_until(lambda: SAVE_MAP.server in bus.alive(), DISCOVERY_TIMEOUT_S):
             raise UserError("no mapper is running: start one with `presage up --mapping`, and drive")
-        reply = bus.ask(SAVE_MAP, SaveMapRequest(name=name), SaveMapReply, SAVE_TIMEOUT_S)
+        reply = bus.query(SAVE_MAP, SaveMapRequest(name=name), SaveMapReply, SAVE_TIMEOUT_S)
     if not reply.ok:
         raise UserError(f"not saved: {reply.reason}")
     console.print(f"saved: {reply.file}. Before `presage up --world`, learn its model:", soft_wrap=True)
@@ -245,8 +245,8 @@ def save_map(link: Link, name: str, console: Console) -> None:
 
 def save_model(link: Link, name: str, console: Console) -> None:
     """Has the estimator write what it learned while driving; raises UserError with the reason if it cannot."""
-    with session(link) as bus:
-        reply = bus.ask(SAVE_MODEL, SaveModelRequest(name=name), SaveModelReply, SAVE_TIMEOUT_S)
+    with session_bus(link) as bus:
+        reply = bus.query(SAVE_MODEL, SaveModelRequest(name=name), SaveModelReply, SAVE_TIMEOUT_S)
     if not reply.ok:
         raise UserError(f"not saved: {reply.reason}")
     console.print(f"saved version {reply.version}: {reply.file}. Use it with the same world:", soft_wrap=True)

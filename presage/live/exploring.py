@@ -10,7 +10,7 @@ from common.bus.bus import Link
 from common.errors import UserError
 from common.messages.definitions import Exploration, Goal, Pose, Status
 from common.messages.topics import GOAL, STATUS
-from presage.live.bus_watch import Watch, session
+from presage.live.latest_messages import LatestMessages, session_bus
 
 ANSWER_TIMEOUT_S = 3.0
 STATUS_TIMEOUT_S = 30.0  # long enough to restart the mapper meanwhile
@@ -18,22 +18,22 @@ STATUS_TIMEOUT_S = 30.0  # long enough to restart the mapper meanwhile
 
 def explore(link: Link, console: Console) -> int:
     """Explores until everything that can be reached is mapped; returns 0 then, and 1 if the robot cannot get back."""
-    with session(link) as bus:
-        watch = Watch(bus, STATUS)
+    with session_bus(link) as bus:
+        messages = LatestMessages(bus, STATUS)
         if not bus.wait_matching(GOAL, ANSWER_TIMEOUT_S):
             raise UserError("no controller is running: start one with `presage up --mapping`")
         request = Goal(stamp_ns=0, seq=time.time_ns(), pose=Pose(x=0.0, y=0.0), explore=True)
         try:
             bus.put(GOAL, request.encode())
-            return _follow(watch, request.seq, console)
+            return _follow(messages, request.seq, console)
         except KeyboardInterrupt:
-            _stop(watch, request)
+            _stop(messages, request)
             console.print("stopped; `presage save-map NAME` saves the map so far")
             raise
 
 
-def _follow(watch: Watch, seq: int, console: Console) -> int:
-    status = watch.until(Status, lambda s: _progress(s, seq) is not None or s.goal_seq == seq, ANSWER_TIMEOUT_S)
+def _follow(messages: LatestMessages, seq: int, console: Console) -> int:
+    status = messages.wait_for(Status, lambda s: _progress(s, seq) is not None or s.goal_seq == seq, ANSWER_TIMEOUT_S)
     if status is None:
         raise UserError("the controller did not begin to explore within 3 s: `presage doctor` finds the cause")
     began_ns = status.stamp_ns
@@ -54,7 +54,7 @@ def _follow(watch: Watch, seq: int, console: Console) -> int:
             if progress.phase == "failed":
                 console.print(f"the robot cannot return to where it began: {status.reason}; {so_far}")
                 return 1
-            status = watch.until(Status, lambda _: True, STATUS_TIMEOUT_S)
+            status = messages.wait_for(Status, lambda _: True, STATUS_TIMEOUT_S)
     raise UserError(f"the controller has published no status for {STATUS_TIMEOUT_S:g} s")
 
 
@@ -63,7 +63,7 @@ def _progress(status: Status, seq: int) -> Exploration | None:
     return status.exploration if status.exploration is not None and status.exploration.seq == seq else None
 
 
-def _stop(watch: Watch, request: Goal) -> None:
+def _stop(messages: LatestMessages, request: Goal) -> None:
     """Ends the exploration, and waits until the controller confirms it."""
-    watch.bus.put(GOAL, request.model_copy(update={"cancel": True}).encode())
-    watch.until(Status, lambda status: status.exploration is None and status.state == "idle", ANSWER_TIMEOUT_S)
+    messages.bus.put(GOAL, request.model_copy(update={"cancel": True}).encode())
+    messages.wait_for(Status, lambda status: status.exploration is None and status.state == "idle", ANSWER_TIMEOUT_S)

@@ -47,7 +47,7 @@ LMS_FAR_RANGE_MAX, LMS_NEAR_RANGE_MAX = 80.0, 8.18
 LMS_NEAR_CODES = (8.18, 8.192)
 # What headers state as maximum range of such a laser: its limit, or its highest code, in the near and the far mode.
 LMS_STATED_RANGES = ((8.18, 8.2), (LMS_FAR_RANGE_MAX, 82.0))
-SURVEYED_SCANS = 100  # scans of each laser from which the maximum range and the clock are determined
+FIRST_PASS_SCANS = 100  # scans of each laser from which the maximum range and the clock are determined
 # CARMEN's parameters describe a front and a rear laser; there are none of LASER3 and up.
 FRONT = ("FLASER", "ROBOTLASER1", "RAWLASER1")
 REAR = ("RLASER", "ROBOTLASER2", "RAWLASER2")
@@ -55,8 +55,8 @@ POSE_LINES = ("ODOM", "TRUEPOS")
 
 
 @dataclass
-class _Survey:
-    """What the first pass over the file finds."""
+class _FirstPass:
+    """The results of the first pass over the file."""
 
     params: dict[str, str] = field(default_factory=dict)
     lasers: Counter[str] = field(default_factory=Counter)  # lines by name
@@ -70,35 +70,35 @@ class _Survey:
 
 def open_carmen(path: Path, reading: Reading) -> Log:
     """Opens a CARMEN log; raises UserError if it has no usable scans or an option does not fit it."""
-    survey = _survey(path)
-    if not survey.lasers:
+    first_pass = _read_first_pass(path)
+    if not first_pass.lasers:
         raise UserError(f"{path}: a CARMEN log without a scan (no FLASER, ROBOTLASER1, RAWLASER1 lines)")
-    name = _choose_laser(path, survey.lasers, reading.scan_topic)
-    if reading.odom_topic and (reading.odom_topic != "ODOM" or not len(survey.odom[0])):
-        available = "ODOM lines" if len(survey.odom[0]) else "no ODOM lines"
+    name = _choose_laser(path, first_pass.lasers, reading.scan_topic)
+    if reading.odom_topic and (reading.odom_topic != "ODOM" or not len(first_pass.odom[0])):
+        available = "ODOM lines" if len(first_pass.odom[0]) else "no ODOM lines"
         raise UserError(
             f"{path}: odom_topic {reading.odom_topic}: a CARMEN log can only have ODOM, and this one has {available}"
         )
-    if not survey.firsts.get(name):
+    if not first_pass.firsts.get(name):
         raise UserError(f"{path}: every {name} line is malformed")
     notes: list[str] = []
-    first = survey.firsts[name][0]
-    angles, range_max = _angles(path, name, first, reading, notes), _range_max(survey, name, reading, notes)
-    clock = _clock(survey.firsts[name], reading, notes)
-    mount, corrected, assumed = _mount(survey, name, reading, notes)
+    first = first_pass.firsts[name][0]
+    angles, range_max = _angles(path, name, first, reading, notes), _range_max(first_pass, name, reading, notes)
+    clock = _clock(first_pass.firsts[name], reading, notes)
+    mount, corrected, assumed = _mount(first_pass, name, reading, notes)
     log = Log(
         path,
         f"CARMEN log ({name})",
         angles,
         mount,
         range_max,
-        survey.lasers[name],
+        first_pass.lasers[name],
         lambda: iter(()),
         notes=notes,
         mount_assumed=assumed,
     )
-    odom = survey.odom[clock] if first.robot is None or reading.odom_topic == "ODOM" else None
-    true = survey.true[clock] if len(survey.true[clock]) and reading.reference is not False else None
+    odom = first_pass.odom[clock] if first.robot is None or reading.odom_topic == "ODOM" else None
+    true = first_pass.true[clock] if len(first_pass.true[clock]) and reading.reference is not False else None
     if odom is None or len(odom):
         log.odometry = f"{name}'s robot pose" if odom is None else "ODOM, interpolated"
     if true is not None:
@@ -142,9 +142,9 @@ def _angles(path: Path, name: str, first: LaserLine, reading: Reading, notes: li
     return np.deg2rad(np.linspace(first_deg, last_deg, count))
 
 
-def _range_max(survey: _Survey, name: str, reading: Reading, notes: list[str]) -> float:
+def _range_max(first_pass: _FirstPass, name: str, reading: Reading, notes: list[str]) -> float:
     """Range from which on there is no return, m: from the setting, the line's header, a PARAM line, or of an LMS."""
-    lines = survey.firsts[name]
+    lines = first_pass.firsts[name]
     if reading.range_max is not None:
         return reading.range_max
     longest = max(float(np.max(line.ranges)) for line in lines)
@@ -155,7 +155,7 @@ def _range_max(survey: _Survey, name: str, reading: Reading, notes: list[str]) -
             return header.range_max
         range_max, stated = LMS_NEAR_RANGE_MAX if near or near_codes else LMS_FAR_RANGE_MAX, header.range_max
     else:
-        param = survey.params.get(f"robot_{_side(name)}_laser_max", "")
+        param = first_pass.params.get(f"robot_{_side(name)}_laser_max", "")
         try:
             stated = float(param)
         except ValueError:
@@ -178,14 +178,14 @@ def _clock(lines: list[LaserLine], reading: Reading, notes: list[str]) -> int:
     return 0
 
 
-def _mount(survey: _Survey, name: str, reading: Reading, notes: list[str]) -> tuple[Array, bool, bool]:
+def _mount(first_pass: _FirstPass, name: str, reading: Reading, notes: list[str]) -> tuple[Array, bool, bool]:
     """Returns the laser in base_link (3,), whether the laser's poses were corrected, and whether the mount is assumed.
 
     The poses were corrected by a mapping program if their offset from the odometry is not constant.
     """
-    low, high = survey.mounts.get(name, (np.zeros(3), np.full(3, np.inf)))
+    low, high = first_pass.mounts.get(name, (np.zeros(3), np.full(3, np.inf)))
     fixed = bool((high - low <= 2 * MOUNT_TOLERANCE).all())
-    corrected = name in survey.mounts and not fixed
+    corrected = name in first_pass.mounts and not fixed
     if reading.mount is not None:
         return reading.mount, corrected, False
     if fixed:
@@ -193,14 +193,14 @@ def _mount(survey: _Survey, name: str, reading: Reading, notes: list[str]) -> tu
     side = _side(name)
     names = [f"robot_{side}laser_{part}" for part in ("offset", "side_offset", "angular_offset")]
     try:
-        mount = np.array([float(survey.params.get(each, 0)) if side else 0.0 for each in names])
+        mount = np.array([float(first_pass.params.get(each, 0)) if side else 0.0 for each in names])
     except ValueError:
         mount = np.zeros(3)
     if side == "rear":
         mount[2] += np.pi
     text = ",".join(f"{number:g}" for number in (*mount[:2], np.rad2deg(mount[2])))
     notes.append(f"assumed: the laser is mounted at {text} in base_link (change with --mount)")
-    return mount, corrected, not survey.params.keys() & set(names)
+    return mount, corrected, not first_pass.params.keys() & set(names)
 
 
 def _side(name: str) -> str:
@@ -208,38 +208,38 @@ def _side(name: str) -> str:
     return "front" if name in FRONT else "rear" if name in REAR else ""
 
 
-def _survey(path: Path) -> _Survey:
+def _read_first_pass(path: Path) -> _FirstPass:
     """Reads the whole file once for parameters, poses, and the first scans of each laser."""
-    survey = _Survey()
+    first_pass = _FirstPass()
     for words in _read_words(path):
         try:
             if words[0] == "PARAM" and len(words) > 2:
-                survey.params[words[1]] = words[2]
+                first_pass.params[words[1]] = words[2]
             elif words[0] in POSE_LINES:
                 pose, *times = pose_line(words)
-                for track, time in zip(survey.odom if words[0] == "ODOM" else survey.true, times, strict=True):
+                for track, time in zip(first_pass.odom if words[0] == "ODOM" else first_pass.true, times, strict=True):
                     track.add(round(time * 1e9), pose)
             elif is_laser(words[0]):
-                survey.lasers[words[0]] += 1
-                _note_laser(survey, words)
+                first_pass.lasers[words[0]] += 1
+                _note_laser(first_pass, words)
         except (ValueError, IndexError):  # malformed lines are counted when the scans are read
             continue
-    return survey
+    return first_pass
 
 
-def _note_laser(survey: _Survey, words: list[str]) -> None:
+def _note_laser(first_pass: _FirstPass, words: list[str]) -> None:
     name = words[0]
-    firsts = survey.firsts.setdefault(name, [])
-    keep = len(firsts) < SURVEYED_SCANS
+    firsts = first_pass.firsts.setdefault(name, [])
+    keep = len(firsts) < FIRST_PASS_SCANS
     line = laser_line(words, ranges=keep)
     if keep:
         firsts.append(line)
     if line.laser is not None and line.robot is not None:
         mount = se2.between(line.robot, line.laser)
-        low, high = survey.mounts.get(name, (mount, mount))
+        low, high = first_pass.mounts.get(name, (mount, mount))
         unwrapped_yaw = low[2] + se2.wrap(mount[2] - low[2])  # the yaw of a rear scanner is near both pi and -pi
         mount = np.array([*mount[:2], unwrapped_yaw])
-        survey.mounts[name] = np.minimum(low, mount), np.maximum(high, mount)
+        first_pass.mounts[name] = np.minimum(low, mount), np.maximum(high, mount)
 
 
 def _read_scans(

@@ -16,7 +16,7 @@ FIXED_TOLERANCE = 0.01  # m and rad; a frame that changes more moves against its
 
 
 @dataclass(eq=False)
-class Edge:
+class TransformHistory:
     """A frame in its parent over time."""
 
     parent: str
@@ -34,7 +34,7 @@ class FrameHistory:
     """The transforms of tf and tf_static over the whole log."""
 
     def __init__(self) -> None:
-        self._edges: dict[str, Edge] = {}
+        self._edges: dict[str, TransformHistory] = {}
 
     def __contains__(self, frame: str) -> bool:
         return frame in self._edges or any(edge.parent == frame for edge in self._edges.values())
@@ -46,12 +46,12 @@ class FrameHistory:
             return
         edge = self._edges.get(child)
         if edge is None or edge.parent != parent:
-            edge = self._edges[child] = Edge(parent, transform)
+            edge = self._edges[child] = TransformHistory(parent, transform)
         edge.add(stamp_ns, transform)
 
-    def chain(self, parent: str, child: str) -> list[Edge] | None:
+    def chain(self, parent: str, child: str) -> list[TransformHistory] | None:
         """The edges from ``parent`` down to ``child``; None if ``child`` is not a descendant of ``parent``."""
-        found: list[Edge] = []
+        found: list[TransformHistory] = []
         while child != parent:
             edge = self._edges.get(child)
             if edge is None or edge in found:
@@ -60,7 +60,7 @@ class FrameHistory:
             child = edge.parent
         return found
 
-    def at(self, chain: list[Edge], stamp_ns: int) -> Array | None:
+    def at(self, chain: list[TransformHistory], stamp_ns: int) -> Array | None:
         """Planar pose (3,) of the last frame of a chain in its first; None if a transform is unknown at that time."""
         pose = np.zeros(3)
         for edge in chain:

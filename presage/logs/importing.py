@@ -30,7 +30,7 @@ from presage.logs.opening import IS_A_RECORDING, kind_of, open_log
 from presage.terminal.output import check_file, write_json
 from presage.terminal.progress import progress, working
 from services.estimator.factory import DEFAULT_SIGMA_M
-from services.recorder.files.message_counts import Ledger, as_metadata
+from services.recorder.files.message_counts import MessageCounts, as_metadata
 from services.recorder.files.writer import RecordingWriter
 from services.recorder.recording import write_description
 
@@ -103,7 +103,7 @@ class ImportCounts:
     references: int = 0
     first_ns: int | None = None
     last_ns: int = 0
-    ledger: Ledger = field(default_factory=Ledger)
+    message_counts: MessageCounts = field(default_factory=MessageCounts)
 
     def facts(self, options: ImportOptions, log: Log) -> dict[str, Any]:
         """Facts about the import, for --json and the metadata of the recording."""
@@ -157,8 +157,8 @@ def write_recording(
             message_writer.write_scan(stamp_ns, logged, template)
         facts = written.facts(options, log)
         writer.metadata("log", {k: v if isinstance(v, str) else json.dumps(v) for k, v in facts.items()})
-        counts = written.ledger.written
-        writer.metadata("counters", as_metadata(written.ledger.counts(counts, {}, {})))
+        counts = written.message_counts.written
+        writer.metadata("counters", as_metadata(written.message_counts.counts(counts, {}, {})))
         writer.finish()
     except BaseException as error:
         writer.finish().unlink(missing_ok=True)
@@ -250,7 +250,7 @@ class _MessageWriter:
     def _put(self, topic: Topic, message: Stamped, at_ns: int) -> None:
         key, payload = topic.key(self._robot), message.encode()
         self._writer.write(topic, key, payload, at_ns, at_ns)
-        self._written.ledger.see(key, payload)
+        self._written.message_counts.add(key, payload)
 
 
 def _lines(options: ImportOptions, log: Log, facts: dict[str, Any]) -> list[str]:

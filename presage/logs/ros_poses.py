@@ -27,7 +27,7 @@ def no_poses(_: int) -> Array | None:
     return None
 
 
-class Poses:
+class BagPoses:
     """All poses and transforms of a bag, in memory; 32 bytes for each pose."""
 
     def __init__(self, *, by_logger: bool) -> None:

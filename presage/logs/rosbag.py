@@ -21,7 +21,7 @@ from common.robot.ranges import normalise_driver_ranges
 from presage.logs.frame_history import FrameHistory
 from presage.logs.log import Log, LoggedScan, Reading
 from presage.logs.resampling import resample
-from presage.logs.ros_poses import Lookup, Poses
+from presage.logs.ros_poses import BagPoses, Lookup
 
 SCAN = "sensor_msgs/msg/LaserScan"
 ODOM = "nav_msgs/msg/Odometry"
@@ -87,7 +87,7 @@ def open_rosbag(path: Path, kind: Literal["ros1", "ros2"], reading: Reading) -> 
         by_logger = reading.clock == "logger" or not stamp_of(first.header)
         if by_logger and reading.clock == "sensor":
             notes.append("the scans have no stamps: the times of logging are used")
-        poses = Poses(by_logger=by_logger)
+        poses = BagPoses(by_logger=by_logger)
         for topic, logged_ns, message in bag.messages(reader, [*topics.odom, *topics.tf, *topics.reference]):
             poses.add(topic, logged_ns, message)
         scans = sum(connection.msgcount for connection in topics.scan)

@@ -92,7 +92,7 @@ def _element(get: Callable[[Any], Any], index: tuple[int, ...], message: Any) ->
         return None
 
 
-class Tables:
+class CsvTables:
     """The CSV files in a folder; each is opened when its first row comes."""
 
     def __init__(self, folder: Path, stack: ExitStack, *, force: bool) -> None:
@@ -126,7 +126,7 @@ class _TopicLayout:
         self.lists = {name: columns_of(get_args(kind)[0]) for name, kind in kinds if get_origin(kind) is list}
         self.maps = [name for name, kind in kinds if get_origin(kind) is dict]
 
-    def write(self, tables: Tables, message: Any, times: list[Value], *, arrays: bool) -> None:
+    def write(self, tables: CsvTables, message: Any, times: list[Value], *, arrays: bool) -> None:
         """Adds the rows of one message."""
         header = [*TIMES, *(column.name for column in self.columns)]
         tables.add(self.name, header, [*times, *(column.read(message) for column in self.columns)])
@@ -165,7 +165,7 @@ def export_csv(
     layouts = {topic.name: _TopicLayout(topic) for topic in dict.fromkeys(keys.values())}
     counts = recording.counts()
     with ExitStack() as stack:
-        tables = Tables(folder, stack, force=force)
+        tables = CsvTables(folder, stack, force=force)
         messages = with_progress(entries(recording, name), sum(counts[key] for key in keys), "csv", console)
         for topic, message, raw in messages:
             layouts[topic.name].write(tables, message, [raw.logged_ns, raw.published_ns], arrays=arrays)

@@ -31,7 +31,7 @@ from services.recorder.reader import Recording
 CLOCK = "wall clock of the recording; a stamp's time is when its first sensor message was recorded"
 
 
-class Channels:
+class ChannelWriter:
     """Writes messages to the file; registers each channel when its first message comes."""
 
     def __init__(self, writer: Writer) -> None:
@@ -105,7 +105,7 @@ def _write(recording: Recording, robot: str, writer: Writer, console: Console) -
     for title, data in recording.attachments.items():
         if title.endswith(".yaml"):
             writer.add_attachment(recording.start_ns, recording.start_ns, title, "application/yaml", data)
-    channels = Channels(writer)
+    channels = ChannelWriter(writer)
     believed, true = _paths(recording, robot, console)
     for converted in static_messages(recording.world(), recording.robot(), believed, true, recording.start_ns):
         channels.write(converted)

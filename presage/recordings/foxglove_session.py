@@ -47,7 +47,7 @@ from common.messages.topics import Topic
 from common.robot.base import Robot
 from presage.recordings import foxglove_shapes as shapes
 from presage.recordings import plain_numbers as numbers
-from services.recorder.reader import Raw
+from services.recorder.reader import RawMessage
 
 MAX_REMEMBERED_STAMPS = 4096  # far more than the delay between a scan and its belief
 WARNING_STATES = {"lost", "blocked"}
@@ -133,7 +133,7 @@ class SessionConverter:
             LearnedField: self._learned_field,
         }
 
-    def convert(self, topic: Topic, message: Stamped, raw: Raw) -> Iterator[FoxgloveMessage]:
+    def convert(self, topic: Topic, message: Stamped, raw: RawMessage) -> Iterator[FoxgloveMessage]:
         """Yields the Foxglove messages for one message; counts messages of unsupported topics in `left_out`."""
         converter = self._converters.get(type(message))
         if converter is None:

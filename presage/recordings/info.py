@@ -11,7 +11,7 @@ from common.messages.definitions import Health
 from common.messages.topics import topic_of
 from common.messages.wire import DecodeError
 from presage.recordings.selection import robots_of
-from services.recorder.files.message_counts import Ledger, from_metadata, is_numbered
+from services.recorder.files.message_counts import MessageCounts, from_metadata, is_numbered
 from services.recorder.reader import Recording
 
 MAX_CHECKED_BYTES = 64 << 20  # by default, files up to this size are checked, which takes a second or two
@@ -35,7 +35,7 @@ class TopicFacts:
 
 
 @dataclass
-class Facts:
+class RecordingFacts:
     """Facts about a recording."""
 
     file: str
@@ -68,7 +68,7 @@ class _PayloadCheck:
     """Reads all payloads of a recording and counts what is in them."""
 
     def __init__(self) -> None:
-        self.ledger = Ledger()
+        self.message_counts = MessageCounts()
         self.bytes: Counter[str] = Counter()
         self.undecodable: Counter[str] = Counter()
         self.first: dict[str, int] = {}  # by key: time of the first message, ns of wall time
@@ -77,7 +77,7 @@ class _PayloadCheck:
 
     def read(self, recording: Recording) -> None:
         for raw in recording.payloads():
-            self.ledger.see(raw.key, raw.payload)
+            self.message_counts.add(raw.key, raw.payload)
             self.bytes[raw.key] += len(raw.payload)
             self.first.setdefault(raw.key, raw.logged_ns)
             self.last[raw.key] = raw.logged_ns
@@ -101,7 +101,7 @@ class _PayloadCheck:
         return dict(+dropped)
 
 
-def survey(recording: Recording, check: bool | None = None) -> Facts:
+def collect_facts(recording: Recording, check: bool | None = None) -> RecordingFacts:
     """Collects facts about a recording; ``check`` reads all of it, and defaults to True for small files."""
     size = recording.path.stat().st_size
     checked = None
@@ -111,7 +111,7 @@ def survey(recording: Recording, check: bool | None = None) -> Facts:
         recording.verify()
     about = recording.metadata.get("presage", {})
     world = recording.world()
-    return Facts(
+    return RecordingFacts(
         file=str(recording.path),
         file_bytes=size,
         complete=recording.complete,
@@ -155,8 +155,8 @@ def _replace_by_checked(facts: TopicFacts, checked: _PayloadCheck) -> None:
     key = facts.key
     facts.bytes, facts.undecodable = checked.bytes[key], checked.undecodable[key]
     span = (checked.last.get(key, 0) - checked.first.get(key, 0)) * 1e-9
-    facts.rate_hz = (checked.ledger.written[key] - 1) / span if span > 0 else None
+    facts.rate_hz = (checked.message_counts.written[key] - 1) / span if span > 0 else None
     if is_numbered(key):
-        numbers = checked.ledger.lost(key)
+        numbers = checked.message_counts.lost(key)
         facts.gaps, facts.missing, facts.restarts = numbers.gaps, numbers.missing, numbers.restarts
         facts.reordered = numbers.reordered

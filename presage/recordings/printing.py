@@ -16,7 +16,7 @@ from common.errors import UserError
 from common.messages.topics import TOPICS, topic_of
 from common.messages.wire import DecodeError
 from presage.live.commands import echo, to_plain_values, topic_named
-from presage.recordings.info import Facts, survey
+from presage.recordings.info import RecordingFacts, collect_facts
 from presage.terminal.output import check_file, write_json
 from services.recorder.reader import Recording, read_recording
 
@@ -28,7 +28,7 @@ def info(file: Path, json_file: Path | None, check: bool | None, console: Consol
     check_file(json_file, "--json")
     recording = read_recording(file)
     with console.status("reading"):
-        facts = survey(recording, check)
+        facts = collect_facts(recording, check)
     _print_head(facts, recording, console)
     console.print(_table(facts))
     if facts.dropped_by_services:
@@ -48,7 +48,7 @@ def info(file: Path, json_file: Path | None, check: bool | None, console: Consol
     return 0 if facts.complete and not facts.missing else 1
 
 
-def _print_head(facts: Facts, recording: Recording, console: Console) -> None:
+def _print_head(facts: RecordingFacts, recording: Recording, console: Console) -> None:
     state = f"readable, but {facts.missing} messages are missing" if facts.missing else "complete"
     state += ", all checksums are correct" if facts.checked else ", according to its index"
     if (recovered := recording.metadata.get("recovered")) is not None:
@@ -70,7 +70,7 @@ def _print_head(facts: Facts, recording: Recording, console: Console) -> None:
         console.print(escape(facts.warning), style="yellow", highlight=False, soft_wrap=True)
 
 
-def _table(facts: Facts) -> Table:
+def _table(facts: RecordingFacts) -> Table:
     table = Table()
     table.add_column("key", no_wrap=True)
     columns = ("messages", "Hz", "bytes", "gaps", "missing", "restarts", "dropped", "undecodable")

@@ -11,9 +11,9 @@ from rich.progress import track
 from common.errors import UserError
 from common.messages.definitions import Stamped
 from common.messages.topics import Topic
-from services.recorder.reader import Raw, Recording
+from services.recorder.reader import RawMessage, Recording
 
-Entry = tuple[Topic, Stamped, Raw]
+Entry = tuple[Topic, Stamped, RawMessage]
 
 
 def robots_of(recording: Recording) -> list[str]:

@@ -113,10 +113,10 @@ def summary_of(session: RecordedSession) -> SessionSummary:
         goal_distance_m=_distance(path[-1:], goal),
         goal_distance_believed_m=_distance(session.belief.poses[-1:], goal),
         position_error_m=_last(errors),
-        position_error_median_m=_reduce(np.median, localised),
-        position_error_max_m=_reduce(np.max, localised),
-        position_error_navigating_median_m=_reduce(np.median, navigating),
-        position_error_navigating_max_m=_reduce(np.max, navigating),
+        position_error_median_m=statistic_of_finite(np.median, localised),
+        position_error_max_m=statistic_of_finite(np.max, localised),
+        position_error_navigating_median_m=statistic_of_finite(np.median, navigating),
+        position_error_navigating_max_m=statistic_of_finite(np.max, navigating),
         path_m=float(np.hypot(*np.diff(path[:, :2], axis=0).T).sum()) if len(path) else None,
         straight_line_m=None if start is None else _distance(start[None], goal),
         contacts=session.contacts if len(session.truth) else None,
@@ -136,7 +136,7 @@ def _last(errors: Array) -> float | None:
     return float(errors[-1]) if len(errors) and np.isfinite(errors[-1]) else None
 
 
-def _reduce(statistic: Any, errors: Array) -> float | None:
-    """The statistic of all finite errors; None if there are none."""
-    known = errors[np.isfinite(errors)]
+def statistic_of_finite(statistic: Any, values: Array) -> float | None:
+    """The statistic of all finite values; None if there are none."""
+    known = values[np.isfinite(values)]
     return float(statistic(known)) if len(known) else None

@@ -26,7 +26,7 @@ TOPICS = (BELIEF, TRUTH, ODOM)
 FRAMES = {"belief": "map", "truth": "map", "odom": "odom"}
 
 
-class Trajectory:
+class TrajectoryWriter:
     """Writes the poses of one topic; starts a new file whenever the stamps go back."""
 
     def __init__(self, folder: Path, name: str, stack: ExitStack) -> None:
@@ -75,7 +75,7 @@ def export_tum(
     refuse_to_overwrite(sorted(folder.iterdir())[:1], force=force)
     counts = recording.counts()
     with ExitStack() as stack:
-        files = {topic.name: Trajectory(folder, topic.name, stack) for topic in keys.values()}
+        files = {topic.name: TrajectoryWriter(folder, topic.name, stack) for topic in keys.values()}
         messages = with_progress(entries(recording, name, *TOPICS), sum(counts[key] for key in keys), "tum", console)
         for topic, message, _ in messages:
             assert isinstance(message, Belief | Truth | Odom)  # noqa: S101 - the message types of TOPICS

@@ -14,7 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from common.bus.bus import Link
 from common.errors import UserError
 from common.messages.requests import PlayerReply
-from presage.live.bus_watch import session
+from presage.live.latest_messages import session_bus
 from presage.replay.keyboard import HELP, keyboard
 from services.recorder.replaying.replay import ReplayControl, ReplayOptions, names_of, replay
 
@@ -42,7 +42,7 @@ def run_replay(file: Path, link: Link, options: ReplayOptions, console: Console)
             shown = now
             bar.update(task, completed=state.position_s, total=max(state.duration_s, 1e-9), status=describe(state))
 
-    counts = replay(file, link, options, on_progress=show, open_session=session, control_context=show_progress)
+    counts = replay(file, link, options, on_progress=show, open_session=session_bus, control_context=show_progress)
     console.print("replayed " + (", ".join(f"{key} {count}" for key, count in sorted(counts.items())) or "nothing"))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from common.geometry import se2
 from common.messages.definitions import Belief, CmdVel, Stamped
-from services.recorder.files.message_counts import Sequence
+from services.recorder.files.message_counts import SequenceNumbers
 
 COMPARED_FIELDS = "state, pose, covariance, free energy"
 # Maximum difference of beliefs that are both in state tracking, if equality is not required:
@@ -112,7 +112,7 @@ class ReplayOutcome:
     beliefs: MessagePairs = field(default_factory=MessagePairs)
     commands: MessagePairs = field(default_factory=MessagePairs)
     scans: int = 0  # in the recording
-    numbers: Sequence = field(default_factory=Sequence)  # sequence numbers of all recorded scans
+    numbers: SequenceNumbers = field(default_factory=SequenceNumbers)  # sequence numbers of all recorded scans
     given: int = 0  # scans sent to the services
     left_out: int = 0  # scans without a recorded belief, which were not sent
     unanswered: int = 0  # scans sent, but without a new belief

@@ -15,7 +15,7 @@ from presage.replay.comparison import ReplayOutcome
 from presage.replay.goal_times import GoalTimes
 from presage.replay.in_process import InProcessServices
 from presage.terminal.progress import progress
-from services.recorder.reader import Raw, Recording
+from services.recorder.reader import RawMessage, Recording
 
 
 class ScanFeed:
@@ -67,7 +67,7 @@ class ScanFeed:
         if outcome.unanswered == outcome.given > 0:
             raise UserError(f"the estimator answered no scan: {self.services.notes or 'the log above says why'}")
 
-    def _process(self, raw: Raw, answered_stamps: Counter[int]) -> None:
+    def _process(self, raw: RawMessage, answered_stamps: Counter[int]) -> None:
         """Adds a recorded output to the comparison, or sends an input."""
         topic = self.topics[raw.key]
         try:
@@ -77,7 +77,7 @@ class ScanFeed:
         if topic in self.outputs:
             (self.outcome.beliefs if topic is BELIEF else self.outcome.commands).add_recorded(message)
         elif isinstance(message, Scan):
-            self.outcome.numbers.see(message.seq)
+            self.outcome.numbers.add(message.seq)
             if not self.every_scan:
                 if not answered_stamps[message.stamp_ns]:
                     self.outcome.left_out += 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 
-from common.bus.inbox import Answer, Call, Inbox, Sample
+from common.bus.inbox import Inbox, IncomingRequest, RequestResult, Sample
 from common.messages.definitions import Stamped
 from common.messages.requests import Request
 from common.messages.topics import Query, Topic
@@ -46,7 +46,7 @@ class InProcessServices:
         for loop in self._loops:
             if topic in loop.service.inputs:
                 loop.handle(Sample(topic, topic.key(self.robot), payload, 0, 0))
-                while isinstance(answer := loop.inbox.get(0), Answer):
+                while isinstance(answer := loop.inbox.get(0), RequestResult):
                     loop.handle(answer)
 
     # The part of `common.bus.bus.Bus` that services use while they handle messages.
@@ -55,20 +55,20 @@ class InProcessServices:
         """Queues a message of a service."""
         self._outbox.append((topic, payload))
 
-    def request(self, query: Query, request: Request, number: int, inbox: Inbox, timeout: float) -> None:  # noqa: ARG002
+    def send_request(self, query: Query, request: Request, number: int, inbox: Inbox, timeout: float) -> None:  # noqa: ARG002
         """Passes a query to the service that answers it, which replies at once."""
 
         def reply(payload: bytes) -> None:
-            inbox.put(Answer(query, number, payload))
+            inbox.put(RequestResult(query, number, payload))
 
         def refuse(reason: str) -> None:
-            inbox.put(Answer(query, number, b"", reason))
+            inbox.put(RequestResult(query, number, b"", reason))
 
         server = next((loop for loop in self._loops if query in loop.service.queries), None)
         if server is None:
             refuse("no service here answers")
         else:
-            server.handle(Call(query, request.encode(), reply, refuse))
+            server.handle(IncomingRequest(query, request.encode(), reply, refuse))
 
     def publisher(self, topic: Topic, service: str) -> None:
         """Does nothing: within one process, publishers need not be declared."""

@@ -125,7 +125,7 @@ def build_estimator_options(
 
 
 @dataclass(frozen=True)
-class Localised:
+class TimedBelief:
     """A belief, and how long it took."""
 
     posterior: Posterior
@@ -134,7 +134,7 @@ class Localised:
 
 def run(
     estimator: Estimator, scans: Iterable[LaserScan], *, fresh: bool = False, start: Array | None = None
-) -> Iterator[Localised]:
+) -> Iterator[TimedBelief]:
     """Yields the belief after each scan, from ``start`` (3,) or (2,), or from an unknown pose.
 
     With ``fresh``, each scan is alone.
@@ -146,7 +146,7 @@ def run(
             estimator.restart(start)
         began = time.perf_counter()
         posterior = estimator.update(scan)
-        yield Localised(posterior, (time.perf_counter() - began) * 1e3)
+        yield TimedBelief(posterior, (time.perf_counter() - began) * 1e3)
 
 
 def prepare(estimator_options: EstimatorOptions, console: Console) -> Estimator:
@@ -219,8 +219,8 @@ def select_scans(options: LocalizeOptions, scans: Scans) -> Scans:
 
 
 def _with_progress(
-    options: LocalizeOptions, found: Iterator[Localised], count: int, console: Console
-) -> Generator[Localised]:
+    options: LocalizeOptions, found: Iterator[TimedBelief], count: int, console: Console
+) -> Generator[TimedBelief]:
     """Shows the progress, unless the rows themselves are printed to the same terminal."""
     if options.out is None and sys.stdout.isatty() and console.is_terminal:
         yield from found
@@ -244,7 +244,7 @@ def _start(options: LocalizeOptions, scans: Scans) -> Array | None:
     )
 
 
-def _row(scans: Scans, k: int, localised: Localised, *, laser: bool) -> dict[str, Any]:
+def _row(scans: Scans, k: int, localised: TimedBelief, *, laser: bool) -> dict[str, Any]:
     posterior = localised.posterior
     pose, covariance = posterior.pose, posterior.covariance
     mount = scans.geometry.mount

@@ -91,7 +91,7 @@ def estimator_settings(
     return RecordedSettings(values)
 
 
-def check_mount(recording: Recording, settings: EstimatorSettings) -> None:
+def check_recorded_mount(recording: Recording, settings: EstimatorSettings) -> None:
     """Raises UserError if the recording's mount is only assumed and the weights were trained with another mount."""
     from presage.logs.scan_files import mount_assumed  # slow import of numba
     from services.estimator.factory import Geometry

@@ -17,6 +17,7 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from common.messages.definitions import Belief
 from presage.plotting.style import COLOURS, figure_of, legend_below, log_metres
+from presage.recordings.session_summary import statistic_of_finite
 
 RECORDED_COLOUR = "#444444"
 MIN_LOG_VALUE = 1e-4  # m, lower limit of the logarithmic axis
@@ -119,15 +120,15 @@ class EstimatorResult:
         return {
             "estimator": self.name,
             "beliefs": self.beliefs,
-            "share_tracking": _reduce(np.mean, self.tracking.astype(float)),
-            "position_error_median_m": _reduce(np.median, position),
-            "position_error_rms_m": _reduce(lambda e: np.sqrt(np.mean(np.square(e))), position),
-            "position_error_max_m": _reduce(np.max, position),
-            "position_error_all_median_m": _reduce(np.median, self.position),
-            "heading_error_median_rad": _reduce(np.median, heading),
-            "nees_mean": _reduce(np.mean, nees),
-            "update_ms_median": _reduce(np.median, self.update_ms),
-            "update_ms_p95": _reduce(lambda t: np.quantile(t, 0.95), self.update_ms),
+            "share_tracking": statistic_of_finite(np.mean, self.tracking.astype(float)),
+            "position_error_median_m": statistic_of_finite(np.median, position),
+            "position_error_rms_m": statistic_of_finite(lambda e: np.sqrt(np.mean(np.square(e))), position),
+            "position_error_max_m": statistic_of_finite(np.max, position),
+            "position_error_all_median_m": statistic_of_finite(np.median, self.position),
+            "heading_error_median_rad": statistic_of_finite(np.median, heading),
+            "nees_mean": statistic_of_finite(np.mean, nees),
+            "update_ms_median": statistic_of_finite(np.median, self.update_ms),
+            "update_ms_p95": statistic_of_finite(lambda t: np.quantile(t, 0.95), self.update_ms),
         }
 
 
@@ -158,9 +159,9 @@ class Comparison:
             "recorded": self.old.as_dict(),
             "new": self.new.as_dict(),
             "difference": {
-                "position_median_m": _reduce(np.median, position),
-                "position_max_m": _reduce(np.max, position),
-                "heading_max_rad": _reduce(np.max, difference[:, 2]),
+                "position_median_m": statistic_of_finite(np.median, position),
+                "position_max_m": statistic_of_finite(np.max, position),
+                "heading_max_rad": statistic_of_finite(np.max, difference[:, 2]),
             },
         }
 
@@ -251,9 +252,3 @@ def figure_of_curves(columns: dict[str, Array], comparison: Comparison, title: s
 
 def _format(value: float | None, factor: float, unit: str) -> str:
     return "-" if value is None else f"{value * factor:.3g} {unit}".rstrip()
-
-
-def _reduce(statistic: Any, values: Array) -> float | None:
-    """The statistic of all finite values; None if there are none."""
-    known = values[np.isfinite(values)]
-    return float(statistic(known)) if len(known) else None

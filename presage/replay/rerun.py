@@ -31,7 +31,7 @@ from common.messages.wire import DecodeError
 from common.versions import commit, versions
 from presage.logs.scan_files import Scans, read_scans
 from presage.recordings.selection import robot_of
-from presage.replay.localize import Localised, prepare, run
+from presage.replay.localize import TimedBelief, prepare, run
 from presage.replay.recorded_session import estimator_settings, recorded_settings, settings_with
 from presage.replay.report import BeliefSeries, compare, draw, table
 from presage.terminal.output import check_file, write_json
@@ -39,7 +39,7 @@ from presage.terminal.progress import progress
 from services.estimator.service import belief_message, estimator_options, prediction_message
 from services.estimator.settings import EstimatorSettings
 from services.recorder.files.writer import RecordingWriter
-from services.recorder.reader import Raw, Recording, read_recording
+from services.recorder.reader import RawMessage, Recording, read_recording
 
 RERUN_SUFFIX = "-rerun"  # of the robot's name
 
@@ -114,7 +114,7 @@ def write_recording(
     robot: str,
     settings: EstimatorSettings,
     scans: Scans,
-    localised: Iterator[Localised],
+    localised: Iterator[TimedBelief],
     out: Path,
 ) -> tuple[BeliefSeries, BeliefSeries]:
     """Writes the new recording, and returns the recorded and the new beliefs; no file is left if that fails."""
@@ -148,7 +148,7 @@ def _copy(
     alias: str,
     estimator: str,
     scans: Scans,
-    localised: Iterator[Localised],
+    localised: Iterator[TimedBelief],
     writer: RecordingWriter,
 ) -> tuple[BeliefSeries, BeliefSeries]:
     """Copies all messages, and writes each new belief after the recorded one, or else before the next scan."""
@@ -185,7 +185,7 @@ def _copy(
     return old, new
 
 
-def _decode(topic: Topic, raw: Raw) -> Stamped | None:
+def _decode(topic: Topic, raw: RawMessage) -> Stamped | None:
     try:
         return topic.message.decode(raw.payload)
     except DecodeError:

@@ -29,7 +29,7 @@ from presage.replay.in_process import InProcessServices
 from presage.replay.recorded_session import (
     SETTINGS,
     RecordedSettings,
-    check_mount,
+    check_recorded_mount,
     estimator_settings,
     other_versions,
     recorded_settings,
@@ -129,7 +129,7 @@ def build_services(recording: Recording, names: tuple[str, ...], folder: Path, n
             unpacked = estimator_settings(recording, folder, values, weights="log" not in recording.metadata)
             notes += unpacked.notes
             settings = settings_with(EstimatorSettings, unpacked.values)
-            check_mount(recording, settings)
+            check_recorded_mount(recording, settings)
             services.append(EstimatorService(settings))
         else:
             if values.get("world") and (world := world_file(recording, folder)) is not None:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from rich.table import Table
 
-from common.bus.security import ROLES, ROUTER, Member, may_answer, may_ask, may_put
+from common.bus.security import ROLES, ROUTER, Member, may_answer, may_put, may_query
 from common.messages.topics import QUERIES, TOPICS
 
 
@@ -38,7 +38,7 @@ def rights_table() -> Table:
         table.add_row(
             role,
             ", ".join(t.name for t in TOPICS if may_put(role, t)) or "-",
-            ", ".join(q.name for q in QUERIES if may_ask(role, q)) or "-",
+            ", ".join(q.name for q in QUERIES if may_query(role, q)) or "-",
             ", ".join(q.name for q in QUERIES if may_answer(role, q)) or "-",
             about,
         )

@@ -20,7 +20,7 @@ from common.messages.definitions import Belief, Goal, Health, Pose, Status, Trut
 from common.messages.topics import BELIEF, GOAL, HEALTH, STATUS, TRUTH
 from common.robot.base import Robot
 from common.versions import commit
-from presage.live.bus_watch import Watch
+from presage.live.latest_messages import LatestMessages
 from presage.recordings.session_figure import draw_session
 from presage.recordings.session_summary import SessionSummary, summarise
 from presage.session.page import show_page_link
@@ -67,7 +67,7 @@ def run_demo(demo: DemoOptions, stack: Stack, console: Console) -> tuple[Path, b
         simulator += arguments(beams=DEMO_BEAMS)
     stack.start_router()
     with open_bus(stack.link()) as bus:
-        watch = Watch(bus, TRUTH, BELIEF, STATUS, HEALTH)
+        messages = LatestMessages(bus, TRUTH, BELIEF, STATUS, HEALTH)
         if not demo.quiet:
             stack.start("viewer", *plan.config, *arguments(recordings=demo.out))
         stack.start("recorder", *plan.config, *arguments(directory=demo.out, file=recording.name))
@@ -81,7 +81,7 @@ def run_demo(demo: DemoOptions, stack: Stack, console: Console) -> tuple[Path, b
         if not demo.quiet:
             show_page_link(stack, console, open_it=demo.open_page)
         with announced(stack.endpoint, [stack.robot], stack.security):
-            reached = _localise(watch, stack, console) and _navigate(bus, watch, stack, goal, console)
+            reached = _localise(messages, stack, console) and _navigate(bus, messages, stack, goal, console)
         stack.check()
         for name in ("controller", "estimator", "simulator"):
             stack.stop(name)
@@ -120,7 +120,7 @@ def _choose_goal(demo: DemoOptions, world: World) -> tuple[float, float]:
     return demo.goal
 
 
-def _localise(watch: Watch, stack: Stack, console: Console) -> bool:
+def _localise(messages: LatestMessages, stack: Stack, console: Console) -> bool:
     """Waits until the belief is in state tracking; returns False on timeout, raises UserError if no belief comes."""
     start_s = time.monotonic()
     first_stamp: int | None = None
@@ -129,14 +129,14 @@ def _localise(watch: Watch, stack: Stack, console: Console) -> bool:
     with console.status("localising with the laser only") as line:
         while (waited := time.monotonic() - start_s) < WALL_TIMEOUT_S:
             stack.check()
-            message = watch.next(0.5)
+            message = messages.next(0.5)
             if isinstance(message, Health) and message.service == "estimator":
                 health = message
             if first_stamp is None:
                 _check_estimator(health, waited)
             if isinstance(message, Belief):
                 belief, first_stamp = message, message.stamp_ns if first_stamp is None else first_stamp
-                truth = watch.latest.get("truth")
+                truth = messages.latest.get("truth")
                 error = (
                     f"{_position_error(belief, truth):.3f} m from the truth"
                     if isinstance(truth, Truth)
@@ -172,17 +172,17 @@ def _check_estimator(health: Health | None, waited: float) -> None:
         )
 
 
-def _navigate(bus: Bus, watch: Watch, stack: Stack, place: tuple[float, float], console: Console) -> bool:
+def _navigate(bus: Bus, messages: LatestMessages, stack: Stack, place: tuple[float, float], console: Console) -> bool:
     """Sends the goal and waits for the outcome; returns whether the goal was reached."""
     if not bus.wait_matching(GOAL, 5.0):
         raise UserError("no controller receives goals: is it running?")
-    stamp, start_s = watch.latest["belief"].stamp_ns, time.monotonic()
+    stamp, start_s = messages.latest["belief"].stamp_ns, time.monotonic()
     goal = Goal(stamp_ns=stamp, seq=1, pose=Pose(x=place[0], y=place[1]))  # seq 0 in a status means no goal
     bus.put(GOAL, goal.encode())
     with console.status("navigating") as line:
         while True:
             stack.check()
-            status = watch.until(Status, lambda s: s.goal_seq == goal.seq, 5.0)
+            status = messages.wait_for(Status, lambda s: s.goal_seq == goal.seq, 5.0)
             if status is None:
                 console.print("[bold]the controller has published no status of the goal for 5 s[/]")
                 return False
@@ -200,7 +200,9 @@ def _navigate(bus: Bus, watch: Watch, stack: Stack, place: tuple[float, float], 
                 console.print(f"[bold]not at the goal after {passed:.0f} s[/]: {status.state} {status.reason}")
                 return False
     # Wait until the robot stands, so that the recording and the figure contain the end of the drive.
-    return watch.until(Truth, lambda truth: bool(np.hypot(truth.twist.vx, truth.twist.vy) < 0.01), 5.0) is not None
+    return (
+        messages.wait_for(Truth, lambda truth: bool(np.hypot(truth.twist.vx, truth.twist.vy) < 0.01), 5.0) is not None
+    )
 
 
 def show(summary: SessionSummary, recording: Path, figure: Path, console: Console) -> None:

@@ -13,7 +13,7 @@ from common.geometry.world import load_world
 from common.runtime.config import load_settings
 from presage.terminal.options import arguments
 from services.controller.settings import ControllerSettings
-from services.estimator.factory import check
+from services.estimator.factory import check_options
 from services.estimator.service import estimator_options
 from services.estimator.settings import EstimatorSettings
 from services.simulator.settings import SimulatorSettings
@@ -72,7 +72,7 @@ def plan_session(
         if (error := loaded_world.placement_error(pose, radius)) is not None:
             raise UserError(f"start {error} (settings start and radius)")
     if not mapping:
-        check(estimator_options(estimator_settings), loaded_world)
+        check_options(estimator_options(estimator_settings), loaded_world)
     return SessionPlan(
         tuple(common),
         tuple(simulator_args),

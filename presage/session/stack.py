@@ -32,7 +32,7 @@ SHUTDOWN_ORDER = ("controller", "estimator", "mapper", "simulator", "viewer", "r
 
 
 @dataclass
-class Process:
+class ServiceProcess:
     """A child process and the thread that reads its output."""
 
     name: str
@@ -73,7 +73,7 @@ class Stack:
         self.port = port if port is not None else free_port()
         self.robot, self.quiet = robot, quiet
         self.environment = os.environ if environment is None else environment
-        self.processes: dict[str, Process] = {}
+        self.processes: dict[str, ServiceProcess] = {}
 
     @property
     def endpoint(self) -> str:
@@ -193,12 +193,14 @@ class Stack:
             start_new_session=True,  # so that Ctrl-C does not reach the children: they are ended in order
             preexec_fn=end_with_this_process(self.orphan_signal),  # noqa: PLW1509 - no threads in the child yet
         )
-        process = Process(name, child, threading.Thread(target=lambda: self._forward_output(process), daemon=True))
+        process = ServiceProcess(
+            name, child, threading.Thread(target=lambda: self._forward_output(process), daemon=True)
+        )
         process.args = args
         process.reader.start()
         self.processes[name] = process
 
-    def _forward_output(self, process: Process) -> None:
+    def _forward_output(self, process: ServiceProcess) -> None:
         """Prints the child's output to standard error, each line with the child's name in front."""
         assert process.child.stdout is not None  # noqa: S101 - it is a pipe, see _spawn
         colour = f"\033[{COLOURS.get(process.name, 0)}m" if sys.stderr.isatty() else ""
@@ -241,7 +243,7 @@ def _log_text(line: str) -> str:
     return line
 
 
-def _end(process: Process) -> int:
+def _end(process: ServiceProcess) -> int:
     """Ends the child unless it has ended, and releases its resources; returns its exit status."""
     child = process.child
     if child.poll() is None:

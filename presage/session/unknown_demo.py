@@ -1,7 +1,7 @@
-"""`presage demo --unknown`: in a building that it has never seen, a robot explores, is carried off, and returns.
+"""`presage demo --unknown`: a robot explores a building that it has never seen, is kidnapped, and returns.
 
-The demo only plays the people: it asks the robot to explore, carries it off once, and sends it a goal. It measures with
-the true world and the true pose, which of the services only the simulator knows.
+The demo plays the people around the robot: it starts the exploration, teleports the robot once, and sends a goal. It
+measures errors with the true world and the true pose, which no service but the simulator knows.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from common.messages.definitions import Belief, Goal, Map, Pose, Stamped, Status
 from common.messages.requests import PoseRequest, Reply
 from common.messages.topics import BELIEF, GOAL, MAP, STATUS, TELEPORT, TRUTH
 from common.versions import commit
-from presage.live.bus_watch import Watch
+from presage.live.latest_messages import LatestMessages
 from presage.session.demo import DemoOptions, check_recorded, new_recording
 from presage.session.page import show_page_link
 from presage.session.preflight import plan_session
@@ -36,11 +36,11 @@ from presage.terminal.options import arguments
 from presage.terminal.output import check_file, make_folder, write_json
 
 DEFAULT_WORLD = "office"  # unless the options, the environment or the settings file name another
-# In the map when the robot is carried off. The map is the larger part of the drive, so it must be larger than what the
-# robot sees until it has found itself, which takes about 20.
+# In the map when the robot is kidnapped. The map is the larger part of the drive, so it must be larger than what the
+# robot sees until it is localised again, which takes about 20 key scans.
 CARRIED_AT_KEY_SCANS = 40
 CARRIED_M = 5.0  # at least
-FOUND_M = 0.2  # error of a belief below which the robot has found itself
+FOUND_M = 0.2  # error of a belief below which the robot counts as localised
 STANDING_M_S = 0.01
 EXPLORATION_SEQ, GOAL_SEQ = 1, 2  # numbers of the two requests
 KEPT_TRUTHS = 256  # a belief arrives later than the truth of its stamp
@@ -49,11 +49,11 @@ FIRST_MAP_TIMEOUT_S, CARRY_TIMEOUT_S, STEP_TIMEOUT_S, RETURN_TIMEOUT_S = 60.0, 3
 
 
 class StepError(Exception):
-    """A step of the demo did not end well."""
+    """A step of the demo failed."""
 
 
 @dataclass(frozen=True)
-class Step:
+class DemoStep:
     """How a step of the demo ended."""
 
     what: str
@@ -62,13 +62,13 @@ class Step:
     error_m: float  # of the belief, or of the place that was reached
 
 
-class Observer:
+class SessionObserver:
     """What happens in the session, measured with the truth."""
 
     def __init__(self, bus: Bus, stack: Stack, world: World, console: Console) -> None:
         self.stack, self.world, self.console = stack, world, console
-        self.watch = Watch(bus, TRUTH, BELIEF, STATUS, MAP)
-        self.steps: list[Step] = []
+        self.messages = LatestMessages(bus, TRUTH, BELIEF, STATUS, MAP)
+        self.steps: list[DemoStep] = []
         self.contacts = 0  # truths in which the robot touches something
         self.mapped_share = 0.0
         self.status = Status(stamp_ns=0, state="idle")
@@ -130,13 +130,13 @@ class Observer:
                     raise StepError(f"{doing}: {self._state()}")
                 if time.monotonic() > deadline:
                     raise StepError(f"{doing} took longer than {limit_s:g} s: {self._state()}")
-                if (message := self.watch.next(0.5)) is not None:
+                if (message := self.messages.next(0.5)) is not None:
                     self._take(message)
                 line.update(escape(f"{doing}: {self._state()}"))
 
     def end_step(self, what: str, error_m: float) -> None:
         """Notes and prints how a step ended."""
-        self.steps.append(Step(what, self.seconds, self.mapped_share, error_m))
+        self.steps.append(DemoStep(what, self.seconds, self.mapped_share, error_m))
         minutes, seconds = divmod(round(self.seconds), 60)
         self.console.print(
             f"{minutes}:{seconds:02}  {what}; {100 * self.mapped_share:.0f} % mapped", soft_wrap=True, highlight=False
@@ -165,18 +165,18 @@ class Observer:
             self.key_scans, self.mapped_share = message.poses, mapped_share(message.grid, self._area, self.start)
 
 
-def play(bus: Bus, seen: Observer) -> None:
-    """Plays the story; raises StepError if a step does not end well."""
+def play(bus: Bus, seen: SessionObserver) -> None:
+    """Runs the steps of the demo; raises StepError if one fails."""
     seen.wait("making the first map", lambda: len(seen.key_scans) > 0, FIRST_MAP_TIMEOUT_S)
     bus.put(GOAL, Goal(stamp_ns=0, seq=EXPLORATION_SEQ, pose=Pose(x=0.0, y=0.0), explore=True).encode())
     explore(seen)
-    carry_off(bus, seen)
+    kidnap(bus, seen)
     drive_to_goal(bus, seen)
     return_to_start(seen)
 
 
-def explore(seen: Observer) -> None:
-    """Waits until enough is mapped to carry the robot off to a mapped place."""
+def explore(seen: SessionObserver) -> None:
+    """Waits until enough is mapped to kidnap the robot to a mapped place."""
 
     def enough() -> bool:
         if seen.exploration == "finished":
@@ -189,11 +189,11 @@ def explore(seen: Observer) -> None:
     seen.end_step(f"explored a building that it has never seen, its belief {mm(error_m)} from the truth", error_m)
 
 
-def carry_off(bus: Bus, seen: Observer) -> None:
-    """Carries the robot off to a mapped place, and waits until it has found itself there."""
+def kidnap(bus: Bus, seen: SessionObserver) -> None:
+    """Teleports the robot to a mapped place, and waits until it is localised there."""
     before, place = seen.pose, farthest_key_scan(seen)
     place = se2.compose(place, [0.0, 0.0, np.pi])  # with a view that is not the one in the map
-    reply = bus.ask(TELEPORT, PoseRequest(pose=Pose.of(se2.compose(seen.start, place))), Reply)
+    reply = bus.query(TELEPORT, PoseRequest(pose=Pose.of(se2.compose(seen.start, place))), Reply)
     if not reply.ok:
         raise StepError(f"the simulator refuses to carry the robot off: {reply.reason}")
     way_m = distance(place, before)
@@ -211,7 +211,7 @@ def carry_off(bus: Bus, seen: Observer) -> None:
     )
 
 
-def drive_to_goal(bus: Bus, seen: Observer) -> None:
+def drive_to_goal(bus: Bus, seen: SessionObserver) -> None:
     """Sends a goal, which takes precedence over the exploration, and waits until the robot stands there."""
     before, place = seen.pose, farthest_key_scan(seen)
     goal = Goal(stamp_ns=seen.truth.stamp_ns, seq=GOAL_SEQ, pose=Pose(x=place[0], y=place[1]))
@@ -228,15 +228,15 @@ def drive_to_goal(bus: Bus, seen: Observer) -> None:
     )
 
 
-def return_to_start(seen: Observer) -> None:
+def return_to_start(seen: SessionObserver) -> None:
     """Waits until the rest is explored and the robot is back."""
     seen.wait("exploring the rest", lambda: seen.exploration == "finished" and seen.standing, RETURN_TIMEOUT_S)
     error_m = distance(seen.pose, np.zeros(3))
     seen.end_step(f"explored the rest and returned, {mm(error_m)} from where it began", error_m)
 
 
-def farthest_key_scan(seen: Observer) -> Array:
-    """The pose (3,) in map of the key scan that is farthest from the robot: it has been there before."""
+def farthest_key_scan(seen: SessionObserver) -> Array:
+    """The pose (3,) in map of the key scan that is farthest from the robot."""
     return np.asarray(seen.key_scans[np.argmax(np.hypot(*(seen.key_scans - seen.pose)[:, :2].T))])
 
 
@@ -250,8 +250,8 @@ def mm(metres: float) -> str:
     return f"{1000 * metres:.0f} mm"
 
 
-def run_unknown_demo(demo: DemoOptions, stack: Stack, console: Console) -> tuple[Path, Observer, str]:
-    """Plays the story with the services of ``stack``.
+def run_unknown_demo(demo: DemoOptions, stack: Stack, console: Console) -> tuple[Path, SessionObserver, str]:
+    """Runs the demo with the services of ``stack``.
 
     Returns the recording, what was measured, and why a step failed, or an empty text. Raises UserError if an option is
     wrong or a service fails.
@@ -263,7 +263,7 @@ def run_unknown_demo(demo: DemoOptions, stack: Stack, console: Console) -> tuple
     recording, failure = new_recording(demo.out, stack.robot), ""
     stack.start_router()
     with open_bus(stack.link()) as bus:
-        seen = Observer(bus, stack, load_world(plan.simulator_settings.world), console)
+        seen = SessionObserver(bus, stack, load_world(plan.simulator_settings.world), console)
         if not demo.quiet:
             stack.start("viewer", *plan.config, *arguments(recordings=demo.out))
         stack.start("recorder", *plan.config, *arguments(directory=demo.out, file=recording.name))

@@ -1,4 +1,4 @@
-"""Checks output paths and writes JSON."""
+"""Checks output paths, writes JSON, and makes text from the bus printable."""
 
 from __future__ import annotations
 
@@ -40,3 +40,8 @@ def write_json(file: Path | None, data: dict[str, Any]) -> None:
     """Writes ``data`` as indented JSON; does nothing if ``file`` is None."""
     if file is not None:
         file.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+
+
+def printable(text: str) -> str:
+    """Removes control characters, which could change the state of the terminal, from text received on the bus."""
+    return "".join(c if c.isprintable() else "?" for c in text)

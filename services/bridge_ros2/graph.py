@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from services.bridge_ros2.keys import Endpoint, Names, read_token
+from services.bridge_ros2.keys import Endpoint, RosKeys, read_token
 from services.bridge_ros2.ros_types import NO_HASH, TWIST, TWIST_STAMPED, type_hash
 
 MAX_NAMES_SHOWN = 4  # in one line
@@ -14,9 +14,9 @@ class Graph:
     A zenoh thread calls `change`; the service's loop calls the other methods.
     """
 
-    def __init__(self, names: Names | None = None) -> None:
+    def __init__(self, names: RosKeys | None = None) -> None:
         """``names`` are the bridge's own keys on zenoh."""
-        self._names = names or Names()
+        self._names = names or RosKeys()
         self._tokens: dict[str, Endpoint] = {}
 
     def change(self, token: str, *, alive: bool) -> None:

@@ -63,7 +63,7 @@ def clean_namespace(namespace: str) -> str:
 
 
 @dataclass(frozen=True)
-class Names:
+class RosKeys:
     """Zenoh keys of one flavour and ROS domain."""
 
     flavor: Flavor = "rmw_zenoh"
@@ -111,7 +111,7 @@ def mangle(name: str) -> str:
 class Node:
     """The bridge as a node of rmw_zenoh."""
 
-    names: Names
+    names: RosKeys
     zid: str  # the zenoh session's id
     namespace: str
     name: str

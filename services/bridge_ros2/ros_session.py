@@ -18,7 +18,7 @@ import zenoh.ext
 from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
 from common.messages.topics import Topic
-from services.bridge_ros2.keys import TOKENS, Names, Node, Qos, attachment, publisher_gid, read_attachment
+from services.bridge_ros2.keys import TOKENS, Node, Qos, RosKeys, attachment, publisher_gid, read_attachment
 from services.bridge_ros2.ros_types import encode
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ class RosPublisher:
 class RosSession:
     """The bridge's node in the ROS graph. zenoh's threads fill the graph and the inbox."""
 
-    def __init__(self, session: zenoh.Session, names: Names, namespace: str, name: str, graph: Graph) -> None:
+    def __init__(self, session: zenoh.Session, names: RosKeys, namespace: str, name: str, graph: Graph) -> None:
         """Declares the node, and subscribes to the tokens of other nodes."""
         self._session, self._names, self._graph = session, names, graph
         self._declared: list[Any] = []

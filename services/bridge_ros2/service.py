@@ -246,7 +246,7 @@ class BridgeRos2Service(Service):
     def _on_initial_pose(self, message: Any) -> None:
         pose = pose_of(message, MAP_FRAME)
         self.log.info("initial pose from ROS", x=pose.x, y=pose.y, yaw=pose.yaw)
-        self.request(LOCALISE, LocaliseRequest(pose=pose))
+        self.send_request(LOCALISE, LocaliseRequest(pose=pose))
 
     def _on_goal(self, message: Any) -> None:
         pose = pose_of(message, MAP_FRAME)

@@ -11,7 +11,7 @@ from common.errors import UserError
 from common.geometry.pose_text import POSE_TEXT, pose_of_text
 from common.messages.ros_messages import Mount
 from common.runtime.robot_settings import SelfFilterSettings
-from services.bridge_ros2.keys import NAME, Names, full_name
+from services.bridge_ros2.keys import NAME, RosKeys, full_name
 
 TOPIC = rf"^$|^{NAME}$"
 ENDPOINT = r"[a-z]+/[^\s,]+:(6553[0-5]|655[0-2]\d|65[0-4]\d\d|6[0-4]\d{3}|[1-5]\d{4}|[1-9]\d{0,3})"
@@ -134,9 +134,9 @@ class BridgeRos2Settings(SelfFilterSettings):
 
     obstacle_stop: Annotated[bool, Field(description="slow down and stop before obstacles in the scan")] = True
 
-    def names(self) -> Names:
+    def names(self) -> RosKeys:
         """Zenoh keys of the configured flavour and domain."""
-        return Names(self.flavor, self.domain, hashes=self.distro != "humble")
+        return RosKeys(self.flavor, self.domain, hashes=self.distro != "humble")
 
     def check(self) -> None:
         """Raises UserError if settings contradict each other, or if a file is missing."""

@@ -1,4 +1,4 @@
-"""What the controller waits for before it answers a belief.
+"""What the controller waits for before it answers a belief with a command.
 
 To process a belief means to wait for predicted scans if the policy needs them, and otherwise to answer it at once.
 

@@ -1,4 +1,4 @@
-"""Docking: reaches a goal precisely, on a straight line in the direction that it asks for.
+"""Docking: reaches a goal precisely, on a straight line in its approach direction.
 
 | phase | what the robot does | next phase |
 |---|---|---|
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 
 LINE_LENGTH_M = 0.6
 LINE_SPEED = 0.2  # m/s
-SETTLING_TIME_S = 0.3  # time constant with which it arrives; longer than a scan, the latency and the braking together
+SETTLING_TIME_S = 0.3  # time constant of the arrival; longer than a scan period, the latency and the braking together
 CONVERGENCE_M = 0.1  # a differential base corrects its lateral error over a few times this distance
 MAX_LATERAL_ERROR_M = 0.1  # farther from the line, the robot starts again
 ALIGNED_RAD = 0.03  # of the goal's heading, before the line
-STANDING_TIME_S = 1.0  # before it has arrived, because a belief follows millimetres of creeping only this fast
+STANDING_TIME_S = 1.0  # at rest before it counts as arrived, because the belief lags behind a slow creep
 TARGET_SHARE = 0.33  # of the tolerance, at which the robot stops correcting, so that noise does not keep it moving
 
 
@@ -73,9 +73,9 @@ class Docking:
         self.phase = DockingPhase.DRIVE
 
     def errors(self, pose: Array) -> tuple[float, float, float]:
-        """What is missing from a pose (3,) to the goal: m along and across the line, and rad.
+        """What remains from a pose (3,) to the goal: m along and across the line, and rad of heading.
 
-        The heading's is 0 for a holonomic base if the goal accepts any heading.
+        The heading error is 0 for a holonomic base if the goal accepts any heading.
         """
         along, across = se2.rotate(-self.direction, self.position - pose[:2])
         free_heading = self.yaw_tolerance is None and self.robot.drive == "holonomic"
@@ -87,7 +87,7 @@ class Docking:
         return bool(np.hypot(along, across) <= self.tolerance and abs(turn) <= (self.yaw_tolerance or np.inf))
 
     def velocity(self, pose: Array) -> Array | None:
-        """Velocity (3,) in base_link at a pose (3,), which is that when the command takes effect.
+        """Velocity (3,) in base_link for the pose (3,) at which the command takes effect.
 
         Returns None in phase DRIVE.
         """

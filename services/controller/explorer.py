@@ -4,7 +4,7 @@
 |---|---|---|
 | - | a goal with `explore` | EXPLORING |
 | EXPLORING, RETURNING | a viewpoint is worth a visit | EXPLORING |
-| EXPLORING, RETURNING | no viewpoint is | RETURNING |
+| EXPLORING, RETURNING | no viewpoint is worth a visit | RETURNING |
 | RETURNING | the robot has arrived and stands | FINISHED |
 | RETURNING | the way back stays refused | FAILED |
 
@@ -12,7 +12,7 @@ A viewpoint is given up if it is refused, or if the robot does not move towards 
 
 A goal of a user pauses the exploration until `PAUSE_NS` after that goal was reached, refused or cancelled.
 
-While the robot does not know where it is in the map, it keeps its goal, and the controller looks for the place instead.
+While the robot is not localised in the map, it keeps its goal, and the controller first localises it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from services.controller.goal_state import GoalState
     from services.controller.growing_map import PlannedMap
-    from services.controller.policies.exploration import FieldOfView, Survey, Viewpoint
+    from services.controller.policies.exploration import ExplorationState, FieldOfView, Viewpoint
 
 PAUSE_NS = 2_000_000_000  # for which the robot stands at a goal of a user
 STALLED_NS = 8_000_000_000  # without a motion of `STALLED_M`, after which the goal counts as unreachable
@@ -85,20 +85,22 @@ class Explorer:
             self.path_m += float(np.hypot(*(pose - self._pose)[:2]))
         self._pose, self._located = pose, located
 
-    def survey(self, field_of_view: FieldOfView) -> Survey:
-        """What the choice of the next viewpoint depends on."""
-        from services.controller.policies.exploration import Survey  # compiles
+    def exploration_state(self, field_of_view: FieldOfView) -> ExplorationState:
+        """The input for the choice of the next viewpoint."""
+        from services.controller.policies.exploration import ExplorationState  # slow: numba
 
         target = None
         if self.goal is not None and self.phase == "exploring":
             target = self.goal.pose.array()[:2]
         poses, home = self.map.message.poses, self.home[:2]
-        return Survey(self.map.graph, poses, self._arrivals, field_of_view, self._pose, home, target, self._unreachable)
+        return ExplorationState(
+            self.map.graph, poses, self._arrivals, field_of_view, self._pose, home, target, self._unreachable
+        )
 
     def update(self, state: GoalState, stamp_ns: int, *, moving: bool) -> bool:
-        """Takes the state of the robot's goal after a scan. Returns whether a viewpoint must be chosen now.
+        """Processes the state of the robot's goal after a scan. Returns whether a viewpoint must be chosen now.
 
-        ``moving`` is what the command says: a robot may stop late, beyond the goal that it has reached.
+        ``moving`` is by the command: a robot may stop late, beyond the goal that it has reached.
         """
         if not self.active or not (self.paused or self.goal is not None):
             return False

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.geometry.world import World
     from services.controller.growing_map import PlannedMap
-    from services.controller.policies.exploration import Survey, Viewpoint
+    from services.controller.policies.exploration import ExplorationState, Viewpoint
 
 
 @dataclass
@@ -48,8 +48,8 @@ class Navigator:
         self._map: PlannedMap | None = None  # the mapper's, if there is one
         self._pose: Array | None = None  # (3,) base_link in map, of the latest belief that tracks
         self.explorer: Explorer | None = None  # the last exploration, unless it was cancelled
-        self._requested: Goal | None = None  # to explore, which waits for the first map and a pose in it
-        self._viewpoint_due = False  # the exploration is to choose a viewpoint
+        self._requested: Goal | None = None  # request to explore, which waits for the first map and a pose in it
+        self._viewpoint_due = False  # whether the exploration has to choose a viewpoint
         self._scan: Scan | None = None
         self._scan_points = np.zeros((0, 2))  # m in base_link
 
@@ -97,22 +97,22 @@ class Navigator:
             self.explorer.map = planned
             self._viewpoint_due = self.explorer.drives
 
-    def take_survey(self) -> Survey | None:
-        """What the choice of a viewpoint depends on, if one is due. The answer is to be passed to `use_viewpoint`."""
+    def take_exploration_state(self) -> ExplorationState | None:
+        """Returns the input for the choice of a viewpoint if one is due, else None; then call `use_viewpoint`."""
         if self.goal_state.phase is Phase.UNLOCALISED:
-            return None  # the present goal makes the robot look for its place
+            return None  # the robot first has to be localised
         due, self._viewpoint_due = self._viewpoint_due, False
         if not due or self.explorer is None or self._map is None or self._scan is None or not self.explorer.drives:
             return None
-        from services.controller.policies.exploration import FieldOfView  # compiles
+        from services.controller.policies.exploration import FieldOfView  # slow: numba
 
-        return self.explorer.survey(FieldOfView.of(self._scan, self._map.message.grid.resolution))
+        return self.explorer.exploration_state(FieldOfView.of(self._scan, self._map.message.grid.resolution))
 
-    def use_viewpoint(self, viewpoint: Viewpoint | None, survey: Survey) -> None:
+    def use_viewpoint(self, viewpoint: Viewpoint | None, exploration_state: ExplorationState) -> None:
         """Drive to the viewpoint that was chosen, or back to the start if there is none."""
         if self.explorer is not None and self.explorer.drives:
             goal = self.explorer.next_goal(
-                viewpoint, survey.field_of_view.sector.half, under_way=self.goal_state.active
+                viewpoint, exploration_state.field_of_view.sector.half, under_way=self.goal_state.active
             )
             if goal is not None:
                 self._set_goal(goal)
@@ -140,7 +140,7 @@ class Navigator:
         return None if self._scan is None else self._scan.stamp_ns
 
     def step(self, belief: Belief) -> tuple[CmdVel, Status]:
-        """Command and status that answer a belief, both with its stamp."""
+        """Command and status for a belief, both with its stamp."""
         pose, manual_twist = belief.pose.array(), self._manual.twist(belief.stamp_ns)
         self._resume_after_pause(belief.stamp_ns)
         self.decision = Decision()
@@ -172,7 +172,7 @@ class Navigator:
         return command, status
 
     def step_without_belief(self, stamp_ns: int) -> tuple[CmdVel, Status] | None:
-        """Command and status that answer a scan while no estimator runs, so that manual driving still works.
+        """Command and status for a scan while no estimator runs, so that manual driving still works.
 
         Returns None if the robot stands and is not driven by hand.
         """

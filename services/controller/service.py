@@ -33,7 +33,7 @@ from services.controller.settings import ControllerSettings
 
 if TYPE_CHECKING:
     from services.controller.growing_map import PlannedMap
-    from services.controller.policies.exploration import Survey, Viewpoint
+    from services.controller.policies.exploration import ExplorationState, Viewpoint
     from services.controller.policies.geodesic_field import CostField
     from services.controller.policies.planner import GeodesicPolicy
 
@@ -80,7 +80,7 @@ class ControllerService(Service):
         self.geodesic: GeodesicPolicy | None = None  # the policy if the preset is `geodesic`
         self._map: PlannedMap | None = None  # the mapper's, if the policy plans in it
         self._map_job: BackgroundJob[PlannedMap] = BackgroundJob(self._wake)
-        self._viewpoint_job: BackgroundJob[tuple[Viewpoint | None, Survey]] = BackgroundJob(self._wake)
+        self._viewpoint_job: BackgroundJob[tuple[Viewpoint | None, ExplorationState]] = BackgroundJob(self._wake)
         self.self_filter = settings.build_self_filter()
         self._wait: BeliefWait = NoBelief()
         self._belief_received_s = 0.0  # time.monotonic() of the latest belief
@@ -189,7 +189,7 @@ class ControllerService(Service):
             self._step(belief, cpu_ns)
             return
         request = PredictRequest(poses=motions.poses().reshape(-1, 3), beams=PREDICTED_BEAMS)
-        self._latest_request = self.request(PREDICT, request, PREDICTION_TIMEOUT_S)
+        self._latest_request = self.send_request(PREDICT, request, PREDICTION_TIMEOUT_S)
         self._wait = AwaitsPredictions(belief, cpu_ns)
 
     def on_reply(self, query: Query, number: int, reply: Reply) -> None:  # noqa: ARG002 - PREDICT is the only query
@@ -262,10 +262,10 @@ class ControllerService(Service):
 
     def _choose_viewpoint(self) -> None:
         """If the exploration is to choose a viewpoint, do so in a thread."""
-        if (survey := self.navigator.take_survey()) is not None:
+        if (exploration_state := self.navigator.take_exploration_state()) is not None:
             from services.controller.policies.exploration import choose_viewpoint
 
-            self._viewpoint_job.submit(lambda: (choose_viewpoint(survey), survey))
+            self._viewpoint_job.submit(lambda: (choose_viewpoint(exploration_state), exploration_state))
 
     def _send(self, command: CmdVel, status: Status) -> None:
         self.publish(STATUS, status)

@@ -20,16 +20,16 @@ from common.robot.scanner import SCANNERS, Scanner
 from services.estimator.paper.perception import Descent
 from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.particle_filter.sensor import Sensor
-from services.estimator.particle_filter.settings import Settings as ParticleSettings
+from services.estimator.particle_filter.settings import ParticleFilterSettings
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.gauss_newton import Optimiser
 from services.estimator.precise.global_seeds import SEED_SPACING_M, Seeds, thin_places
 from services.estimator.precise.learning import weights
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.motion_model import MotionNoise
-from services.estimator.precise.settings import Settings
+from services.estimator.precise.settings import PreciseSettings
 from services.estimator.shared.generative_models import GenerativeModel, RayCaster, map_error
-from services.estimator.shared.interface import Estimator, Observation
+from services.estimator.shared.interface import Observation, PoseEstimator
 from services.estimator.shared.model_folder import find_folder
 
 DEFAULT_SIGMA_M = 0.02  # noise of a scanner whose scans state none
@@ -128,7 +128,7 @@ class Geometry:
         return Likelihood(max(self.sigma, MIN_SIGMA_M), relative=self.sigma_relative)
 
 
-Factory = Callable[[Geometry], Estimator]
+Factory = Callable[[Geometry], PoseEstimator]
 
 
 def prepare(options: EstimatorOptions) -> Factory:
@@ -148,8 +148,8 @@ def prepare(options: EstimatorOptions) -> Factory:
     RayCaster(world).expect(np.zeros((1, 3)), np.zeros(1))  # compile now, so that no request has to wait
     sensor = functools.cache(functools.partial(Sensor, world))  # all filters share one field
 
-    def make(geometry: Geometry) -> Estimator:
-        settings = ParticleSettings.tuned() if tuned else ParticleSettings()
+    def make(geometry: Geometry) -> PoseEstimator:
+        settings = ParticleFilterSettings.tuned() if tuned else ParticleFilterSettings()
         if tuned:
             settings = replace(settings, robot_model_type="omni")  # this model also covers a differential base
         x, y, yaw = map(float, geometry.mount)
@@ -165,12 +165,12 @@ def prepare(options: EstimatorOptions) -> Factory:
 def _precise(options: EstimatorOptions, world: World) -> Factory:
     model, seeds, card = load_model(options, world)
     calibration = card.calibration if card else None
-    settings = calibration.settings() if calibration else Settings(inflation=card.inflation if card else 1.0)
+    settings = calibration.settings() if calibration else PreciseSettings(inflation=card.inflation if card else 1.0)
     error = 0.0 if calibration else map_error(world)
     bounds = (card.world if card else world).bounds
     _compile(model, seeds)
 
-    def make(geometry: Geometry) -> Estimator:
+    def make(geometry: Geometry) -> PoseEstimator:
         if card:
             check_mount(geometry, card.scanner)
         if options.likelihood is not None:
@@ -213,7 +213,7 @@ def field_path(options: EstimatorOptions, world: World) -> Path:
     return path
 
 
-def check(options: EstimatorOptions, world: World) -> None:
+def check_options(options: EstimatorOptions, world: World) -> None:
     """Raises UserError if a model is missing, as `prepare` does, but without compiling anything."""
     check_start(options, world)
     if options.estimator == "precise" and options.model != "exact":
@@ -269,7 +269,7 @@ def _paper(options: EstimatorOptions, world: World) -> Factory:
     from services.estimator.paper import weights as paper_weights
     from services.estimator.paper.beam_fitting import fit
     from services.estimator.paper.decoder import use_one_core
-    from services.estimator.paper.estimator import PaperPerception
+    from services.estimator.paper.estimator import PaperEstimator
 
     use_one_core()
     folder, files, remedy = _paper_weights(options, world)
@@ -284,11 +284,11 @@ def _paper(options: EstimatorOptions, world: World) -> Factory:
         model.predict(np.array([*card.world.center(), card.heading]))
     load = functools.cache(paper_weights.load)  # all estimators share one network
 
-    def make(geometry: Geometry) -> Estimator:
+    def make(geometry: Geometry) -> PoseEstimator:
         model, card = load(paper_weights.nearest(folder, world.name, "paper", len(geometry.angles)))
         check_mount(geometry, card.scanner)
         converted = fit(card.scanner, geometry.angles, geometry.mount, f"{train_command} {_train_options(geometry)}")
-        return PaperPerception(model, card, options.descent, options.initial_pose, converted)
+        return PaperEstimator(model, card, options.descent, options.initial_pose, converted)
 
     return make
 

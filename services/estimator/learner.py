@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 from common.processes import end_with_parent
 from services.estimator.precise.learning import weights
-from services.estimator.precise.learning.key_scans import KeyScans
-from services.estimator.precise.learning.live_learning import Version, learn_version
+from services.estimator.precise.learning.key_scans import KeyScanCollector
+from services.estimator.precise.learning.live_learning import ModelVersion, learn_version
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -27,10 +27,10 @@ NICENESS = 10  # of the process that learns: the other services come first, but 
 
 
 @dataclass(frozen=True)
-class LearnedVersion:
+class EncodedVersion:
     """A version of the model, and the bytes from which another process decodes the same."""
 
-    version: Version
+    version: ModelVersion
     data: bytes
 
 
@@ -39,12 +39,12 @@ class Learner:
 
     def __init__(self, estimator: PreciseEstimator, geometry: Geometry) -> None:
         """The model of the ``estimator`` is the original one."""
-        self.keys = KeyScans(geometry.angles, geometry.mount, geometry.range_max)
+        self.keys = KeyScanCollector(geometry.angles, geometry.mount, geometry.range_max)
         self._original, self._places = estimator.model, estimator.seeds.places
         self._pool = ThreadPoolExecutor(1, "learner")
         self._process: BaseProcess | None = None
         self._closed = False
-        self._running: Future[LearnedVersion | None] | None = None
+        self._running: Future[EncodedVersion | None] | None = None
 
     def add(self, posterior: Posterior, observation: Observation, present: GenerativeModel) -> None:
         """Adds a scan, and starts learning if enough key scans are new; ``present`` is the model in use."""
@@ -52,7 +52,7 @@ class Learner:
         if self._running is None and (drive := self.keys.take_drive()) is not None:
             self._running = self._pool.submit(self._learn, present, drive)
 
-    def take(self) -> LearnedVersion | None:
+    def take(self) -> EncodedVersion | None:
         """The version that was learned since the last call, if any; raises RuntimeError if learning failed."""
         if self._running is None or not self._running.done():
             return None
@@ -66,7 +66,7 @@ class Learner:
         if (process := self._process) is not None:
             process.terminate()
 
-    def _learn(self, present: GenerativeModel, drive: ReferenceDrive) -> LearnedVersion | None:
+    def _learn(self, present: GenerativeModel, drive: ReferenceDrive) -> EncodedVersion | None:
         # Forking would copy the locks of threads. `start` takes a while, as it sends the arguments to the new process.
         context = multiprocessing.get_context("spawn")
         receiver, sender = context.Pipe(duplex=False)
@@ -81,7 +81,7 @@ class Learner:
         if self._closed:
             process.terminate()
         try:
-            learned: LearnedVersion | None = receiver.recv()
+            learned: EncodedVersion | None = receiver.recv()
         except EOFError:
             process.join()
             raise RuntimeError(f"the process that learns ended with status {process.exitcode}") from None
@@ -103,5 +103,5 @@ def _learn_and_send(
     if version is not None:
         data = weights.encode(version.model, version.seeds.places)
         model, seeds = weights.decode(data)
-        learned = LearnedVersion(replace(version, model=model, seeds=seeds), data)
+        learned = EncodedVersion(replace(version, model=model, seeds=seeds), data)
     sender.send(learned)

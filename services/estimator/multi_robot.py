@@ -25,7 +25,7 @@ from services.estimator.shared.interface import SearchingEstimator
 if TYPE_CHECKING:
     from common.bus.bus import Bus
     from common.messages.definitions import Scan
-    from services.estimator.shared.interface import Estimator, Observation, Posterior
+    from services.estimator.shared.interface import Observation, PoseEstimator, Posterior
 
 DISCOVERY_PERIOD_S = 0.5  # between two checks for new and absent robots
 HEALTH_CHECK_PERIOD_S = 0.05  # between two checks for due health messages
@@ -57,7 +57,7 @@ class FleetRobot(EstimatorService):
         self._start_search = start_search
         self._searched_scan: Scan | None = None
 
-    def update_estimator(self, scan: Scan, estimator: Estimator, observation: Observation) -> None:
+    def update_estimator(self, scan: Scan, estimator: PoseEstimator, observation: Observation) -> None:
         """Tracks at once, and starts a search if one is needed."""
         self.publish_search()  # of a scan that was handled late, because its odometry did not arrive
         if not isinstance(estimator, SearchingEstimator):

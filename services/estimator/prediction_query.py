@@ -11,13 +11,15 @@ from common.messages.requests import PredictReply, PredictRequest
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
-    from services.estimator.shared.interface import Estimator
+    from services.estimator.shared.interface import PoseEstimator
 
 MAX_POSES = 1000
 MAX_RANGES = 1_000_000  # take about half a second, during which no scan is processed
 
 
-def answer_prediction(estimator: Estimator, request: PredictRequest, angles: Array, range_max: float) -> PredictReply:
+def answer_prediction(
+    estimator: PoseEstimator, request: PredictRequest, angles: Array, range_max: float
+) -> PredictReply:
     """Predicts scans of a scanner with beams at ``angles`` (B,) rad; ranges beyond ``range_max`` m become +inf.
 
     Raises UserError if the request is too large, or the model cannot predict the poses.

@@ -51,7 +51,7 @@ from common.runtime.odometry_sync import OdometrySync, ScanWithOdometry
 from common.runtime.service import Service
 from services.estimator.factory import EstimatorOptions, Factory, Geometry, prepare
 from services.estimator.field_exchange import FieldAssembler, split_into_messages
-from services.estimator.learner import LearnedVersion, Learner
+from services.estimator.learner import EncodedVersion, Learner
 from services.estimator.model_card import ModelInUse, model_in_use, save_learned
 from services.estimator.paper.perception import Descent
 from services.estimator.precise.estimator import PreciseEstimator
@@ -59,7 +59,7 @@ from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.live_learning import mean_error
 from services.estimator.prediction_query import answer_prediction
 from services.estimator.settings import EstimatorSettings
-from services.estimator.shared.interface import Estimator, Observation, Posterior
+from services.estimator.shared.interface import Observation, PoseEstimator, Posterior
 
 FIELD_PERIOD_NS = 30_000_000_000  # after which the learned field is published again, for recordings that begin later
 
@@ -118,7 +118,7 @@ class EstimatorService(Service):
         self.inputs = (SCAN, GOAL, *motion_inputs, *followed)  # type: ignore[misc]
         self.models = models
         self.geometry: Geometry | None = None
-        self.estimator: Estimator | None = None
+        self.estimator: PoseEstimator | None = None
         self.model: ModelInUse | str = "no scan has come yet"  # or the reason why it is unknown
         self.goal: Goal | None = None
         self.odometry_sync = OdometrySync()  # used if the prior is odometry
@@ -126,7 +126,7 @@ class EstimatorService(Service):
         self.last: tuple[int, Belief, Prediction] | None = None  # stamp in ns and results of the latest scan
         self.field_version = 0  # of the field learned while driving; 0 is the original model
         self._learner: Learner | None = None
-        self._learned: LearnedVersion | None = None  # in use
+        self._learned: EncodedVersion | None = None  # in use
         self._field_ns = 0  # stamp with which it was published last
         self._assembler = FieldAssembler()
 
@@ -185,7 +185,7 @@ class EstimatorService(Service):
             elif (estimator := self._estimator_for(scan)) is not None:
                 self.update_estimator(scan, estimator, self._observation(scan, odom))
 
-    def update_estimator(self, scan: Scan, estimator: Estimator, observation: Observation) -> None:
+    def update_estimator(self, scan: Scan, estimator: PoseEstimator, observation: Observation) -> None:
         """Updates the estimator and publishes the posterior."""
         posterior = estimator.update(observation)
         self.publish_posterior(scan, posterior, estimator.name)
@@ -214,7 +214,7 @@ class EstimatorService(Service):
         )
         self._publish_field(learned, stamp_ns)
 
-    def _publish_field(self, learned: LearnedVersion, stamp_ns: int) -> None:
+    def _publish_field(self, learned: EncodedVersion, stamp_ns: int) -> None:
         self._field_ns = stamp_ns
         for message in split_into_messages(learned.data, self.field_version, self._base(), stamp_ns):
             self.publish(FIELD, message)
@@ -257,7 +257,7 @@ class EstimatorService(Service):
         self.publish(PREDICTION, prediction)
         self.publish(BELIEF, belief)
 
-    def _estimator_for(self, scan: Scan) -> Estimator | None:
+    def _estimator_for(self, scan: Scan) -> PoseEstimator | None:
         """Returns the estimator for a scan, and builds a new one if the scanner has changed.
 
         If there is no model for the scanner, logs the reason, puts it into the health note, and returns None.

@@ -24,8 +24,8 @@ from common.runtime.service import Service
 from services.mapper.settings import MapperSettings
 from services.mapper.slam.drive import Laser
 from services.mapper.slam.elements import elements_of_scan
-from services.mapper.slam.front_end import Place
-from services.mapper.slam.mapper import GrownMap, Mapper
+from services.mapper.slam.front_end import ScanPose
+from services.mapper.slam.mapper import Mapper, MapSnapshot
 from services.mapper.slam.search import search
 
 UPDATE_PERIOD_NS = 1_000_000_000  # between the beginnings of two updates of the map, which leaves time for the scans
@@ -52,7 +52,7 @@ class MapperService(Service):
         self._belief: Belief | None = None  # of the latest scan
         self._odometry_sync = OdometrySync()
         self._pool = ThreadPoolExecutor(1, "update")
-        self._update: Future[GrownMap] | None = None  # that runs now
+        self._update: Future[MapSnapshot] | None = None  # running
         self._update_ns = self._published_ns = -UPDATE_PERIOD_NS  # stamps of the last update and of the last map
 
     def open(self) -> None:
@@ -83,10 +83,10 @@ class MapperService(Service):
         ranges = ranges_for_localisation(scan.ranges)
         if not np.array_equal(angles, mapper.laser.angles):  # some scanners' numbers of beams vary from turn to turn
             ranges = evenly_spaced(ranges, angles, Sweep.of_angles(mapper.laser.angles), -np.inf)
-        place = mapper.add(scan.stamp_ns * 1e-9, ranges, None if odom is None else odom.pose.array())
-        if not place.matched:
+        scan_pose = mapper.add(scan.stamp_ns * 1e-9, ranges, None if odom is None else odom.pose.array())
+        if not scan_pose.matched:
             self.counters["unmatched_scans"] += 1
-        self._belief = belief_message(scan, place)
+        self._belief = belief_message(scan, scan_pose)
         self.publish(BELIEF, self._belief)
         if self._update is None and mapper.outdated and scan.stamp_ns - self._update_ns >= UPDATE_PERIOD_NS:
             self._start_update(mapper, scan.stamp_ns)
@@ -99,7 +99,7 @@ class MapperService(Service):
         self._update.add_done_callback(lambda _: self.loop.inbox.wake())
 
     def _mapper_for(self, scan: Scan) -> Mapper:
-        """The mapper; a new one if time has gone back or the scanner was moved, as then no scan fits the map."""
+        """The mapper; a new one if time went back or the mount changed, because then scans no longer fit the map."""
         mount = scan.mount.array()
         restarted = self._belief is not None and scan.stamp_ns < self._belief.stamp_ns
         if self.mapper is None or restarted or not np.allclose(mount, self.mapper.laser.mount, atol=1e-4):
@@ -115,11 +115,11 @@ class MapperService(Service):
         return 0.0 if self._update is not None and self._update.done() else None
 
     def on_timer(self) -> None:
-        """Uses and publishes the updated map."""
+        """Takes the updated map into use, and publishes it."""
         self._finish_update()
 
     def _finish_update(self) -> None:
-        assert self.mapper is not None  # noqa: S101 - updates begin with it
+        assert self.mapper is not None  # noqa: S101 - only a mapper starts updates
         update, self._update = self._update, None
         if update is None:
             return
@@ -136,7 +136,7 @@ class MapperService(Service):
             self.publish(MAP, map_message(self._belief.stamp_ns, mapper.map))
 
     def on_request(self, query: Query, request: Request) -> Reply:
-        """Saves the map as it was published last."""
+        """Saves the last published map."""
         if not isinstance(request, SaveMapRequest):
             return super().on_request(query, request)
         if self.mapper is None:
@@ -164,12 +164,12 @@ def save_map(folder: Path, name: str, mapper: Mapper) -> Path:
         raise UserError(f"{path}: cannot be written ({error.strerror}): choose another folder with --maps") from None
 
 
-def belief_message(scan: Scan, place: Place) -> Belief:
-    """The place of a scan as a message."""
-    pose, covariance = Pose.of(place.pose), place.covariance if place.matched else None
+def belief_message(scan: Scan, scan_pose: ScanPose) -> Belief:
+    """The belief that states the pose of a scan."""
+    pose, covariance = Pose.of(scan_pose.pose), scan_pose.covariance if scan_pose.matched else None
     return Belief(
         stamp_ns=scan.stamp_ns,
-        state="tracking" if place.matched else "lost",
+        state="tracking" if scan_pose.matched else "lost",
         pose=pose,
         covariance=covariance,
         hypotheses=[Hypothesis(pose=pose, covariance=covariance, weight=1.0)],
@@ -177,8 +177,8 @@ def belief_message(scan: Scan, place: Place) -> Belief:
     )
 
 
-def map_message(stamp_ns: int, grown: GrownMap) -> Map:
+def map_message(stamp_ns: int, snapshot: MapSnapshot) -> Map:
     """The map as a message."""
-    ends = grown.poses[grown.closures.ravel(), :2].astype(np.float32)
-    known = np.isfinite(grown.poses).all(axis=1)
-    return Map(stamp_ns=stamp_ns, grid=grown.grid, poses=grown.poses[known], closures=ends)
+    ends = snapshot.poses[snapshot.closures.ravel(), :2].astype(np.float32)
+    known = np.isfinite(snapshot.poses).all(axis=1)
+    return Map(stamp_ns=stamp_ns, grid=snapshot.grid, poses=snapshot.poses[known], closures=ends)

@@ -28,7 +28,7 @@ from services.recorder.files.writer import PROFILE
 
 
 @dataclass(frozen=True)
-class Raw:
+class RawMessage:
     """One recorded payload with its wall-clock times, in ns."""
 
     key: str
@@ -79,7 +79,7 @@ class Recording:
 
     def payloads(
         self, keys: Collection[str] | None = None, start_ns: int | None = None, end_ns: int | None = None
-    ) -> Iterator[Raw]:
+    ) -> Iterator[RawMessage]:
         """Yields the payloads in the order in which they were received.
 
         ``keys`` defaults to all keys. ``start_ns`` (included) and ``end_ns`` (excluded) are wall times of reception.
@@ -88,16 +88,16 @@ class Recording:
         try:
             with self.path.open("rb") as stream:
                 for channel, message in (self._indexed if self.indexed else self._torn)(stream, keys, start_ns, end_ns):
-                    yield Raw(channel.topic, message.data, message.publish_time, message.log_time)
+                    yield RawMessage(channel.topic, message.data, message.publish_time, message.log_time)
         except OSError as error:
             raise _unreadable(self.path, error) from None
 
     @property
-    def raw(self) -> list[Raw]:
+    def raw(self) -> list[RawMessage]:
         """All payloads as a list, for short recordings."""
         return list(self.payloads())
 
-    def messages(self, *topics: Topic) -> Iterator[tuple[Topic, Stamped, Raw]]:
+    def messages(self, *topics: Topic) -> Iterator[tuple[Topic, Stamped, RawMessage]]:
         """Yields topic, decoded message and payload. Defaults to all topics.
 
         Payloads that cannot be decoded are skipped and counted in `undecodable`.

@@ -17,8 +17,8 @@ from common.log import Logger
 from common.messages.requests import RecordReply
 from common.messages.topics import Topic
 from common.versions import versions
-from services.recorder.files.message_counts import Count, Ledger, as_metadata
-from services.recorder.files.parts import Limits, PartsWriter
+from services.recorder.files.message_counts import KeyCounts, MessageCounts, as_metadata
+from services.recorder.files.parts import PartLimits, PartsWriter
 from services.recorder.files.writer import UNFINISHED_SUFFIX, NameTakenError, RecordingWriter, is_being_written
 from services.recorder.session_description import DescriptionReply, MetadataRecord, records_of
 from services.recorder.settings import RecorderSettings
@@ -34,10 +34,10 @@ class OpenRecording:
 
         The metadata known so far is written first, so that it is readable even in a file that is never finished.
         """
-        self.ledger = Ledger()
+        self.message_counts = MessageCounts()
         self._inbox, self._before, self._began = inbox, inbox.tally(), time.monotonic()
         self._logged_ns = 0  # log time of the last message
-        limits = Limits(int(options.split_size * 1e6), options.split_minutes * 60)
+        limits = PartLimits(int(options.split_size * 1e6), options.split_minutes * 60)
         writer = self.writer = PartsWriter(parts_of(options, numbered=numbered), limits, self._counters)
         writer.metadata("presage", {"robot": options.robot, "command": " ".join(sys.argv), **versions()})
         writer.metadata("config:recorder", {"config": json.dumps(options.effective())})
@@ -52,7 +52,7 @@ class OpenRecording:
         self._logged_ns = max(self._logged_ns, sample.received_ns)
         published = sample.published_ns or sample.received_ns
         self.writer.write(sample.topic, sample.key, sample.payload, published, self._logged_ns)
-        self.ledger.see(sample.key, sample.payload)
+        self.message_counts.add(sample.key, sample.payload)
 
     def describe(self, service: str, answer: DescriptionReply) -> None:
         """Writes a service's reply about its configuration, world or model."""
@@ -60,12 +60,12 @@ class OpenRecording:
 
     def state(self) -> RecordReply:
         """File, number of messages and duration so far."""
-        written, seconds = sum(self.ledger.written.values()), time.monotonic() - self._began
+        written, seconds = sum(self.message_counts.written.values()), time.monotonic() - self._began
         return RecordReply(recording=True, file=str(self.writer.part.path), messages=written, seconds=seconds)
 
     def missing(self) -> int:
         """Messages that were published and never received, by their sequence numbers."""
-        return sum(self.ledger.lost(key).missing for key in self.ledger.sequences)
+        return sum(self.message_counts.lost(key).missing for key in self.message_counts.sequences)
 
     def lost(self) -> int:
         """Upper bound of the messages that were queued but are not in the file, after writing failed."""
@@ -76,9 +76,9 @@ class OpenRecording:
         """Messages that were dropped because the queue was full."""
         return sum(count.dropped for count in self._counts().values())
 
-    def _counts(self) -> dict[str, Count]:
+    def _counts(self) -> dict[str, KeyCounts]:
         received, dropped, oversized = self._since(self._inbox.tally())
-        return self.ledger.counts(received, dropped, oversized)
+        return self.message_counts.counts(received, dropped, oversized)
 
     def _since(self, now: tuple[Counter[str], ...]) -> list[dict[str, int]]:
         """Counts by key since the recording began, without requests, which the inbox counts by query name."""

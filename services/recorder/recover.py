@@ -24,7 +24,7 @@ from mcap.stream_reader import StreamReader
 from common.errors import UserError
 from services.recorder.files.chunks import MAGIC, PREFIX, mcap_writer, records_of
 from services.recorder.files.index import summary_of
-from services.recorder.files.message_counts import Ledger, as_metadata
+from services.recorder.files.message_counts import MessageCounts, as_metadata
 from services.recorder.files.writer import PROFILE, UNFINISHED_SUFFIX, claim, is_being_written
 
 TORN_SUFFIX = ".torn"  # appended to the name of an unfinished source file after recovery
@@ -33,7 +33,7 @@ LANDMARK = re.compile(rb"[\x06\x09\x0c](?=.{5}\x00\x00\x00)", re.DOTALL)
 
 
 @dataclass(frozen=True)
-class Damage:
+class DamagedRange:
     """A range of bytes that could not be read."""
 
     offset: int
@@ -41,7 +41,7 @@ class Damage:
 
 
 @dataclass
-class Recovered:
+class RecoveryResult:
     """Result of a recovery."""
 
     source: Path
@@ -52,10 +52,10 @@ class Recovered:
     start_ns: int | None = None
     end_ns: int | None = None
     skipped: int = 0  # messages in intact chunks whose channel declaration is lost
-    damages: list[Damage] = field(default_factory=list)
+    damages: list[DamagedRange] = field(default_factory=list)
     altered: bool = False  # no chunk or length is damaged, but the file's checksum is wrong
     source_finished: bool = False  # the source file was finished: only the damaged parts are missing
-    ledger: Ledger = field(default_factory=Ledger)
+    message_counts: MessageCounts = field(default_factory=MessageCounts)
 
     def lines(self) -> list[str]:
         """Lines of a report for the user."""
@@ -73,14 +73,14 @@ class Recovered:
         lines += [
             f"missing: {numbers.missing} messages of {key} by their sequence numbers, in {numbers.gaps} gaps"
             for key in self.messages
-            if (numbers := self.ledger.lost(key)).missing
+            if (numbers := self.message_counts.lost(key)).missing
         ]
         return lines
 
 
 def recover(
     source: Path, path: Path | None = None, *, on_progress: Callable[[float], None] = lambda _: None
-) -> Recovered:
+) -> RecoveryResult:
     """Writes the readable part of ``source`` to ``path``, which defaults to `target_of`.
 
     An unfinished source (.mcap.active) is renamed to .mcap.torn. Raises UserError if the source is still being written,
@@ -95,7 +95,7 @@ def recover(
                 raise UserError(f"{source}: is empty, there is nothing to recover: it can be removed")
             declared = _declared(stream)
             with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
-                found = _copy(data, Recovered(source, path, len(data)), declared, on_progress)
+                found = _copy(data, RecoveryResult(source, path, len(data)), declared, on_progress)
     except OSError as error:
         file = error.filename or source
         raise UserError(f"{file}: cannot be read or written ({error.strerror}); name another file with --out") from None
@@ -121,8 +121,8 @@ def _declared(stream: BinaryIO) -> list[Schema | Channel]:
 
 
 def _copy(
-    data: mmap.mmap, found: Recovered, declared: list[Schema | Channel], on_progress: Callable[[float], None]
-) -> Recovered:
+    data: mmap.mmap, found: RecoveryResult, declared: list[Schema | Channel], on_progress: Callable[[float], None]
+) -> RecoveryResult:
     active = found.path.with_name(found.path.name + ".recovering")
     if not is_being_written(active):  # left by an interrupted recovery
         active.unlink(missing_ok=True)
@@ -146,7 +146,7 @@ def _copy(
 class _Copier:
     """Copies records of one file to another."""
 
-    def __init__(self, stream: BinaryIO, found: Recovered, declared: list[Schema | Channel]) -> None:
+    def __init__(self, stream: BinaryIO, found: RecoveryResult, declared: list[Schema | Channel]) -> None:
         """Writes to ``stream``. ``declared`` are the summary's declarations, in case their chunks are damaged."""
         self._writer, _ = mcap_writer(stream, "zstd", 1 << 18)
         self._found, self._declared = found, declared
@@ -187,7 +187,7 @@ class _Copier:
         self._writer.add_message(channel, record.log_time, record.data, record.publish_time, record.sequence)
         key = self._keys[record.channel_id]
         found.messages[key] += 1
-        found.ledger.see(key, record.data)
+        found.message_counts.add(key, record.data)
         found.start_ns = record.log_time if found.start_ns is None else found.start_ns
         found.end_ns = record.log_time
 
@@ -198,13 +198,13 @@ class _Copier:
             raise UserError(f"{found.source}: no message in it can be recovered: {_reason(found)}")
         lost = sum(damage.length for damage in found.damages)
         about = {"from": found.source.name, "bytes": str(found.size), "bytes_not_used": str(lost)}
-        counts = found.ledger.counts(found.messages, {}, {})
+        counts = found.message_counts.counts(found.messages, {}, {})
         self._writer.add_metadata("counters", as_metadata(counts))
         self._writer.add_metadata("recovered", about)
         self._writer.finish()  # type: ignore[no-untyped-call]
 
 
-def _reason(found: Recovered) -> str:
+def _reason(found: RecoveryResult) -> str:
     """Explains why no message was recovered."""
     if found.skipped:
         return f"{found.skipped} are in whole chunks, but the declarations of their channels are damaged"
@@ -216,14 +216,14 @@ def _reason(found: Recovered) -> str:
     return f"{lost} of its {found.size} bytes are damaged or cut short"
 
 
-def _walk(data: mmap.mmap, found: Recovered) -> Iterator[tuple[list[McapRecord], int]]:
+def _walk(data: mmap.mmap, found: RecoveryResult) -> Iterator[tuple[list[McapRecord], int]]:
     """Yields the content of each intact record and its end offset. Skips damaged bytes up to the next intact record."""
     offset, size = len(MAGIC), len(data)
     while offset < size:
         records = _parse(data, offset)
         if records is None:
             following = _next_intact(data, offset)
-            found.damages.append(Damage(offset, following - offset))
+            found.damages.append(DamagedRange(offset, following - offset))
             offset = following
             continue
         opcode, length = PREFIX.unpack_from(data, offset)

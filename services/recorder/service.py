@@ -107,9 +107,9 @@ class RecorderService(Service):
         state, dropped, missing = recording.state(), recording.dropped(), recording.missing()
         self._ended = state.model_copy(update={"recording": False})
         self._update_note()
-        for key, written in recording.ledger.written.items():
+        for key, written in recording.message_counts.written.items():
             self._written[key] += written
-            self._missing[key] += recording.ledger.lost(key).missing
+            self._missing[key] += recording.message_counts.lost(key).missing
         writer = recording.writer
         try:
             *_, path = files = writer.finish()
@@ -134,8 +134,8 @@ class RecorderService(Service):
         """Written and missing messages of a key, for the health message."""
         written, missing = self._written[key], self._missing[key]
         if self.recording is not None:
-            ledger = self.recording.ledger
-            written, missing = written + ledger.written.get(key, 0), missing + ledger.lost(key).missing
+            message_counts = self.recording.message_counts
+            written, missing = written + message_counts.written.get(key, 0), missing + message_counts.lost(key).missing
         return {"written": written, "missing": min(missing, MAX_COUNT)}
 
     def due(self) -> float | None:

@@ -173,21 +173,23 @@ class DescriptionCollector:
     def _query(self, service: str, query: Query) -> float | None:
         """Queries the service and queues a changed reply. Returns the delay until the next query in s, or None."""
         if query is CONFIG:
-            self._queue_if_new(service, query, self._bus.ask(CONFIG, Request(), ConfigReply, ANSWER_TIMEOUT_S, service))
+            self._queue_if_new(
+                service, query, self._bus.query(CONFIG, Request(), ConfigReply, ANSWER_TIMEOUT_S, service)
+            )
         elif query is WORLD:
-            self._queue_if_new(service, query, self._bus.ask(WORLD, Request(), WorldReply, ANSWER_TIMEOUT_S))
+            self._queue_if_new(service, query, self._bus.query(WORLD, Request(), WorldReply, ANSWER_TIMEOUT_S))
         else:
             return self._query_model(service)
         return None
 
     def _query_model(self, service: str) -> float:
-        reply = self._bus.ask(MODEL, ModelRequest(), ModelReply, ANSWER_TIMEOUT_S)
+        reply = self._bus.query(MODEL, ModelRequest(), ModelReply, ANSWER_TIMEOUT_S)
         if not reply.ok:
             return MODEL_RETRY_DELAY_S
         if reply != self._last.get((service, MODEL.name)):
             with_weights = reply
             if self._weights and 0 < reply.size <= MAX_WEIGHTS_BYTES:
-                with_weights = self._bus.ask(MODEL, ModelRequest(weights=True), ModelReply, ANSWER_TIMEOUT_S)
+                with_weights = self._bus.query(MODEL, ModelRequest(weights=True), ModelReply, ANSWER_TIMEOUT_S)
                 if not with_weights.ok:
                     self._log.warning("the weights are not stored", reason=with_weights.reason)
                     with_weights = reply

@@ -15,7 +15,7 @@ from common.geometry.se2 import Array
 
 
 @dataclass(frozen=True)
-class Drift:
+class OdometryNoise:
     """Variance added per unit of motion."""
 
     turn_by_turn: float = 1e-3  # alpha 1, rad²/rad
@@ -27,7 +27,7 @@ class Drift:
 class Odometer:
     """Pose and covariance in odom, from the true motion and noise. Starts at the origin with zero covariance."""
 
-    def __init__(self, drift: Drift, rng: np.random.Generator) -> None:
+    def __init__(self, drift: OdometryNoise, rng: np.random.Generator) -> None:
         self.drift, self._rng = drift, rng
         self.pose, self.covariance = np.zeros(3), np.zeros((3, 3))
 

@@ -44,7 +44,7 @@ from common.messages.topics import (
 from common.runtime.service import Service
 from services.simulator.physics import choose_engine
 from services.simulator.settings import SimulatorSettings
-from services.simulator.simulation import Setup, Simulation
+from services.simulator.simulation import Simulation, SimulationSetup
 
 MAX_SAMPLE_RANGES = 4_000_000  # in one reply, 16 MB
 MAX_LAG_S = 1.0  # a simulation farther behind real time does not catch up
@@ -94,7 +94,7 @@ class SimulatorService(Service):
         engine = choose_engine(settings.physics)
         if settings.physics == "auto" and engine == "kinematic":
             self.log.warning("pybullet is not installed: the simulation is kinematic, contacts just stop the robot")
-        self.setup = Setup(
+        self.setup = SimulationSetup(
             world=load_world(settings.world),
             scanner=scanner,
             robot=robot,

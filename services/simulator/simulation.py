@@ -19,7 +19,7 @@ from common.robot.motion_distortion import beam_times, correct_scan
 from common.robot.scanner import Scanner
 from common.runtime import safety
 from services.simulator.actuator import Actuator
-from services.simulator.odometry import Drift, Odometer
+from services.simulator.odometry import Odometer, OdometryNoise
 from services.simulator.physics import SUBSTEP_S, Engine, Physics, choose_engine
 from services.simulator.recent_motion import MotionState, RecentMotion
 
@@ -30,7 +30,7 @@ SAMPLE_BLOCK_POSES = 200  # poses whose scans are simulated together
 
 
 @dataclass(frozen=True)
-class Setup:
+class SimulationSetup:
     """Everything that a run depends on, besides the commands."""
 
     world: World
@@ -38,7 +38,7 @@ class Setup:
     robot: Robot = field(default_factory=Robot)
     start: tuple[float, float, float] | None = None  # x m, y m, yaw rad; defaults to the world's start
     seed: int = 0
-    drift: Drift = field(default_factory=Drift)
+    drift: OdometryNoise = field(default_factory=OdometryNoise)
     slip: float = 0.0  # mean share of its motion that a wheel loses
     obstacle_stop: bool = True  # off only for fault injection
     sweep: bool = False  # measure one beam after another, as a rotating scanner does, not all at once
@@ -50,11 +50,11 @@ class Setup:
 class Simulation:
     """The simulated robot. The same setup and commands give the same bytes.
 
-    With `Setup.sweep`, a scan is published when its last beam has been measured, with the stamp of its first: the
-    physics is ahead of the stamp by the time of a sweep, and a command takes effect as much later.
+    With `SimulationSetup.sweep`, a scan is published when its last beam has been measured, with the stamp of its first
+    beam: the physics is ahead of the stamp by the time of a sweep, and a command takes effect as much later.
     """
 
-    def __init__(self, setup: Setup) -> None:
+    def __init__(self, setup: SimulationSetup) -> None:
         """Begin at time 0. Raises UserError if the robot would stand in a wall, or the people have no room."""
         self.setup, self.world = setup, _name_obstacles(setup.world)
         robot, scanner = setup.robot, setup.scanner
@@ -318,7 +318,7 @@ def _reach(scanner: Scanner) -> float:
 def _create_physics(engine: Engine, world: World, robot: Robot, pose: Array) -> Physics:
     """Build the boundary or the map of ``world`` without its furniture, and put the robot at ``pose`` (3,)."""
     if engine == "kinematic":
-        from services.simulator.kinematics import Kinematics  # compiles its rays
+        from services.simulator.kinematics import Kinematics  # slow: numba
 
         return Kinematics(world, robot, pose)
     from services.simulator.pybullet_physics import PybulletPhysics  # has no wheels on some platforms

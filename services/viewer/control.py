@@ -1,7 +1,7 @@
 """Goals, teleports, obstacles and driving over the bus.
 
 Every action returns an `ActionResult`. An action that cannot be carried out raises UserError with the reason, which
-`Control.do` turns into a result.
+`RobotControl.do` turns into a result.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class RobotLookup:
     stamp_ns: Callable[[str], int]  # stamp of the newest sensor message
 
 
-class Control:
+class RobotControl:
     """Carries out actions on robots."""
 
     def __init__(self, bus: Bus, roster: Roster, lookup: RobotLookup, connect: str = "") -> None:
@@ -105,17 +105,17 @@ class Control:
         except UserError as error:
             return ActionResult(ok=False, reason=str(error))
 
-    def ask(self, robot: str, query: Query, request: Request, reply: type[R]) -> R:
-        """Returns a service's answer. Raises UserError if the service is not running, does not answer or refuses."""
+    def send_request(self, robot: str, query: Query, request: Request, reply: type[R]) -> R:
+        """Returns the reply of a service. Raises UserError if it is not running, does not reply or refuses."""
         self._check_running(robot, query.server)
-        answer = self._bus.ask(query, request, reply, ANSWER_TIMEOUT_S, robot=robot)
+        answer = self._bus.query(query, request, reply, ANSWER_TIMEOUT_S, robot=robot)
         if not answer.ok:
             raise UserError(answer.reason or f"the {query.server} refused")
         return answer
 
     def query(self, robot: str, query: Query, request: Request, reply: type[R]) -> R:
-        """Returns the answer of any service, which may be a refusal. Raises UserError if none answers."""
-        return self._bus.ask(query, request, reply, ANSWER_TIMEOUT_S, robot=robot)
+        """Returns the reply of any service, which may be a refusal. Raises UserError if no service replies."""
+        return self._bus.query(query, request, reply, ANSWER_TIMEOUT_S, robot=robot)
 
     def _check_running(self, robot: str, service: str) -> None:
         if service not in self._roster.services(robot):
@@ -182,7 +182,7 @@ class Control:
 
     def _teleport(self, robot: str, action: requests.Teleport) -> ActionResult:
         pose = Pose(x=action.x, y=action.y, yaw=action.yaw)
-        self.ask(robot, TELEPORT, PoseRequest(pose=pose), Reply)
+        self.send_request(robot, TELEPORT, PoseRequest(pose=pose), Reply)
         return ActionResult(
             ok=True, reason=f"carried to ({action.x:.2f}, {action.y:.2f}); the estimator is not informed"
         )
@@ -193,28 +193,28 @@ class Control:
         pose = None
         if action.x is not None and action.y is not None:
             pose = Pose(x=action.x, y=action.y, yaw=action.yaw or 0.0)
-        self.ask(robot, LOCALISE, LocaliseRequest(pose=pose, heading_known=action.yaw is not None), Reply)
+        self.send_request(robot, LOCALISE, LocaliseRequest(pose=pose, heading_known=action.yaw is not None), Reply)
         return ActionResult(ok=True, reason="searching near there" if pose is not None else "searching the whole map")
 
     def _obstacle(self, robot: str, action: requests.EditObstacle) -> ActionResult:
         request = ObstacleRequest(action=action.action, name=action.name, obstacle=action.obstacle)
-        self.ask(robot, OBSTACLE, request, Reply)
+        self.send_request(robot, OBSTACLE, request, Reply)
         done = {"add": "added", "move": "moved", "remove": "removed"}[action.action]
         return ActionResult(ok=True, reason=f"{action.name}: {done}")
 
     def _clock(self, robot: str, action: requests.ControlClock) -> ActionResult:
-        self.ask(robot, CLOCK_QUERIES[action.do], Request(), Reply)
+        self.send_request(robot, CLOCK_QUERIES[action.do], Request(), Reply)
         return ActionResult(ok=True, reason=CLOCK_RESULTS[action.do])
 
     def _reset(self, robot: str, action: requests.Reset) -> ActionResult:
-        self.ask(robot, RESET, ResetRequest(seed=action.seed), Reply)
+        self.send_request(robot, RESET, ResetRequest(seed=action.seed), Reply)
         seed = "" if action.seed is None else f" with seed {action.seed}"
         return ActionResult(ok=True, reason=f"simulation restarted{seed}")
 
     def _speed(self, robot: str, action: requests.SetSpeed) -> ActionResult:
         if not 0.1 <= action.factor <= 20:
             raise UserError(f"{action.factor:g} times real time cannot be: between 0.1 and 20")
-        self.ask(robot, SPEED, SpeedRequest(factor=action.factor), Reply)
+        self.send_request(robot, SPEED, SpeedRequest(factor=action.factor), Reply)
         return ActionResult(ok=True, reason=f"{action.factor:g} times real time")
 
     def _drive(self, robot: str, action: requests.DriveByHand) -> ActionResult:
@@ -229,7 +229,7 @@ class Control:
         return ActionResult(ok=True)
 
     def _record(self, robot: str, action: requests.Record) -> ActionResult:
-        reply = self.ask(robot, RECORDING, RecordRequest(action=action.action), RecordReply)
+        reply = self.send_request(robot, RECORDING, RecordRequest(action=action.action), RecordReply)
         more = {
             "recording": reply.recording,
             "file": reply.file,
@@ -242,6 +242,6 @@ class Control:
         return ActionResult(ok=True, reason=state, more=more)
 
     def _save_map(self, robot: str, action: requests.SaveMap) -> ActionResult:
-        file = self.ask(robot, SAVE_MAP, SaveMapRequest(name=action.name), SaveMapReply).file
+        file = self.send_request(robot, SAVE_MAP, SaveMapRequest(name=action.name), SaveMapReply).file
         use = f"presage train --world {file}, then presage up --world {file}"
         return ActionResult(ok=True, reason=f"map saved; to drive in it: {use}")

@@ -21,7 +21,7 @@ STOP_TIMEOUT_S = 5.0
 
 
 @dataclass(frozen=True)
-class Child:
+class ReplayProcess:
     """The process of a replay."""
 
     process: subprocess.Popen[bytes]
@@ -36,7 +36,7 @@ class Playback:
         """Replays files of ``folder`` under the robot name ``robot``-replay, over the endpoints ``connect``."""
         self.folder, self._connect = folder, connect
         self.robot = f"{robot[:57]}-replay"  # a robot's name has at most 64 characters
-        self._child: Child | None = None
+        self._child: ReplayProcess | None = None
         self._lock = threading.Lock()
         self._leaving = False
 
@@ -93,7 +93,7 @@ class Playback:
         with self._lock:
             return self._end() if self._child is child else None
 
-    def _start(self, name: str) -> Child:
+    def _start(self, name: str) -> ReplayProcess:
         command = [sys.executable, "-m", "presage", "--connect", self._connect, "replay", str(self.folder / name)]
         command += ["--robot", self.robot, "--force", "--paused"]
         stderr = tempfile.TemporaryFile()  # noqa: SIM115 - closed in _end
@@ -105,7 +105,7 @@ class Playback:
             start_new_session=True,
             preexec_fn=end_with_this_process(),  # noqa: PLW1509 - one call, before any thread of the child
         )
-        return Child(process, stderr, name)
+        return ReplayProcess(process, stderr, name)
 
     def _end(self) -> str:
         """Ends the child process and returns its last error line, or an empty string."""

@@ -18,7 +18,7 @@ from common.errors import UserError
 from common.messages.requests import PlayerReply, PlayerRequest, Request, WorldReply
 from common.messages.topics import PLAYER, WORLD
 from services.viewer import visitor_requests as requests
-from services.viewer.control import ActionResult, Control
+from services.viewer.control import ActionResult, RobotControl
 from services.viewer.playback import Playback
 from services.viewer.state.roster import Roster
 from services.viewer.visitors import Hub, Visitor
@@ -38,7 +38,7 @@ class RequestContext:
     """The objects that requests act on."""
 
     hub: Hub
-    control: Control
+    control: RobotControl
     playback: Playback
     roster: Roster
     pool: Executor
@@ -71,11 +71,11 @@ class RequestHandler:
 
     async def act(self, visitor: Visitor, action: requests.Action) -> ActionResult:  # noqa: PLR0911 - one per action
         """Carries out a visitor's action. Returns the reason if that fails."""
-        if not self.context.control_allowed and not isinstance(action, requests.Watch):
+        if not self.context.control_allowed and not isinstance(action, requests.WatchRobot):
             return ActionResult(ok=False, reason="visitors of this page only watch (it runs without --allow-control)")
         try:
             match action:
-                case requests.Watch():
+                case requests.WatchRobot():
                     return self._watch(visitor, action.robot)
                 case requests.ListRecordings():
                     return await self._recordings()
@@ -165,7 +165,7 @@ class RequestHandler:
 
     def _player(self, action: Any, value: float = 0.0) -> PlayerReply:
         request = PlayerRequest(action=action, value=value)
-        return self.context.control.ask(self.context.playback.robot, PLAYER, request, PlayerReply)
+        return self.context.control.send_request(self.context.playback.robot, PLAYER, request, PlayerReply)
 
     # ---- all visitors
 

@@ -27,7 +27,7 @@ from common.errors import UserError
 from services.viewer.access import COOKIE, is_token, known_host, same_origin, token_of
 from services.viewer.request_handler import RequestHandler
 from services.viewer.settings import FIRST_PORT, ViewerSettings
-from services.viewer.visitor_session import Session
+from services.viewer.visitor_session import VisitorSession
 
 PAGE_FOLDER = Path(__file__).resolve().parent / "static"
 MAX_VISITORS = 100
@@ -121,7 +121,7 @@ def create_app(handler: RequestHandler, token: str, started: Callable[[asyncio.A
         if len(handler.context.hub) >= MAX_VISITORS:
             await websocket.send_denial_response(PlainTextResponse("too many visitors\n", 503))
             return
-        await Session(websocket, handler).run()
+        await VisitorSession(websocket, handler).run()
 
     routes = [WebSocketRoute("/ws", connect), Mount("/", StaticFiles(directory=PAGE_FOLDER, html=True))]
     return Starlette(routes=routes, middleware=[Middleware(AccessMiddleware, token=token)], lifespan=lifespan)

@@ -22,7 +22,7 @@ from common.messages.wire import DecodeError
 from common.runtime.liveness import RobotLiveness, start_command
 from common.runtime.service import Service
 from common.versions import versions
-from services.viewer.control import Control, RobotLookup
+from services.viewer.control import RobotControl, RobotLookup
 from services.viewer.playback import Playback
 from services.viewer.request_handler import RequestContext, RequestHandler
 from services.viewer.server import WebServer, create_app, link, listen
@@ -78,7 +78,7 @@ class ViewerService(Service):
         lookup = RobotLookup(self._status, self._stamp_ns)
         context = RequestContext(
             hub=self.hub,
-            control=Control(self.loop.bus, self.roster, lookup, self._connect),
+            control=RobotControl(self.loop.bus, self.roster, lookup, self._connect),
             playback=self.playback,
             roster=self.roster,
             pool=self.pool,

@@ -32,7 +32,7 @@ class Action(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True, extra="ignore")
 
 
-class Watch(Action):
+class WatchRobot(Action):
     """Show another robot."""
 
     do: Literal["watch"]
@@ -159,7 +159,7 @@ class ControlPlayer(Action):
 
 
 ACTIONS = (
-    Watch,
+    WatchRobot,
     GoTo,
     Cancel,
     Explore,

@@ -22,7 +22,7 @@ MESSAGES_PER_S, MAX_BURST = 60.0, 120.0  # rate limit per visitor; further messa
 CLOSE_CODE_TOO_SLOW = 1008  # web socket close code: policy violation
 
 
-class Session:
+class VisitorSession:
     """Handles one web socket from its opening to its end."""
 
     def __init__(self, websocket: WebSocket, handler: RequestHandler) -> None:

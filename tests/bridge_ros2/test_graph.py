@@ -6,16 +6,16 @@ import pytest
 
 from services.bridge_ros2.diagnostics import diagnose
 from services.bridge_ros2.graph import Graph
-from services.bridge_ros2.keys import Names, Node, Qos
+from services.bridge_ros2.keys import Node, Qos, RosKeys
 from services.bridge_ros2.ros_types import LASER_SCAN, OCCUPANCY_GRID, ODOMETRY, TWIST, TWIST_STAMPED, type_hash
 from services.bridge_ros2.settings import BridgeRos2Settings
 
 
 def token(kind, topic, message, number=1, **names):
-    return Node(Names(**names), "ab", "", "driver").endpoint_token(kind, number, topic, message, Qos())
+    return Node(RosKeys(**names), "ab", "", "driver").endpoint_token(kind, number, topic, message, Qos())
 
 
-NODE = Node(Names(), "ab", "", "driver").token()
+NODE = Node(RosKeys(), "ab", "", "driver").token()
 SCANS, ODOM = token("MP", "/scan", LASER_SCAN), token("MP", "/odom", ODOMETRY, 9)
 LISTENS_STAMPED, LISTENS = token("MS", "/cmd_vel", TWIST_STAMPED), token("MS", "/cmd_vel", TWIST, 2)
 FAR = token("MP", "/scan", LASER_SCAN, domain=5)

@@ -12,9 +12,9 @@ from services.bridge_ros2.keys import (
     SENSOR,
     TOKENS,
     Endpoint,
-    Names,
     Node,
     Qos,
+    RosKeys,
     attachment,
     full_name,
     publisher_gid,
@@ -29,22 +29,22 @@ TOKEN = (
     "@ros2_lv/0/100f0e0d0c0b0a090807060504030201/0/16/MS/%/%/nucleo_h743zi2/%nucleo%cmd_vel/"
     "geometry_msgs::msg::dds_::Twist_/" + type_hash(TWIST) + "/::,:,:,:,,"
 )
-NODE = Node(Names(), "100f0e0d0c0b0a090807060504030201", "", "nucleo_h743zi2")
+NODE = Node(RosKeys(), "100f0e0d0c0b0a090807060504030201", "", "nucleo_h743zi2")
 
 
 def test_keys_of_rmw_zenoh():
-    assert Names().publish("/nucleo/cmd_vel", TWIST) == TWIST_KEY
-    assert Names(domain=7, hashes=False).publish("/scan", LASER_SCAN) == (
+    assert RosKeys().publish("/nucleo/cmd_vel", TWIST) == TWIST_KEY
+    assert RosKeys(domain=7, hashes=False).publish("/scan", LASER_SCAN) == (
         "7/scan/sensor_msgs::msg::dds_::LaserScan_/TypeHashNotSupported"
     )
-    heard = KeyExpr(Names().subscribe("/scan", LASER_SCAN))
-    for names in (Names(), Names(hashes=False)):
+    heard = KeyExpr(RosKeys().subscribe("/scan", LASER_SCAN))
+    for names in (RosKeys(), RosKeys(hashes=False)):
         assert heard.includes(KeyExpr(names.publish("/scan", LASER_SCAN)))
-    assert not heard.intersects(KeyExpr(Names().publish("/scan_raw", LASER_SCAN)))
+    assert not heard.intersects(KeyExpr(RosKeys().publish("/scan_raw", LASER_SCAN)))
 
 
 def test_keys_of_ros2dds():
-    names = Names("ros2dds", domain=3)
+    names = RosKeys("ros2dds", domain=3)
     assert names.publish("/robot1/scan", LASER_SCAN) == names.subscribe("/robot1/scan", LASER_SCAN) == "robot1/scan"
     assert KeyExpr(names.caches("/tf_static")[0]).includes(KeyExpr("@/a1/@ros2_pub_cache/tf_static"))
     assert any(KeyExpr(k).includes(KeyExpr("@/a1/@ros2_lv/MP/scan/sensor_msgs§msg§LaserScan/:::")) for k in TOKENS)
@@ -54,7 +54,7 @@ def test_tokens():
     qos = Qos(depth=42)  # the default of rmw_zenoh
     assert NODE.endpoint_token("MS", 16, "/nucleo/cmd_vel", TWIST, qos) == TOKEN
     assert NODE.token() == "@ros2_lv/0/100f0e0d0c0b0a090807060504030201/0/0/NN/%/%/nucleo_h743zi2"
-    spaced = Node(Names(domain=5), "ab", "/robot1/", "presage").endpoint_token("MP", 1, "/robot1/x", TWIST, qos)
+    spaced = Node(RosKeys(domain=5), "ab", "/robot1/", "presage").endpoint_token("MP", 1, "/robot1/x", TWIST, qos)
     assert spaced.startswith("@ros2_lv/5/ab/0/1/MP/%/%robot1/presage/%robot1%x/")
     KeyExpr(spaced)  # a key expression that zenoh takes
     assert any(KeyExpr(k).includes(KeyExpr(TOKEN)) for k in TOKENS)
@@ -112,9 +112,9 @@ def test_names_in_a_namespace(topic, namespace, name):
 
 
 def test_other_type_hash():
-    names = Names()
+    names = RosKeys()
     names.check_type_hash(names.publish("/scan", LASER_SCAN), LASER_SCAN)
-    names.check_type_hash(Names(hashes=False).publish("/scan", LASER_SCAN), LASER_SCAN)
+    names.check_type_hash(RosKeys(hashes=False).publish("/scan", LASER_SCAN), LASER_SCAN)
     with pytest.raises(ValueError, match=r"RIHS01_00.*another definition"):
         names.check_type_hash("0/scan/sensor_msgs::msg::dds_::LaserScan_/RIHS01_00", LASER_SCAN)
-    Names("ros2dds").check_type_hash("scan", LASER_SCAN)
+    RosKeys("ros2dds").check_type_hash("scan", LASER_SCAN)

@@ -13,7 +13,7 @@ from common.messages.ros_messages import stamp_of
 from services.bridge_ros2 import ros_types as r
 from services.bridge_ros2.to_ros import hypotheses_message, pose_message, transform_message, twist_message
 from tests.bridge_ros2 import independent as other
-from tests.bridge_ros2.made import belief
+from tests.bridge_ros2.messages import belief
 
 # As `ros2 topic info -v` of Iron and later prints them ("Topic type hash"), rosbag2 writes them into metadata.yaml
 # (type_description_hash), and ROS's packages have them in share/PACKAGE/msg/NAME.json. Found in public logs and bags.

@@ -19,7 +19,7 @@ from common.messages.definitions import Goal, Health, Odom, Scan
 from common.messages.requests import LocaliseRequest, Reply
 from common.messages.topics import BELIEF, CMD_VEL, GOAL, HEALTH, LOCALISE, ODOM, SCAN
 from tests.bridge_ros2 import independent as other
-from tests.bridge_ros2.made import belief
+from tests.bridge_ros2.messages import belief
 from tests.conftest import WAIT_TIMEOUT_S
 from tests.system.ros2_robot import BEGIN, Ros, transform, transforms
 

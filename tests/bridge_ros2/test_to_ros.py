@@ -11,7 +11,7 @@ from common.messages.definitions import Pose
 from services.bridge_ros2 import to_ros
 from services.bridge_ros2.ros_types import OCCUPANCY_GRID, encode
 from tests.bridge_ros2 import independent as other
-from tests.bridge_ros2.made import belief
+from tests.bridge_ros2.messages import belief
 
 
 def test_covariance():

@@ -50,7 +50,7 @@ class Small(Service):
             self.publish(CMD_VEL, CmdVel(stamp_ns=message.stamp_ns, twist={"vx": 0.5}))
         elif isinstance(message, Goal) and message.cancel:
             # Sent to itself: a blocking request would never return.
-            self.request(
+            self.send_request(
                 TELEPORT if message.pose.y == 0 else PREDICT,
                 PoseRequest(pose=message.pose),
                 timeout=10.0 if message.pose.x != 1.0 else 1.0,

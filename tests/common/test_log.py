@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from common.bus.bus import wait_until
-from common.log_capture import Line, parse_line
+from common.log_capture import CapturedLine, parse_line
 from common.messages.definitions import Goal, Pose
 from common.messages.topics import GOAL
 from presage.session.stack import _log_text
@@ -28,7 +28,7 @@ def objects(text: str) -> list[dict]:
 
 def test_lines_as_json():
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    noisy = Path(__file__).with_name("noisy.py")
+    noisy = Path(__file__).with_name("noisy_process.py")
     done = subprocess.run([sys.executable, str(noisy)], env=environment, capture_output=True, text=True, timeout=60)
     assert done.returncode == 1
     assert done.stdout == "printed text\n"
@@ -88,8 +88,8 @@ def test_zenohs_lines_are_parsed():
         "\x1b[2m2026-01-02T03:04:05.017181Z\x1b[0m \x1b[33m WARN\x1b[0m net-0 ThreadId(04) "
         "\x1b[2mzenoh::net::runtime\x1b[0m\x1b[2m:\x1b[0m Unable to connect: refused\n"
     )
-    assert parse_line(zenoh, "stdout") == Line("warning", "zenoh::net::runtime", "Unable to connect: refused")
-    assert parse_line("thread 'x' panicked", "stderr") == Line("warning", "stderr", "thread 'x' panicked")
+    assert parse_line(zenoh, "stdout") == CapturedLine("warning", "zenoh::net::runtime", "Unable to connect: refused")
+    assert parse_line("thread 'x' panicked", "stderr") == CapturedLine("warning", "stderr", "thread 'x' panicked")
     assert parse_line("  \n", "stdout") is None
 
 

@@ -14,7 +14,7 @@ from common.robot.scanner import SCANNERS
 from services.controller.navigator import Navigator
 from services.controller.policies.free_space import FreeSpace
 from services.controller.policies.planner import GeodesicPolicy
-from services.simulator.simulation import Setup, Simulation
+from services.simulator.simulation import Simulation, SimulationSetup
 
 PERIOD_NS = 66_666_667
 PERIOD_S = PERIOD_NS * 1e-9
@@ -98,7 +98,7 @@ def drive(
     navigator = Navigator(robot, preset=GeodesicPolicy(robot, known or world))
     navigator.on_goal(to)
     poses, statuses, contacts = [], [], 0
-    with closing(Simulation(Setup(world, scanner, robot, start, seed, obstacle_stop=stop))) as simulation:
+    with closing(Simulation(SimulationSetup(world, scanner, robot, start, seed, obstacle_stop=stop))) as simulation:
         while simulation.steps < limit:
             if change is not None:
                 change(simulation)

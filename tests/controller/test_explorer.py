@@ -59,9 +59,9 @@ class PerfectRobot:
         """Begin to explore, or go on with viewpoints at these places in m."""
         for place in places:
             viewpoint = None if place is None else Viewpoint(np.array([*place, 0.0]), 9.0, np.array([place]))
-            survey = self.navigator.take_survey()
-            assert survey is not None
-            self.navigator.use_viewpoint(viewpoint, survey)
+            exploration_state = self.navigator.take_exploration_state()
+            assert exploration_state is not None
+            self.navigator.use_viewpoint(viewpoint, exploration_state)
 
 
 def begin() -> PerfectRobot:
@@ -87,7 +87,7 @@ def test_exploration_waits_for_the_first_map():
         5,
         "waiting for the mapper's first map",
     )
-    assert drive.navigator.take_survey() is None
+    assert drive.navigator.take_exploration_state() is None
     drive.use_map(map_with(START))
     drive.step()
     drive.explore((5.0, 2.5))
@@ -96,7 +96,7 @@ def test_exploration_waits_for_the_first_map():
     assert drive.step().exploration is None
 
 
-def test_carried_off():
+def test_kidnapped():
     drive = begin()
     drive.explore((8.0, 2.5))
     drive.until(lambda _: drive.pose[0] > 3.0)
@@ -105,13 +105,13 @@ def test_carried_off():
     statuses = [drive.step(state="lost") for _ in range(10 * SCANS_PER_S)]  # longer than at a place without progress
     assert all(status.reason.startswith("the belief is lost") for status in statuses)
     drive.use_map(map_with(START))
-    assert drive.navigator.take_survey() is None  # where it would begin is not known
+    assert drive.navigator.take_exploration_state() is None  # where it would begin is not known
     path, place = statuses[-1].exploration.path, drive.pose
     drive.pose = place - [3.0, 0.0, 0.0]
     status = drive.step()
     assert (status.goal.x, status.reason) == (8.0, "going where a scan tells most")
     assert status.exploration.path == path > driven + 0.5
-    assert len(drive.navigator.take_survey().unreachable) == 0
+    assert len(drive.navigator.take_exploration_state().unreachable) == 0
 
 
 def test_viewpoints_then_the_way_back():
@@ -133,7 +133,7 @@ def test_viewpoints_then_the_way_back():
     assert np.hypot(*(drive.pose - START)[:2]) < 0.01
     assert 5.9 < status.exploration.path < 7.5
     assert status.state == "reached"
-    assert drive.navigator.take_survey() is None
+    assert drive.navigator.take_exploration_state() is None
 
 
 def test_a_robot_that_stops_late_returns_again():
@@ -156,7 +156,7 @@ def test_a_goal_of_a_user_takes_precedence():
     drive.until(lambda _: drive.pose[0] > 3.0)
     drive.navigator.on_goal(goal(3.0, 1.5, seq=6))
     drive.use_map(map_with(START, (3.0, 2.5, 0.0)))
-    assert drive.navigator.take_survey() is None  # no viewpoint is chosen meanwhile
+    assert drive.navigator.take_exploration_state() is None  # no viewpoint is chosen meanwhile
     status = drive.until(lambda status: status.state == "reached")
     assert (status.goal_seq, status.exploration.phase) == (6, "exploring")
     count = drive.scans
@@ -189,9 +189,9 @@ def test_a_place_without_progress_is_given_up():
     drive = begin()
     drive.explore((8.0, 2.5))
     drive.until(lambda _: drive.navigator._viewpoint_due, moves=False)
-    survey = drive.navigator.take_survey()
-    assert survey.unreachable.tolist() == [[8.0, 2.5]]
-    assert not len(survey.arrivals)
+    exploration_state = drive.navigator.take_exploration_state()
+    assert exploration_state.unreachable.tolist() == [[8.0, 2.5]]
+    assert not len(exploration_state.arrivals)
 
 
 def test_a_way_back_that_stays_refused_fails():
@@ -218,8 +218,8 @@ def test_a_new_map_may_show_a_better_viewpoint_and_moves_the_start():
     drive.explore((8.0, 2.5))
     drive.step()
     drive.use_map(map_with((2.1, 2.5, 0.0), (3.0, 2.5, 0.0)))
-    survey = drive.navigator.take_survey()
-    assert survey.target.tolist() == [8.0, 2.5]
-    assert survey.home.tolist() == [2.1, 2.5]
-    drive.navigator.use_viewpoint(Viewpoint(np.array([4.0, 4.0, 0.0]), 9.0, np.zeros((1, 2))), survey)
+    exploration_state = drive.navigator.take_exploration_state()
+    assert exploration_state.target.tolist() == [8.0, 2.5]
+    assert exploration_state.home.tolist() == [2.1, 2.5]
+    drive.navigator.use_viewpoint(Viewpoint(np.array([4.0, 4.0, 0.0]), 9.0, np.zeros((1, 2))), exploration_state)
     assert drive.step().goal.y == 4.0

@@ -13,7 +13,7 @@ from common.robot.self_filter import SelfFilter
 from services.bridge_ros2.command_gate import CommandGate
 from services.controller.policies.free_space import FreeSpace
 from services.controller.policies.geodesic_field import FreeSpaceGraph
-from services.simulator.simulation import Setup, Simulation
+from services.simulator.simulation import Simulation, SimulationSetup
 from tests.controller.driving import KINDS, SCANNER, box, drive, goal, room
 
 BURGER = Robot(drive="differential", radius=0.105, max_speed=0.22, max_turn=2.84, acceleration=0.5, turn_acceleration=3)
@@ -78,7 +78,7 @@ def test_robot_in_its_own_scan(kind, self_filter):
 
 
 def test_obstacle_stop_of_the_bridge():
-    with closing(Simulation(Setup(HALL, SCANNER, Robot(), (1.0, 2.0, 0.0)))) as simulation:
+    with closing(Simulation(SimulationSetup(HALL, SCANNER, Robot(), (1.0, 2.0, 0.0)))) as simulation:
         scan = with_posts(simulation.observe()[2])
     command, self_filter, outputs = CmdVel(stamp_ns=scan.stamp_ns, twist=Twist(vx=0.3)), SelfFilter(radius=0.2), []
     for shown in (scan, self_filter.mask_for_bus(scan), self_filter.mask_for_planning(scan)):

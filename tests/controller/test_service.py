@@ -74,7 +74,7 @@ def test_answers(monkeypatch, needs_predictions, events, answers):
     service.geodesic = policy = Predicting(needs_predictions)
     monkeypatch.setattr(service, "_publish_plan", lambda stamp_ns: None)
     requests = {}
-    monkeypatch.setattr(loop, "request", lambda *_: requests.setdefault(len(requests) + 1, len(requests) + 1))
+    monkeypatch.setattr(loop, "send_request", lambda *_: requests.setdefault(len(requests) + 1, len(requests) + 1))
     found = []
     for event in events.split():
         kind, number = event[0], int(event[1:] or 0)

@@ -18,7 +18,7 @@ from lab.accuracy.scenes import Scene
 from services.estimator.factory import EstimatorOptions, Geometry, prepare
 from services.estimator.field_exchange import FieldAssembler, split_into_messages
 from services.estimator.precise.learning import weights
-from services.estimator.precise.learning.key_scans import KeyScans
+from services.estimator.precise.learning.key_scans import KeyScanCollector
 from services.estimator.service import EstimatorService
 from services.estimator.settings import EstimatorSettings
 from tests.conftest import WAIT_TIMEOUT_S, received_messages
@@ -76,7 +76,7 @@ def test_kidnapping_while_learning():
     path, rate = np.concatenate([before, after]), scene.scanner.rate
     estimator = prepare(EstimatorOptions(office, model="exact"))(Geometry.of(scene.scanner))
     estimator.restart(path[0])
-    keys = KeyScans(scene.scanner.angles(), np.array(scene.scanner.mount), scene.scanner.range_max)
+    keys = KeyScanCollector(scene.scanner.angles(), np.array(scene.scanner.mount), scene.scanner.range_max)
     for k, clean in enumerate(scene.clean(path)):
         observation = scene.observe(clean, k / rate)
         keys.add(estimator.update(observation), observation)
@@ -97,7 +97,7 @@ def test_learn_save_and_follow(process, bus, worlds, tmp_path):
     options = [f"--{name.replace('_', '-')}={value}" for name, value in settings.items()]
     running = process("estimator", *options, "--learn", "refine", "--saved-models", str(tmp_path / "saved"))
     assert bus.wait_matching(SCAN, WAIT_TIMEOUT_S)
-    assert "nothing was learned" in bus.ask(SAVE_MODEL, SaveModelRequest(name="monday"), SaveModelReply).reason
+    assert "nothing was learned" in bus.query(SAVE_MODEL, SaveModelRequest(name="monday"), SaveModelReply).reason
     sent = []
 
     def send(k):
@@ -120,11 +120,11 @@ def test_learn_save_and_follow(process, bus, worlds, tmp_path):
     parts = list(received_messages(fields, LearnedField))
     assembler = FieldAssembler()
     data = next(data for part in parts if (data := assembler.add(part)) is not None)
-    reply = bus.ask(SAVE_MODEL, SaveModelRequest(name="monday"), SaveModelReply)
+    reply = bus.query(SAVE_MODEL, SaveModelRequest(name="monday"), SaveModelReply)
     assert reply.ok, reply.reason
     assert reply.version == stored[-1].field_version
-    assert "exists already" in bus.ask(SAVE_MODEL, SaveModelRequest(name="monday"), SaveModelReply).reason
-    assert "letters" in bus.ask(SAVE_MODEL, SaveModelRequest(name="../monday"), SaveModelReply).reason
+    assert "exists already" in bus.query(SAVE_MODEL, SaveModelRequest(name="monday"), SaveModelReply).reason
+    assert "letters" in bus.query(SAVE_MODEL, SaveModelRequest(name="../monday"), SaveModelReply).reason
     saved = tmp_path / "saved" / "monday-precise.safetensors"
     model, _, card = weights.load(saved)
     assert "key scans while driving" in card.source

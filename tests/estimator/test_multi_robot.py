@@ -179,7 +179,7 @@ def test_request_during_a_search(fleet):
     a.send(1, 2)
     assert wait_until(lambda: searching(loop), WAIT_TIMEOUT_S)
     threading.Timer(0.3, SearchingStub.proceed.set).start()
-    assert a.bus.ask(LOCALISE, LocaliseRequest(), Reply, timeout=WAIT_TIMEOUT_S).ok
+    assert a.bus.query(LOCALISE, LocaliseRequest(), Reply, timeout=WAIT_TIMEOUT_S).ok
     assert wait_until(lambda: a.has(1), WAIT_TIMEOUT_S)
 
 

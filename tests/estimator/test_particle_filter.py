@@ -9,17 +9,17 @@ import pytest
 
 from common.geometry import se2
 from common.geometry.world import World
-from services.estimator.particle_filter import ParticleFilter, Settings
+from services.estimator.particle_filter import ParticleFilter, ParticleFilterSettings
 from services.estimator.shared.interface import Observation, Posterior
 from tests.estimator.models import ROOM, SCANNER
 
 ANGLES = SCANNER.angles()
-SMALL = replace(Settings.tuned(), max_particles=5000)
+SMALL = replace(ParticleFilterSettings.tuned(), max_particles=5000)
 CERTAIN = np.diag([0.01, 0.01, 0.0025])
 HERE = np.array([3.0, 1.5, 0.4])
 
 
-def make(seed: int, settings: Settings = SMALL, world: World = ROOM, start=None) -> ParticleFilter:
+def make(seed: int, settings: ParticleFilterSettings = SMALL, world: World = ROOM, start=None) -> ParticleFilter:
     found = ParticleFilter(world, settings, SCANNER.mount, seed)
     if start is not None:
         found.restart(start, CERTAIN)
@@ -43,7 +43,9 @@ def drive(steps: int) -> np.ndarray:
     return np.column_stack([3 + 2.2 * np.sin(0.45 * t), 1.4 + 0.4 * np.sin(0.9 * t), se2.wrap(np.sin(t) * 1.0)])
 
 
-def follow(settings: Settings, path: np.ndarray, seed: int, **known) -> tuple[np.ndarray, list[Posterior]]:
+def follow(
+    settings: ParticleFilterSettings, path: np.ndarray, seed: int, **known
+) -> tuple[np.ndarray, list[Posterior]]:
     """Position errors and posteriors along a path from a known start; ``known`` are values by scan."""
     rng, found = np.random.default_rng(seed), make(seed, settings, start=path[0])
     posteriors = [
@@ -152,7 +154,7 @@ def test_two_identical_places():
         assert min(np.hypot(*(h.pose - place)[:2]) for h in posterior.hypotheses[:2]) < 0.1
 
 
-@pytest.mark.parametrize("settings", [SMALL, Settings()], ids=["tuned", "nav2"])
+@pytest.mark.parametrize("settings", [SMALL, ParticleFilterSettings()], ids=["tuned", "nav2"])
 def test_seed(settings):
     def run(seed):
         rng, found = np.random.default_rng(7), make(seed, settings)

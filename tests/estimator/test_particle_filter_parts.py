@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from common.errors import UserError
 from common.geometry import se2
 from common.geometry.world import World
-from services.estimator.particle_filter import Settings, motion, resampling
+from services.estimator.particle_filter import ParticleFilterSettings, motion, resampling
 from services.estimator.particle_filter.beam_model import BeamModel, RangeTable
-from services.estimator.particle_filter.clusters import hypotheses, labels, moments
+from services.estimator.particle_filter.clusters import cluster_hypotheses, labels, moments
 from services.estimator.particle_filter.likelihood_field import LikelihoodField, SurfaceDistances
 from services.estimator.particle_filter.recovery import Recovery
 from tests.estimator.models import ROOM
@@ -189,12 +189,12 @@ def test_hypotheses():
     centres = [(1.0, 1.0, 3.1), (4.0, 1.0, 0.0), (1.0, 5.0, 1.0)]
     poses = np.concatenate([np.array(c) + 0.05 * rng.standard_normal((300, 3)) for c in centres])
     weights = np.repeat([0.2, 0.7, 0.1], 300) / 300
-    found = hypotheses(poses, weights)
+    found = cluster_hypotheses(poses, weights)
     assert [h.weight for h in found] == pytest.approx([0.7, 0.2, 0.1], abs=2e-3)
     for h, centre in zip(found, (centres[1], centres[0], centres[2]), strict=True):
         assert np.allclose(se2.between(np.array(centre), h.pose), 0, atol=0.015)
         assert np.allclose(h.covariance, 0.0025 * np.eye(3), atol=6e-4)
-    one = hypotheses(np.array([[1.0, 2.0, 0.5]]), np.ones(1))[0]
+    one = cluster_hypotheses(np.array([[1.0, 2.0, 0.5]]), np.ones(1))[0]
     assert np.linalg.eigvalsh(one.covariance).min() > 0
 
 
@@ -220,7 +220,7 @@ def test_recovery():
 def test_settings():
     for wrong in ({"sigma_hit": 0.0}, {"alpha1": -1.0}, {"max_beams": 0}, {"z_rand": 0.0}, {"min_particles": 9000}):
         with pytest.raises(UserError, match="particle filter"):
-            dataclasses.replace(Settings(), **wrong)
+            dataclasses.replace(ParticleFilterSettings(), **wrong)
 
 
 def test_overlapping_obstacles():

@@ -8,7 +8,7 @@ import msgpack
 import numpy as np
 import pytest
 
-from common.bus.inbox import Call, Inbox
+from common.bus.inbox import Inbox, IncomingRequest
 from common.errors import UserError
 from common.geometry import se2
 from common.geometry.world import load_world
@@ -156,7 +156,9 @@ def ask(service, payload: bytes):
     """Passes a request through the service's loop; returns the reply, or the refusal as text."""
     found = []
     loop = Loop(service, SimpleNamespace(robot="robot"), Inbox())
-    loop._answer(Call(PREDICT, payload, lambda reply: found.append(PredictReply.decode(reply)), found.append))
+    loop._answer(
+        IncomingRequest(PREDICT, payload, lambda reply: found.append(PredictReply.decode(reply)), found.append)
+    )
     assert loop.failed == 0
     return found[0]
 

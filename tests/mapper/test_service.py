@@ -64,7 +64,7 @@ def test_drive_and_save(process, bus, link, tmp_path, odometry):
     assert (world.clearance(poses[:, :2]) > 0).mean() > 0.9
     assert np.loadtxt(tmp_path / "maps" / "here.tum").shape == (len(truth), 8)
     for name, reason in (("here", "exists already"), ("../here", "letters"), ("office", "shipped")):
-        reply = bus.ask(SAVE_MAP, SaveMapRequest(name=name), SaveMapReply)
+        reply = bus.query(SAVE_MAP, SaveMapRequest(name=name), SaveMapReply)
         assert not reply.ok
         assert reason in reply.reason
 
@@ -79,5 +79,5 @@ def test_drive_and_save(process, bus, link, tmp_path, odometry):
 def test_save_before_the_first_scan(process, bus):
     process("mapper")
     assert bus.wait_matching(SCAN, WAIT_TIMEOUT_S)
-    reply = bus.ask(SAVE_MAP, SaveMapRequest(name="here"), SaveMapReply)
+    reply = bus.query(SAVE_MAP, SaveMapRequest(name="here"), SaveMapReply)
     assert "no scan has come" in reply.reason

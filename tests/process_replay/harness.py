@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from common.bus.inbox import Answer, Call, Inbox, Sample
+from common.bus.inbox import Inbox, IncomingRequest, RequestResult, Sample
 from common.messages.definitions import Stamped
 from common.messages.requests import ModelReply, Reply, Request, SampleReply, WorldReply
 from common.messages.topics import Query, Topic
@@ -43,16 +43,18 @@ class FakeBus:
         for service in dict.fromkeys(service for service, _ in self.replies):
             changed(service, True)
 
-    def ask(self, query: Query, request: Request, reply: type[Reply], timeout: float = 5.0, service: str = "*") -> Any:
+    def query(
+        self, query: Query, request: Request, reply: type[Reply], timeout: float = 5.0, service: str = "*"
+    ) -> Any:
         return self.replies[service if query.per_service else query.server, query.name]
 
-    def request(
+    def send_request(
         self, query: Query, request: Request, number: int, inbox: Inbox, timeout: float = 5.0, service: str = "*"
     ) -> None:
         reply = self.replies.get((query.server, query.name))
-        inbox.put(Answer(query, number, reply.encode() if reply else b"", "" if reply else "nobody answers"))
+        inbox.put(RequestResult(query, number, reply.encode() if reply else b"", "" if reply else "nobody answers"))
 
-    def ask_each(self, *args: Any, **rest: Any) -> threading.Event:
+    def query_all(self, *args: Any, **rest: Any) -> threading.Event:
         """Completes at once, without answers."""
         done = threading.Event()
         done.set()
@@ -98,7 +100,7 @@ def drive(service: Service, events: Iterable[Event]) -> list[Row]:
     try:
         for number, event in enumerate(events):
             _feed(loop, event, number, rows)
-            while isinstance(answer := loop.inbox.get(0), Answer):
+            while isinstance(answer := loop.inbox.get(0), RequestResult):
                 loop.service.on_reply(answer.query, answer.number, answer.reply())
             rows += [
                 {"event": number, "topic": topic.name, **row_of(topic.message.decode(payload))}
@@ -133,7 +135,7 @@ def _feed(loop: Loop, event: Event, number: int, rows: list[Row]) -> None:
         def refuse(why: str) -> None:
             rows.append({"event": number, "reply": query.name, "refused": why})
 
-        loop._answer(Call(query, event.payload, reply, refuse))
+        loop._answer(IncomingRequest(query, event.payload, reply, refuse))
 
 
 def row_of(model: BaseModel) -> Row:

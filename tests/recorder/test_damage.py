@@ -16,7 +16,7 @@ from rich.console import Console
 
 from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
-from presage.recordings.info import survey
+from presage.recordings.info import collect_facts
 from presage.recordings.printing import info
 from services.recorder.files.chunks import MAGIC, MAX_CHUNK_BYTES
 from services.recorder.files.writer import PROFILE
@@ -32,7 +32,7 @@ def test_info_notices_each_bit(tmp_path_factory, bit, compression):
     path, _ = write_chunks(tmp_path_factory.mktemp("flipped"), compression, closed=True)
     bad = damaged(path, bit // 8 % path.stat().st_size, bytes([1 << bit % 8]))
     try:
-        facts = survey(read_recording(bad), check=True)
+        facts = collect_facts(read_recording(bad), check=True)
     except UserError as error:
         assert "presage recover" in str(error)  # noqa: PT017
         return

@@ -14,7 +14,7 @@ from common.errors import UserError
 from common.messages.definitions import CmdVel, Pose, Truth, Twist
 from common.messages.topics import CMD_VEL, TRUTH
 from services.recorder.files.chunks import COMPRESSION
-from services.recorder.files.message_counts import Count, as_metadata, from_metadata
+from services.recorder.files.message_counts import KeyCounts, as_metadata, from_metadata
 from services.recorder.files.writer import PROFILE, RecordingWriter
 from services.recorder.reader import read_recording
 from services.recorder.recover import recover
@@ -140,7 +140,7 @@ def test_counters_of_recovered_messages(tmp_path):
     writer, key = RecordingWriter(tmp_path / "run.mcap", "none", chunk_size=1024), TRUTH.key("r")
     for number in range(0, 80, 2):
         writer.write(TRUTH, key, message(number)[1], number, number)
-    writer.metadata("counters", as_metadata({key: Count(received=40, written=40)}))
+    writer.metadata("counters", as_metadata({key: KeyCounts(received=40, written=40)}))
     path = writer.finish()
     found = recover(damaged(path, path.read_bytes().find(message(40)[1]) + 5))
     count = from_metadata(read_recording(found.path).metadata["counters"])[key]

@@ -14,7 +14,7 @@ from common.bus.bus import wait_until
 from common.bus.inbox import MAX_KEYS, Inbox
 from common.messages.definitions import Health
 from common.messages.topics import HEALTH, ODOM, SCAN, TOPICS
-from presage.recordings.info import survey
+from presage.recordings.info import collect_facts
 from services.recorder.files.message_counts import from_metadata
 from services.recorder.reader import read_recording
 from services.recorder.recover import recover
@@ -238,7 +238,7 @@ def test_presage_record_beside_a_recorder(recorder, request_recording, process, 
     assert first.stop() == 0
     for path in (logs / "first.mcap", only_file(tmp_path / "second")):
         recording = read_recording(path)
-        (row,) = [row for row in survey(recording).topics if row.key == own]
+        (row,) = [row for row in collect_facts(recording).topics if row.key == own]
         assert (row.missing, row.gaps, row.restarts, row.reordered) == (0, 0, 0, 0)
         count = from_metadata(recording.metadata["counters"])[own]
         assert (count.missing, count.restarts, count.reordered) == (0, 0, 0)

@@ -99,7 +99,7 @@ class FakeBus:
     def watch_alive(self, changed):
         self.changed = changed
 
-    def ask(self, query, request, reply, timeout, service="*"):
+    def query(self, query, request, reply, timeout, service="*"):
         self.asked.append((service if query.per_service else query.server, query.name))
         answer = self.replies.get(self.asked[-1])
         answer = answer(request) if callable(answer) else answer

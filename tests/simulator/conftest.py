@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from services.simulator.simulation import Setup, Simulation
+from services.simulator.simulation import Simulation, SimulationSetup
 from tests.simulator.driving import HALL, SCANNER, shipped
 
 
@@ -14,7 +14,7 @@ def make():
 
     def build(world=HALL, scanner=SCANNER, **settings) -> Simulation:
         world = shipped(world) if isinstance(world, str) else world
-        made.append(Simulation(Setup(world, scanner, **settings)))
+        made.append(Simulation(SimulationSetup(world, scanner, **settings)))
         made[-1].observe()
         return made[-1]
 

@@ -12,14 +12,14 @@ from common.geometry.world import load_world
 from common.messages.definitions import Twist
 from common.robot.scanner import SCANNERS
 from services.simulator import physics
-from services.simulator.simulation import Setup, Simulation
+from services.simulator.simulation import Simulation, SimulationSetup
 
 SCANNER = SCANNERS["tim571"].model_copy(update={"sigma": 0.0, "sigma_relative": 0.0})
 
 
 def simulations(world="office", **setup):
     return [
-        Simulation(Setup(load_world(world), SCANNER, obstacle_stop=False, engine=engine, **setup))
+        Simulation(SimulationSetup(load_world(world), SCANNER, obstacle_stop=False, engine=engine, **setup))
         for engine in ("pybullet", "kinematic")
     ]
 

@@ -15,7 +15,7 @@ from common.geometry.occupancy_grid import OCCUPIED, UNKNOWN, OccupancyGrid
 from common.geometry.world import Obstacle, World, known_worlds
 from common.robot.scanner import SCANNERS
 from services.simulator import pybullet_physics
-from services.simulator.simulation import Setup, Simulation
+from services.simulator.simulation import Simulation, SimulationSetup
 from tests.common.geometry.maps import rooms
 from tests.simulator.driving import FORWARD, drive, shipped
 
@@ -25,7 +25,7 @@ MM = 1e-3
 
 @functools.cache
 def simulation_of(name: str) -> Simulation:
-    return Simulation(Setup(shipped(name), SCANNER))
+    return Simulation(SimulationSetup(shipped(name), SCANNER))
 
 
 @pytest.fixture(scope="module")

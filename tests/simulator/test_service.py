@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
-from common.bus.inbox import Call, Inbox
+from common.bus.inbox import Inbox, IncomingRequest
 from common.messages.definitions import CmdVel, Twist
 from common.messages.requests import Request, ResetRequest, SpeedRequest
 from common.messages.topics import PAUSE, RESET, RESUME, SCAN, SPEED, STEP, TRUTH, WORLD
@@ -40,7 +40,9 @@ class Running:
         """Send a request and return the reply."""
         replies = []
         payload = (request or Request()).encode()
-        self.loop._answer(Call(query, payload, lambda p: replies.append(query.reply.decode(p)), replies.append))
+        self.loop._answer(
+            IncomingRequest(query, payload, lambda p: replies.append(query.reply.decode(p)), replies.append)
+        )
         (reply,) = replies
         return reply
 

@@ -12,7 +12,7 @@ from common.geometry import se2
 from common.geometry.world import Obstacle
 from common.messages.definitions import Twist
 from common.robot.base import Robot
-from services.simulator.odometry import Drift, Odometer
+from services.simulator.odometry import Odometer, OdometryNoise
 from tests.simulator.driving import FORWARD, HALL, contacts, drive, measurements, speed
 
 LEFT = (1.0, 3.0, 0.0)
@@ -117,7 +117,7 @@ def test_bytes_depend_on_the_seed(make, people):
 
 def test_odometry_without_drift_is_exact(make):
     start = np.array([2.0, 3.0, 0.7])
-    simulation = make(start=tuple(start), drift=Drift(0, 0, 0, 0))
+    simulation = make(start=tuple(start), drift=OdometryNoise(0, 0, 0, 0))
     drive(simulation, Twist(vx=0.5, vy=0.2, wz=0.5), 2)
     odom, truth, _ = simulation.observe()
     assert odom.pose.array() == pytest.approx(se2.between(start, truth.pose.array()), abs=1e-9)
@@ -129,7 +129,7 @@ def test_odometry_drift():
     for _ in range(30):
         poses.append(se2.compose(poses[-1], np.array([0.03, 0.01, 0.02])))
     for seed in range(200):
-        odometer = Odometer(Drift(), np.random.default_rng(seed))
+        odometer = Odometer(OdometryNoise(), np.random.default_rng(seed))
         for before, after in itertools.pairwise(poses):
             odometer.move(before, after)
         error = odometer.pose - poses[-1]

@@ -8,12 +8,12 @@ import pytest
 from common.geometry import se2
 from common.messages.definitions import Twist
 from common.robot.motion_distortion import correct_beams
-from services.simulator.odometry import Drift
+from services.simulator.odometry import OdometryNoise
 from tests.simulator.driving import HALL, SCANNER, measurements
 
 EXACT = SCANNER.model_copy(update={"sigma": 0.0})
 TURNING = Twist(vx=0.4, vy=0.2, wz=1.0)
-NO_DRIFT = Drift(0, 0, 0, 0)
+NO_DRIFT = OdometryNoise(0, 0, 0, 0)
 
 
 @pytest.mark.parametrize("engine", ["kinematic", "pybullet"])

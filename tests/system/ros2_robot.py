@@ -22,7 +22,7 @@ from common.geometry.world import load_world
 from common.messages.definitions import Twist
 from common.robot.base import Robot
 from common.robot.scanner import SCANNERS
-from services.simulator.simulation import Setup, Simulation
+from services.simulator.simulation import Simulation, SimulationSetup
 from tests.bridge_ros2.independent import (
     decode,
     encode,
@@ -135,7 +135,9 @@ class StandIn:
     def __init__(self, ros: Ros, *, stamped: bool) -> None:
         scanner = SCANNERS["tim571"].with_beams(622).model_copy(update={"mount": MOUNT})
         # Without the simulator's obstacle stop, because the bridge's is tested.
-        self.simulation = Simulation(Setup(load_world("corridor"), scanner, Robot(), None, 3, obstacle_stop=False))
+        self.simulation = Simulation(
+            SimulationSetup(load_world("corridor"), scanner, Robot(), None, 3, obstacle_stop=False)
+        )
         self.lock = threading.Lock()
         self.heard = {"commands": 0, "zeros": 0, "transforms": 0, "pose": None, "odom_in_map": None}
         twist = "geometry_msgs::msg::dds_::TwistStamped_" if stamped else "geometry_msgs::msg::dds_::Twist_"

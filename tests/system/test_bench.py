@@ -9,7 +9,7 @@ import pytest
 
 from common.messages.topics import TRUTH
 from lab.benchmarks.recorder import _compare
-from services.recorder.files.message_counts import Count, as_metadata
+from services.recorder.files.message_counts import KeyCounts, as_metadata
 from services.recorder.files.writer import RecordingWriter
 
 
@@ -62,6 +62,6 @@ def test_lost_or_altered_messages(tmp_path, payloads, equal):
     key, writer = TRUTH.key("bench"), RecordingWriter(tmp_path / "bench.mcap")
     for number, payload in enumerate(payloads):
         writer.write(TRUTH, key, payload, number, number)
-    writer.metadata("counters", as_metadata({key: Count(received=2, written=len(payloads))}))
+    writer.metadata("counters", as_metadata({key: KeyCounts(received=2, written=len(payloads))}))
     sent = {"sent": {key: {"count": 2, "crc": zlib.crc32(b"ab")}}, "late_s": 0.0}
     assert _compare(sent, writer.finish())["bytes_as_sent"] is equal

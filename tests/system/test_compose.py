@@ -14,7 +14,7 @@ from common.bus.bus import Link, open_bus, wait_until
 from common.bus.security import credentials
 from common.messages.definitions import Belief, Scan, Status, Truth
 from common.messages.topics import BELIEF, CMD_VEL, SCAN, STATUS, TRUTH
-from presage.live.bus_watch import Watch
+from presage.live.latest_messages import LatestMessages
 from presage.session import credentials as secure
 from services.recorder.reader import read_recording
 from tests.conftest import free_tcp_port
@@ -114,8 +114,8 @@ def test_secure_mode_and_health(compose, tmp_path):
     router = (f"tcp/127.0.0.1:{project.router}",)
     with open_bus(Link(connect=router)) as stranger:
         with open_bus(Link(connect=router, security=credentials(keys, ("observer",)))) as known:
-            watch = Watch(known, TRUTH, STATUS)
-            assert watch.until(Truth, lambda truth: truth.pose.x > 5.0, TIMEOUT_S), project.explain("goal")
+            messages = LatestMessages(known, TRUTH, STATUS)
+            assert messages.wait_for(Truth, lambda truth: truth.pose.x > 5.0, TIMEOUT_S), project.explain("goal")
             assert known.alive() >= {"simulator", "estimator", "controller", "recorder"}
         assert project.ends("goal") == 0
         assert "reached: within 0.02 m of the goal" in project.do("logs", "goal")
@@ -164,14 +164,14 @@ def test_replaced_services(compose):
     project.do("up", "--detach")
     assert project.do("ps", "--all", "--quiet", "viewer") == ""
     with open_bus(Link(connect=(f"tcp/127.0.0.1:{project.router}",))) as bus:
-        watch = Watch(bus, TRUTH, STATUS, BELIEF, SCAN)
-        assert watch.until(Truth, lambda truth: truth.pose.x > 5.0, TIMEOUT_S), project.explain("goal")
+        messages = LatestMessages(bus, TRUTH, STATUS, BELIEF, SCAN)
+        assert messages.wait_for(Truth, lambda truth: truth.pose.x > 5.0, TIMEOUT_S), project.explain("goal")
 
         # Replace the estimator while the robot drives: the robot stops, then continues to its goal.
         project.do("stop", "estimator")
-        alone = watch.until(Status, lambda status: "no belief for" in status.reason, TIMEOUT_S)
+        alone = messages.wait_for(Status, lambda status: "no belief for" in status.reason, TIMEOUT_S)
         assert alone is not None
-        assert watch.until(Truth, lambda truth: truth.stamp_ns > alone.stamp_ns + 2e9, TIMEOUT_S) is not None
+        assert messages.wait_for(Truth, lambda truth: truth.stamp_ns > alone.stamp_ns + 2e9, TIMEOUT_S) is not None
         project.do("up", "--detach", "--no-deps", "estimator", PRESAGE_ESTIMATOR="particle-filter")
         assert project.ends("goal") == 0
         assert "reached: within 0.02 m of the goal" in project.do("logs", "goal")
@@ -188,9 +188,9 @@ def test_replaced_services(compose):
         replayed = {"PRESAGE_SCANNER": "replay", "PRESAGE_REPLAY": file.name}
         project.do("up", "--detach", "--no-deps", "simulator", **replayed)
         project.becomes("simulator", "healthy")
-        again = watch.until(Scan, lambda scan: scan.seq < 100, TIMEOUT_S)
+        again = messages.wait_for(Scan, lambda scan: scan.seq < 100, TIMEOUT_S)
         assert again is not None
-        assert watch.until(Belief, lambda belief: belief.stamp_ns >= again.stamp_ns, TIMEOUT_S) is not None
+        assert messages.wait_for(Belief, lambda belief: belief.stamp_ns >= again.stamp_ns, TIMEOUT_S) is not None
         assert bus.alive() >= {"replay", "estimator", "controller", "recorder"}
     project.down()
 

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from common.bus.bus import Link, open_bus, wait_until
-from common.bus.inbox import Call, Inbox
+from common.bus.inbox import Inbox, IncomingRequest
 from common.messages.definitions import Health, Scan, TopicHealth
 from common.messages.topics import CONFIG, HEALTH, ODOM, SCAN
 from common.runtime.protocol_check import build_config_reply
@@ -49,7 +49,7 @@ class Participant:
             while not self.stopping.wait(0.25 if self.frozen else 0.0):
                 if self.frozen:
                     continue
-                if isinstance(call := calls.get(0.25), Call):
+                if isinstance(call := calls.get(0.25), IncomingRequest):
                     call.reply(build_config_reply(self.name, "{}").model_copy(update=self.reply_fields).encode())
                 number += 1
                 bus.put(HEALTH, self.health(number).encode(), self.name)

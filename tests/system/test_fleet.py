@@ -87,9 +87,9 @@ def test_one_estimator_for_three_robots(process, bus, link, names, simulate):
             ),
             "healthy",
         )
-        config = bus.ask(CONFIG, Request(), ConfigReply, service="estimator", robot=listener.robot)
+        config = bus.query(CONFIG, Request(), ConfigReply, service="estimator", robot=listener.robot)
         assert f'"robot": "{listener.robot}"' in config.config
-        assert bus.ask(MODEL, ModelRequest(), ModelReply, robot=listener.robot).ok
+        assert bus.query(MODEL, ModelRequest(), ModelReply, robot=listener.robot).ok
 
     # Malformed scans of one robot are counted for that robot and do not affect the others.
     garbage, before = bus.for_robot(names[2]), Inbox()

@@ -140,7 +140,7 @@ def test_afterwards(system, before):
     first = next_message(bus, SCAN, Scan)
     assert next_message(bus, SCAN, Scan, lambda scan: scan.seq > first.seq + 5)
     for name in SERVICES:
-        assert bus.ask(CONFIG, Request(), ConfigReply, service=name).service == name
+        assert bus.query(CONFIG, Request(), ConfigReply, service=name).service == name
         assert "Traceback" not in running[name].output, running[name].output[-3000:]
     for name, topics in SUBSCRIBED_TOPICS.items():
         health = next_message(bus, HEALTH, Health, lambda h, n=name: h.service == n)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from common.bus.bus import wait_until
-from common.bus.inbox import Answer, Inbox
+from common.bus.inbox import Inbox, RequestResult
 from common.errors import UserError
 from common.geometry import se2
 from common.geometry.world import load_world
@@ -31,7 +31,7 @@ def estimator(bus, process):
     bus.subscribe(BELIEF, beliefs)
     assert wait_until(lambda: "estimator" in bus.alive(), TIMEOUT_S), running.output
     assert bus.wait_matching(SCAN, TIMEOUT_S)
-    early = bus.ask(PREDICT, PredictRequest(poses=np.zeros((1, 3))), PredictReply)
+    early = bus.query(PREDICT, PredictRequest(poses=np.zeros((1, 3))), PredictReply)
     assert early.reason == "no scan has come yet"
     scan = Scan(
         stamp_ns=1, angle_min=SCANNER.angle_min, angle_increment=SCANNER.angle_increment, range_min=0.05,
@@ -46,25 +46,25 @@ def test_predictions(estimator, bus):
     rng = np.random.default_rng(0)
     poses = np.column_stack([WORLD.sample_free(100, rng, 0.27), rng.uniform(-np.pi, np.pi, 100)])
     request = PredictRequest(poses=poses, beams=61)
-    waited = bus.ask(PREDICT, request, PredictReply)
+    waited = bus.query(PREDICT, request, PredictReply)
     ranges = waited.ranges.reshape(100, 61)
     exact = WORLD.ray_distances(se2.compose(poses, np.array(SCANNER.mount)), waited.angles)
     assert np.median(np.abs(ranges - exact)) < 0.001
     inbox = Inbox()
     for number in range(5):
-        bus.request(PREDICT, request, number, inbox, TIMEOUT_S)
+        bus.send_request(PREDICT, request, number, inbox, TIMEOUT_S)
     assert wait_until(lambda: len(inbox) == 5, TIMEOUT_S)
     answers = [inbox.get(0) for _ in range(5)]
-    assert all(isinstance(each, Answer) and each.reply() == waited for each in answers)
+    assert all(isinstance(each, RequestResult) and each.reply() == waited for each in answers)
     assert sorted(each.number for each in answers) == list(range(5))
 
     for hostile in (PredictRequest(poses=np.zeros((1001, 3))), PredictRequest(poses=poses, beams=181)):
-        assert not bus.ask(PREDICT, hostile, PredictReply).ok
+        assert not bus.query(PREDICT, hostile, PredictReply).ok
     walls = PredictRequest(poses=np.array([[0.0, 0.0, 0.0], [1e4, -5.0, 7.0], [4.6, 0.9, 1.0]]))
-    assert bus.ask(PREDICT, walls, PredictReply).ok
+    assert bus.query(PREDICT, walls, PredictReply).ok
     not_finite = PredictRequest.model_construct(poses=np.full((1, 3), np.nan), beams=None)
     with pytest.raises(UserError, match=r"refused: PredictRequest\.poses: .* not finite"):
-        bus.ask(PREDICT, not_finite, PredictReply)
-    assert bus.ask(PREDICT, request, PredictReply) == waited
+        bus.query(PREDICT, not_finite, PredictReply)
+    assert bus.query(PREDICT, request, PredictReply) == waited
     assert estimator.stop() == 0
     assert "Traceback" not in estimator.output

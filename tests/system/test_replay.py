@@ -77,7 +77,7 @@ def terminal(tmp_path, link):
 
 
 def state(bus):
-    return bus.ask(PLAYER, PlayerRequest(action="status"), PlayerReply, timeout=WAIT_TIMEOUT_S)
+    return bus.query(PLAYER, PlayerRequest(action="status"), PlayerReply, timeout=WAIT_TIMEOUT_S)
 
 
 def test_keys_in_a_terminal(terminal, bus, tmp_path):

@@ -33,7 +33,7 @@ def add_barrier(bus, truth):
     """Adds a box across the whole corridor, ``BOX_DISTANCE`` ahead of the robot."""
     box = Box(center=(truth.pose.x + 0.27 + BOX_DISTANCE + 0.2, 2.25), size=(0.4, 4.5))
     request = ObstacleRequest(action="add", name="barrier", obstacle=Obstacle(box=box))
-    assert bus.ask(OBSTACLE, request, Reply).ok
+    assert bus.query(OBSTACLE, request, Reply).ok
 
 
 def drive(bus, truths, answer):

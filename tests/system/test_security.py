@@ -156,10 +156,10 @@ def test_imposter_of_the_router(secure_router, name, answered):
     with open_bus(link, connect_timeout=WAIT_TIMEOUT_S) as bus:
         assert wait_until(bus.linked, WAIT_TIMEOUT_S)
         if answered:
-            assert bus.ask(WORLD, Request(), WorldReply, WAIT_TIMEOUT_S).reason == "I am the world"
+            assert bus.query(WORLD, Request(), WorldReply, WAIT_TIMEOUT_S).reason == "I am the world"
         else:
             with pytest.raises(UserError, match="no service answers"):
-                bus.ask(WORLD, Request(), WorldReply, 2.0)
+                bus.query(WORLD, Request(), WorldReply, 2.0)
     fake.kill()
 
 

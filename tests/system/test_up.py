@@ -12,7 +12,7 @@ from common.bus.bus import Link, open_bus, wait_until
 from common.errors import UserError
 from common.messages.definitions import Belief, Health, Truth
 from common.messages.topics import BELIEF, GOAL, HEALTH, SCAN, STATUS, TRUTH
-from presage.live.bus_watch import Watch
+from presage.live.latest_messages import LatestMessages
 from presage.session.demo import FIRST_BELIEF_TIMEOUT_S, _check_estimator
 from services.recorder.reader import read_recording
 from tests.conftest import ended
@@ -110,9 +110,9 @@ def test_up_with_page_and_dead_service(up):
     assert len(children) == 6  # router, simulator, estimator, controller, viewer and an idle recorder
     (where,) = [line.split()[-1] for line in running.output.splitlines() if line.startswith("page:")]
     with Page(where) as page:
-        assert page.told("world")["world"]["name"] == "corridor"
+        assert page.wait_for("world")["world"]["name"] == "corridor"
         assert page.frame(lambda header: header["belief"] is not None)
-        page.told("services", lambda message: len(message["services"]) == 5 and not message["missing"])
+        page.wait_for("services", lambda message: len(message["services"]) == 5 and not message["missing"])
         assert page.done("record", action="status")["recording"] is False
     next(child for child in children if "services.estimator" in child.cmdline()).kill()
     running.wait_for("estimator ended with status -9", 20)
@@ -128,10 +128,10 @@ def test_up_with_two_robots(up):
     assert len(children) == 6  # a simulator and a controller for each robot, one router and one estimator
     for robot in ("r-1", "r-2"):
         with open_bus(Link(robot, (f"tcp/127.0.0.1:{port}",))) as bus:
-            watch = Watch(bus, BELIEF, TRUTH)
-            assert watch.until(Belief, lambda belief: belief.state == "tracking", 60)
-            belief = watch.latest["belief"]
-            truth = watch.until(Truth, lambda truth, stamp=belief.stamp_ns: truth.stamp_ns >= stamp, 60)
+            messages = LatestMessages(bus, BELIEF, TRUTH)
+            assert messages.wait_for(Belief, lambda belief: belief.state == "tracking", 60)
+            belief = messages.latest["belief"]
+            truth = messages.wait_for(Truth, lambda truth, stamp=belief.stamp_ns: truth.stamp_ns >= stamp, 60)
             assert abs(belief.pose.x - truth.pose.x) < 0.3
             assert bus.alive() == {"estimator", "simulator", "controller"}
     assert running.stop(signal.SIGTERM, 60) == 130

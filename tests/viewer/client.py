@@ -93,29 +93,29 @@ class Page:
         last = "\n".join(f"{kind}: {str(message)[:600]}" for kind, message in self.last.items())
         raise AssertionError(f"nothing as wanted within {timeout:g} s; the last were\n{last}")
 
-    def told(self, kind, wanted=lambda _: True, timeout=PATIENCE):
+    def wait_for(self, kind, wanted=lambda _: True, timeout=PATIENCE):
         """The next message of a type that meets a condition."""
         return self.until(lambda m: kind_of(m) == kind and wanted(m), timeout)
 
     def by_now(self, kind, wanted, timeout=PATIENCE):
-        """Like `told`, but also accepts the last message that was already received."""
+        """Like `wait_for`, but also accepts the last message that was already received."""
         last = self.last.get(kind)
         if last is not None and wanted(last):
             return last
-        return self.told(kind, wanted, timeout)
+        return self.wait_for(kind, wanted, timeout)
 
     def frame(self, wanted=lambda _: True, timeout=PATIENCE):
         """The next frame whose header meets a condition."""
-        return self.told("frame", lambda m: wanted(m.header), timeout)
+        return self.wait_for("frame", lambda m: wanted(m.header), timeout)
 
-    def ask(self, do, timeout=PATIENCE, **fields):
+    def request(self, do, timeout=PATIENCE, **fields):
         """Requests an action and returns the answer."""
         number = next(self.numbers)
         self.socket.send(json.dumps({"id": number, "do": do, **fields}))
-        return self.told("answer", lambda m: m["id"] == number, timeout)
+        return self.wait_for("answer", lambda m: m["id"] == number, timeout)
 
     def done(self, do, **fields):
-        """Like `ask`, and asserts success."""
-        answer = self.ask(do, **fields)
+        """Like `request`, and asserts success."""
+        answer = self.request(do, **fields)
         assert answer["ok"], answer
         return answer

@@ -38,14 +38,14 @@ class Visitor:
         self.socket, self.session = socket, session
         self.field: bytes | None = None  # the last one sent
 
-    async def tell(self, **message: object) -> None:
+    async def send(self, **message: object) -> None:
         """Sends a message as JSON."""
         await self.socket.send_text(json.dumps(message))
 
     async def world(self) -> None:
         """Sends world, scanner and robot."""
         world = self.session.world.model_dump(mode="json")
-        await self.tell(
+        await self.send(
             type="world", world=world, scanner=SCANNER.model_dump(mode="json"), robot=Robot().model_dump(mode="json")
         )
 
@@ -53,15 +53,15 @@ class Visitor:
         """Sends frames and services until the visitor leaves."""
         session, count = self.session, 0
         live = session.scene != "empty"
-        await self.tell(
+        await self.send(
             type="hello", control=session.scene != "watching", version="stub", robots=["robot"] * live, robot="robot"
         )
         if live:
             await self.world()
             columns = zip(*session.history, strict=True) if session.history else [[]] * 6
             names = ("t", "free_energy", "accuracy", "complexity", "error", "speed")
-            await self.tell(type="history", samples={n: list(c) for n, c in zip(names, columns, strict=True)})
-            await self.tell(**session.journal())
+            await self.send(type="history", samples={n: list(c) for n, c in zip(names, columns, strict=True)})
+            await self.send(**session.journal())
         while True:
             if live and not session.paused:
                 await self.socket.send_bytes(session.step())
@@ -69,16 +69,16 @@ class Visitor:
                     self.field = session.planner.news
                     await self.socket.send_bytes(self.field)
             if count % 15 == 0:
-                await self.tell(**pulses(session.scene))
+                await self.send(**pulses(session.scene))
             count += 1
             await asyncio.sleep(DT)
 
     async def listen(self) -> None:
         """Answers requests until the visitor leaves."""
         while True:
-            ask = json.loads(await self.socket.receive_text())
-            await self.tell(type="answer", id=ask.get("id"), **self.session.act(ask))
-            if ask.get("do") == "obstacle":
+            request = json.loads(await self.socket.receive_text())
+            await self.send(type="answer", id=request.get("id"), **self.session.act(request))
+            if request.get("do") == "obstacle":
                 await self.world()
 
 

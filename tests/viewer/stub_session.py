@@ -8,7 +8,7 @@ import numpy as np
 
 from common.geometry.world import Obstacle, World
 from common.robot.scanner import SCANNERS
-from services.viewer.state.frames import encode
+from services.viewer.state.frames import encode_frame
 from tests.viewer import stub_plan
 
 SCENES = (
@@ -122,7 +122,7 @@ class Session:
             },
         }  # fmt: skip
         none = np.zeros(0, np.float32)
-        return encode(header, {
+        return encode_frame(header, {
             "ranges": measured.astype(np.float32),
             "predicted": none if blind else expected.astype(np.float32),
             "sigma": none if blind else sigma.astype(np.float32),
@@ -157,23 +157,23 @@ class Session:
         """Pose of the scanner for a pose of the robot."""
         return pose + SCANNER.mount[0] * np.array([np.cos(pose[2]), np.sin(pose[2]), 0])
 
-    def act(self, ask: dict) -> dict:
+    def act(self, request: dict) -> dict:
         """Handles a visitor's request. Returns the fields of the answer."""
         if self.scene == "watching":
             return {"ok": False, "reason": "visitors only watch here"}
-        reason = getattr(self, f"do_{ask.get('do')}", lambda _: "")(ask)
+        reason = getattr(self, f"do_{request.get('do')}", lambda _: "")(request)
         more = reason if isinstance(reason, dict) else {"reason": reason or ""}
         return {"ok": not more.get("reason"), "reason": "", **more}
 
-    def do_goal(self, ask: dict) -> str:
-        if self.world.clearance([[ask["x"], ask["y"]]])[0] < 0.27:
+    def do_goal(self, request: dict) -> str:
+        if self.world.clearance([[request["x"], request["y"]]])[0] < 0.27:
             return "the robot does not fit there"
-        self.goal = np.array([ask["x"], ask["y"], *([ask["yaw"]] if "yaw" in ask else [])])
+        self.goal = np.array([request["x"], request["y"], *([request["yaw"]] if "yaw" in request else [])])
         return ""
 
-    def do_obstacle(self, ask: dict) -> None:
-        others = [o for o in self.world.obstacles if o.name != ask["name"]]
-        new = [] if ask["action"] == "remove" else [Obstacle.model_validate(ask["obstacle"])]
+    def do_obstacle(self, request: dict) -> None:
+        others = [o for o in self.world.obstacles if o.name != request["name"]]
+        new = [] if request["action"] == "remove" else [Obstacle.model_validate(request["obstacle"])]
         self.world = World.model_validate(self.world.model_copy(update={"obstacles": others + new}).model_dump())
 
     def do_pause(self, _: dict) -> None:

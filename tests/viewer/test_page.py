@@ -198,11 +198,11 @@ def test_two_visitors(system):
         assert frame.header["latency_ms"] > 0
         page.done("obstacle", action="add", name="crate", obstacle=CRATE)
         for visitor in (page, other):
-            visitor.told("world", lambda m: "crate" in [o["name"] for o in m["world"]["obstacles"]])
+            visitor.wait_for("world", lambda m: "crate" in [o["name"] for o in m["world"]["obstacles"]])
         page.done("obstacle", action="remove", name="crate")
-        assert "crate" in page.ask("obstacle", action="remove", name="crate")["reason"]
-        assert "inside something" in page.ask("goal", x=-4, y=1.5)["reason"]
-        assert "wall" in page.ask("teleport", x=0.05, y=0.05)["reason"]
+        assert "crate" in page.request("obstacle", action="remove", name="crate")["reason"]
+        assert "inside something" in page.request("goal", x=-4, y=1.5)["reason"]
+        assert "wall" in page.request("teleport", x=0.05, y=0.05)["reason"]
         page.done("goal", x=12.0, y=1.5, yaw=1.57)
         frame = page.frame(
             lambda h: (
@@ -220,7 +220,7 @@ def test_two_visitors(system):
         page.frame(lambda h: h["status"]["goal"] is None)
         page.done("localise")
 
-        assert not page.ask("step")["ok"]  # refused while the simulation runs
+        assert not page.request("step")["ok"]  # refused while the simulation runs
         page.done("pause")
         time.sleep(0.2)  # for frames that are under way
         with Page(system.address) as late:  # gets the current frame
@@ -230,7 +230,7 @@ def test_two_visitors(system):
             assert stepped["stamp_ns"] - first == pytest.approx(1e9 / 15, rel=0.01)
         page.done("resume")
         page.done("speed", factor=2)
-        assert not page.ask("speed", factor=500)["ok"]
+        assert not page.request("speed", factor=500)["ok"]
         page.done("speed", factor=1)
         page.done("reset", seed=5)
         page.frame(lambda h: h["t"] < stepped["t"])

@@ -28,9 +28,9 @@ def test_recording_of_one_visitor(viewer, bus):
         assert set(rows) == {"broken.mcap", "hall.mcap"}
         assert "duration" not in rows["broken.mcap"]
         assert rows["hall.mcap"]["duration"] == pytest.approx(9.9, abs=0.1)
-        assert not page.ask("player", action="resume")["ok"]
-        assert not page.ask("open", name="../hall.mcap")["ok"]
-        assert "not an MCAP file" in page.ask("open", name="broken.mcap")["reason"]
+        assert not page.request("player", action="resume")["ok"]
+        assert not page.request("open", name="../hall.mcap")["ok"]
+        assert "not an MCAP file" in page.request("open", name="broken.mcap")["reason"]
 
         page.done("open", name="hall.mcap")
         hello = page.last["hello"]
@@ -39,10 +39,10 @@ def test_recording_of_one_visitor(viewer, bus):
         frame = page.by_now("frame", lambda f: f.header["robot"] == ghost and is_complete(f.header))
         assert frame.header["error"] == pytest.approx(2.0)
         assert len(frame.arrays["ranges"]) == len(frame.arrays["predicted"]) == recorded.SCANNER.beams
-        state = page.told("player")
+        state = page.wait_for("player")
         assert (state["paused"], state["file"]) == (True, "hall.mcap")
         other.by_now("hello", lambda m: ghost in m["robots"] and m["robot"] == bus.robot)  # keeps its robot
-        assert "recording" in page.ask("goal", x=5, y=1.5)["reason"]
+        assert "recording" in page.request("goal", x=5, y=1.5)["reason"]
 
         page.done("player", action="seek", value=5.0)
         page.frame(lambda h: h["t"] == pytest.approx(5.0, abs=0.11) and is_complete(h))
@@ -53,7 +53,7 @@ def test_recording_of_one_visitor(viewer, bus):
         page.frame(lambda h: h["t"] < 1.0)
         page.done("player", action="rate", value=8)
         page.done("player", action="resume")
-        page.told("player", lambda m: m["paused"] and m["position_s"] == pytest.approx(m["duration_s"]))  # it stays
+        page.wait_for("player", lambda m: m["paused"] and m["position_s"] == pytest.approx(m["duration_s"]))  # it stays
         page.done("player", action="rate", value=0.5)  # faster, a slow machine may skip the first second
         page.done("player", action="resume")  # it starts from the beginning
         page.frame(lambda h: h["t"] < 1.0)
@@ -71,7 +71,7 @@ def test_death_of_replay_and_viewer(viewer, bus):
 
     with Page(page_of(viewer)) as page:
         open_recording(page).kill()
-        page.told("closed")
+        page.wait_for("closed")
         page.by_now("hello", lambda m: m["robots"] == [bus.robot])
         child = open_recording(page)
         viewer.send(signal.SIGKILL)

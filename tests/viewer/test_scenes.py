@@ -76,7 +76,7 @@ def look(browser, stub):
 
     yield start
     for seen in visits:
-        seen.see("presage.connection.ask('resume')")  # for the next visitor of the scene
+        seen.see("presage.connection.request('resume')")  # for the next visitor of the scene
         seen.page.context.close()
         assert seen.complaints == []
 
@@ -114,7 +114,7 @@ def test_widths_and_layouts(look):
 
 def test_tools_on_a_phone(look):
     seen = look("planning", **PHONE)
-    seen.wait("store.world && store.frame && modes.can")
+    seen.wait("store.world && store.frame && modes.canControl")
     assert seen.see("view.shown.field") is False  # which on a wide screen is shown
     for width, height in ((360, 640), (390, 844), (844, 390)):
         seen.page.set_viewport_size({"width": width, "height": height})
@@ -194,7 +194,7 @@ def test_goals_by_drag(look):
 def test_axis_labels(look):
     seen = look("tracking", **PHONE)
     seen.wait("store.world && store.frame")
-    seen.see("presage.connection.ask('pause')")
+    seen.see("presage.connection.request('pause')")
     seen.wait("performance.now() - store.arrivals.at(-1) > 500")
     seen.see(LARGE_NUMBERS)
     for name in ("c-energy", "c-complexity", "c-speed", "c-scan", "map"):
@@ -229,7 +229,7 @@ def test_zoom_and_joystick(look):
     assert seen.see("store.frame.status.goal") == goal
 
     # The joystick steers the same though the page moves under the thumb.
-    seen.see("presage.connection.ask = (action, fields) => ((window.asked ??= []).push({ action, ...fields }), "
+    seen.see("presage.connection.request = (action, fields) => ((window.sent ??= []).push({ action, ...fields }), "
              "Promise.resolve({ ok: true, reason: '' }))")  # fmt: skip
     box = seen.page.locator("#joystick").bounding_box()
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
@@ -237,11 +237,11 @@ def test_zoom_and_joystick(look):
     fingers.do("touchMove", (x, y - 24))
     seen.see("document.getElementById('banner').hidden = false")  # 40 px of something above
     fingers.do("touchMove", (x, y - 25))
-    seen.wait("window.asked.length > 3", 5)
+    seen.wait("window.sent.length > 3", 5)
     fingers.do("touchEnd")
-    seen.wait("window.asked.at(-1).vx === 0", 5)
-    *said, last = seen.see("window.asked.filter((one) => one.action === 'drive')")
-    assert all(one["vx"] > 0.2 for one in said[2:]), said
+    seen.wait("window.sent.at(-1).vx === 0", 5)
+    *before, last = seen.see("window.sent.filter((one) => one.action === 'drive')")
+    assert all(one["vx"] > 0.2 for one in before[2:]), before
     assert (last["vx"], last["wz"]) == (0, 0)
 
 

@@ -14,7 +14,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from common.bus.bus import Link, open_bus, wait_until
-from common.bus.inbox import Call, Inbox, Sample
+from common.bus.inbox import Inbox, IncomingRequest, Sample
 from common.geometry.world import load_world
 from common.messages.definitions import Health
 from common.messages.requests import Reply, WorldReply
@@ -73,16 +73,16 @@ class Pretence:
 def test_empty_system(viewer, link):
     _, where = viewer()
     with Page(where) as page:
-        hello = page.told("hello")
+        hello = page.wait_for("hello")
         assert (hello["control"], hello["robots"], hello["robot"]) == (True, [link.robot], link.robot)
-        assert page.told("history")["samples"]["t"] == []
-        services = page.told("services", lambda m: m["linked"])
+        assert page.wait_for("history")["samples"]["t"] == []
+        services = page.wait_for("services", lambda m: m["linked"])
         assert [row["name"] for row in services["missing"]] == ["simulator", "estimator", "controller"]
         start = services["missing"][1]["start"]
         assert start == f"python -m services.estimator --robot {link.robot} --connect {link.connect[0]}"
-        rows = page.told("services", lambda m: m["services"] and m["services"][0]["rates"])["services"]
+        rows = page.wait_for("services", lambda m: m["services"] and m["services"][0]["rates"])["services"]
         assert rows[0]["name"] == "viewer"
-        answer = page.ask("teleport", x=1, y=1, timeout=2.0)  # the viewer does not wait for a missing service
+        answer = page.request("teleport", x=1, y=1, timeout=2.0)  # the viewer does not wait for a missing service
         assert "the simulator is not running; start it with: python -m services.simulator" in answer["reason"]
 
 
@@ -126,7 +126,7 @@ def test_token(viewer):
     assert refused(base) == 401
     assert refused(where, origin="http://evil.example") == 403
     with Page(base, additional_headers={"Cookie": cookie}) as page:
-        assert page.told("hello")["control"] is True
+        assert page.wait_for("hello")["control"] is True
 
 
 def test_visitors_beyond_loopback(viewer, bus, link):
@@ -135,14 +135,14 @@ def test_visitors_beyond_loopback(viewer, bus, link):
     for topic in TOPICS:
         bus.subscribe(topic, inbox, keep_all=True)
     with Page(where) as page:
-        assert page.told("hello")["control"] is False
+        assert page.wait_for("hello")["control"] is False
         for do, fields in [
             ("goal", {"x": 1, "y": 1}), ("drive", {"vx": 1}), ("pause", {}), ("recordings", {}),
             ("open", {"name": "a.mcap"}), ("player", {"action": "pause"}), ("record", {"action": "start"}),
         ]:  # fmt: skip
-            assert "only watch" in page.ask(do, **fields)["reason"]
+            assert "only watch" in page.request(do, **fields)["reason"]
         page.done("watch", robot=link.robot)
-        page.told("services", lambda m: any(row["name"] == "viewer" for row in m["services"]))
+        page.wait_for("services", lambda m: any(row["name"] == "viewer" for row in m["services"]))
     heard = {sample.topic for sample in iter(lambda: inbox.get(0), None) if isinstance(sample, Sample)}
     assert heard <= {HEALTH}
 
@@ -151,9 +151,9 @@ def test_messages_and_late_visitors(viewer, bus):
     _, where = viewer()
     robot = Pretence(bus)
     with Page(where) as page:
-        page.told("history")
+        page.wait_for("history")
         bus.put(PREFERENCE, preference(1.0).encode())
-        assert page.told("field").header["goal"]["x"] == 9.0
+        assert page.wait_for("field").header["goal"]["x"] == 9.0
         frame = robot.keep_saying(page, lambda h: is_complete(h) and h["truth"] and h["cmd"] and h["status"])
         header = frame.header
         assert header["robot"] == bus.robot
@@ -162,10 +162,10 @@ def test_messages_and_late_visitors(viewer, bus):
         np.testing.assert_array_equal(frame.arrays["predicted"], np.arange(5))
         rows = page.by_now("journal", lambda m: m["rows"])["rows"]
         assert [row["state"] for row in rows] == ["navigating"]
-        services = page.told("services", lambda m: len(m["missing"]) < 3)
+        services = page.wait_for("services", lambda m: len(m["missing"]) < 3)
         assert "simulator" not in [row["name"] for row in services["missing"]]  # scans arrive
         bus.put(PREFERENCE, preference(2.0, x=3.0).encode())
-        assert page.told("field").header["goal"]["x"] == 3.0
+        assert page.wait_for("field").header["goal"]["x"] == 3.0
     bus.put(PREFERENCE, preference(3.0, x=4.0).encode())  # without visitors
     time.sleep(0.2)
     with Page(where) as page:
@@ -183,22 +183,22 @@ def test_several_robots(viewer, bus, link):
     _, where = viewer()
     name = "two" + link.robot
     with Page(where) as page, Page(where) as other, open_bus(Link(name, link.connect)) as second:
-        page.told("hello")
-        assert not page.ask("watch", robot=name)["ok"]
+        page.wait_for("hello")
+        assert not page.request("watch", robot=name)["ok"]
         second.declare_alive("simulator")
-        assert page.told("hello", lambda m: len(m["robots"]) == 2)["robots"] == [link.robot, name]
+        assert page.wait_for("hello", lambda m: len(m["robots"]) == 2)["robots"] == [link.robot, name]
         page.done("watch", robot=name)
         assert page.last["hello"]["robot"] == name
         Pretence(second).keep_saying(page, lambda h: h["robot"] == name)
         Pretence(bus).keep_saying(other, lambda h: h["robot"] == link.robot)
         second.put(PREFERENCE, preference(1.0).encode())
-        page.told("field", lambda f: f.header["robot"] == name)
+        page.wait_for("field", lambda f: f.header["robot"] == name)
         page.done("watch", robot=link.robot)
         assert page.frame().header["robot"] == link.robot
         for _ in range(2):  # long enough to unfollow a robot without visitors
-            page.told("services")
+            page.wait_for("services")
         page.done("watch", robot=name)
-        assert page.told("field").header["robot"] == name
+        assert page.wait_for("field").header["robot"] == name
 
 
 class Servant:
@@ -214,7 +214,7 @@ class Servant:
         deadline = time.monotonic() + timeout
         while (left := deadline - time.monotonic()) > 0:
             call = self.inbox.get(left)
-            if not isinstance(call, Call):
+            if not isinstance(call, IncomingRequest):
                 continue
             reply = Reply()
             if call.query is WORLD:
@@ -222,7 +222,7 @@ class Servant:
             call.reply(reply.encode())
             if call.query.name == name:
                 return
-        raise AssertionError(f"nobody asked for {name}")
+        raise AssertionError(f"no request {name}")
 
 
 def test_world_that_changes(viewer, bus):
@@ -231,13 +231,13 @@ def test_world_that_changes(viewer, bus):
     bus.declare_alive("simulator")
     with Page(where) as page:
         servant.answer("world")
-        told = page.told("world")
-        assert told["world"]["name"] == "maze"
-        assert told["robot"]["radius"] == 0.3
-        assert told["scanner"]["beams"] == 811
+        message = page.wait_for("world")
+        assert message["world"]["name"] == "maze"
+        assert message["robot"]["radius"] == 0.3
+        assert message["scanner"]["beams"] == 811
         servant.world = load_world("office")
         servant.answer("world", 20)
-        assert page.told("world")["world"]["name"] == "office"
+        assert page.wait_for("world")["world"]["name"] == "office"
 
 
 HOSTILE = [
@@ -256,10 +256,10 @@ def test_hostile_visitors(viewer, bus):
     with Page(where) as page:
         for message in HOSTILE:
             page.socket.send(message)
-            assert not page.told("answer")["ok"], message
-        assert page.ask("recordings")["ok"]
+            assert not page.wait_for("answer")["ok"], message
+        assert page.request("recordings")["ok"]
     with Page(where) as page:  # longer than the server accepts
-        page.told("hello")
+        page.wait_for("hello")
         with pytest.raises(ConnectionClosed):  # noqa: PT012 - sending may fail already
             page.socket.send("x" * 200_000)
             for _ in range(100):
@@ -270,11 +270,11 @@ def test_hostile_visitors(viewer, bus):
         while raw.recv(4096):
             pass
     with Page(where) as flood, Page(where) as page:
-        page.told("hello")
+        page.wait_for("hello")
         with contextlib.suppress(ConnectionClosed, TimeoutError):
             for i in range(1000):
                 flood.socket.send(json.dumps({"id": i, "do": "recordings"}))
-        assert page.ask("recordings", timeout=5.0)["ok"]  # others do not wait
+        assert page.request("recordings", timeout=5.0)["ok"]  # others do not wait
 
     def counted():
         return any(
@@ -297,8 +297,8 @@ def test_slow_visitor(viewer, bus):
     big = {"ranges": np.ones(4000, np.float32)}  # 16 kB
     sent = 400
     with Page(where) as quick, Page(where, sock=narrow, max_queue=1) as slow:
-        quick.told("history")
-        slow.told("history")
+        quick.wait_for("history")
+        slow.wait_for("history")
         seen = set()
         for i in range(sent):  # 6 MB, more than any buffer in between holds
             stamp = 100.0 + i / 15
@@ -320,12 +320,12 @@ def test_router_that_comes_back(processes, tmp_path):
     env = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{port}", "PRESAGE_ROBOT": "again"}
     running = processes.start("viewer", "--port", "0", env=env)
     with Page(page_of(running)) as page:
-        page.told("services", lambda m: m["linked"])
+        page.wait_for("services", lambda m: m["linked"])
         router.stop()
-        lost = page.told("services", lambda m: not m["linked"])
+        lost = page.wait_for("services", lambda m: not m["linked"])
         assert lost["missing"][0] == {"name": "router", "start": "python -m common.router"}
         processes.start("common.router", "--listen", f"tcp/127.0.0.1:{port}")
-        page.told("services", lambda m: m["linked"])
+        page.wait_for("services", lambda m: m["linked"])
         with open_bus(Link("again", (f"tcp/127.0.0.1:{port}",))) as bus:
             Pretence(bus).keep_saying(page, lambda h: h["belief"])
 
@@ -333,7 +333,7 @@ def test_router_that_comes_back(processes, tmp_path):
 def test_end_with_visitors(viewer):
     running, where = viewer()
     with Page(where) as page:
-        page.told("hello")
+        page.wait_for("hello")
         idle = socket.create_connection(("127.0.0.1", int(where.rstrip("/").rsplit(":", 1)[1])))
         with idle:
             assert running.stop() == 0, running.output
@@ -348,7 +348,7 @@ def test_answer_that_does_not_come(viewer, bus):
     bus.declare_alive("simulator")
     bus.serve(PAUSE, Inbox())  # receives the query but never answers
     with Page(where) as page:
-        page.told("services", lambda m: "simulator" not in m["missing"])
-        answer = page.ask("pause")
+        page.wait_for("services", lambda m: "simulator" not in m["missing"])
+        answer = page.request("pause")
         assert not answer["ok"]
         assert "no service answers" in answer["reason"]

@@ -12,7 +12,7 @@ from services.viewer import visitor_requests as requests
 
 BOX = {"box": {"center": [1, 2], "size": [1, 0.5], "yaw_deg": 30}}
 GOOD = [
-    ({"do": "watch", "robot": "robot-2"}, requests.Watch(do="watch", robot="robot-2")),
+    ({"do": "watch", "robot": "robot-2"}, requests.WatchRobot(do="watch", robot="robot-2")),
     ({"do": "goal", "x": 1, "y": 2.5}, requests.GoTo(do="goal", x=1.0, y=2.5)),
     ({"do": "goal", "x": 1, "y": 2, "yaw": -1.5, "tolerance": 0.1}, requests.GoTo(do="goal", x=1, y=2, yaw=-1.5, tolerance=0.1)),  # noqa: E501
     ({"do": "cancel"}, requests.Cancel(do="cancel")),

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 from starlette.websockets import WebSocket
 
-from services.viewer.visitor_session import Session
+from services.viewer.visitor_session import VisitorSession
 from services.viewer.visitors import Hub
 
 
@@ -25,7 +25,7 @@ def talk(send, messages, act=None):
         context = SimpleNamespace(hub=Hub(), roster=SimpleNamespace(robot="robot"))
         desk = SimpleNamespace(context=context, act=act, show_robot=lambda visitor, _robot: visitor.queue_text("hello"))
         websocket = WebSocket({"type": "websocket"}, receive, send)
-        await asyncio.wait_for(Session(websocket, desk).run(), 30.0)
+        await asyncio.wait_for(VisitorSession(websocket, desk).run(), 30.0)
 
     asyncio.run(whole())
 

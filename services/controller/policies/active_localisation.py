@@ -1,9 +1,10 @@
 """Chooses where to drive while the pose is ambiguous or unknown.
 
-Policies are drives to a place, and their expected free energy is that of `expected_free_energy`: the path to the place
-and from there to the goal, minus the expected information of a scan from there. With several possible poses, that is
-how well predicted scans distinguish them; with an unknown pose, any scan is assumed to give the pose. In both cases a
-scan near a place where the robot has already been gives less, because scans from one place are not independent.
+A policy is a drive to a place. Its expected free energy (see `expected_free_energy`) is the length of the path to the
+place and from there to the goal, minus the expected information of a scan from there. With several possible poses, this
+information is how well predicted scans distinguish the poses; with an unknown pose, any scan is assumed to give the
+pose. In both cases a scan near a place where the robot has already been gives less information, because scans from one
+place are not independent.
 """
 
 from __future__ import annotations
@@ -43,8 +44,8 @@ CORRELATION_LENGTH_M = 1.0  # scans from places this far apart are nearly indepe
 MAX_VISITED = 100  # positions kept, VISITED_SPACING_M apart
 VISITED_SPACING_M = 0.25
 STALLED_NS = 3_000_000_000  # time without motion after which a place counts as visited, because no way leads there
-MAX_USEFUL_ROOM_M = 5.0  # more room than this is no advantage
-WINDOW_RAD = 0.35  # to either side of a direction; its room is the shortest range in this window
+MAX_USEFUL_ROOM_M = 5.0  # more free distance than this is no advantage
+WINDOW_RAD = 0.35  # to either side of a direction; its room (free distance) is the shortest range in this window
 MIN_ROOM_M = 0.7  # if every direction has less, the robot turns on the spot
 NOMINAL_SIGMA_M = 0.02  # of a beam whose precision is not in doubt
 
@@ -69,7 +70,7 @@ class VisitedPlaces:
     def __init__(self) -> None:
         self.positions = np.zeros((1, 2))  # (V, 2) m
         self._stamp_ns: int | None = None
-        self._progress = np.zeros(2), 0  # m and ns, where and when the robot last got on
+        self._progress = np.zeros(2), 0  # m and ns, where and when the robot last made progress
 
     def move(self, stamp_ns: int, velocity: Array) -> Array:
         """Advance to a stamp with the latest command (3,). Returns the motion (3,) since the stamp before."""
@@ -117,7 +118,7 @@ class ActiveLocaliser:
         """Plan in another map."""
         self.graph = graph
         area = float((graph.free.clearance > 0).sum()) * graph.grid.resolution**2
-        # Of a pose of which nothing is known, at the resolution of the pose.
+        # Entropy of an unknown pose, at the resolution of poses.
         self._unknown_entropy = float(np.log(max(1.0, 2 * np.pi * area / np.sqrt(np.linalg.det(efe.RESOLUTION)))))
 
     def reset(self) -> None:

@@ -68,7 +68,7 @@ class FieldOfView:
 
 
 @dataclass(frozen=True)
-class Survey:
+class ExplorationState:
     """What is known about the building and about the exploration so far."""
 
     graph: FreeSpaceGraph  # of the growing map
@@ -99,7 +99,7 @@ class Frontier:
 
 
 @dataclass(frozen=True)
-class Candidates:
+class CandidateViewpoints:
     """Places that may become viewpoints."""
 
     places: Array  # (P, 2) m in map
@@ -107,14 +107,14 @@ class Candidates:
     target: int | None  # index of the present target; None if there is none, or it cannot be reached
 
 
-def choose_viewpoint(survey: Survey) -> Viewpoint | None:
+def choose_viewpoint(state: ExplorationState) -> Viewpoint | None:
     """The first viewpoint of the tour of least expected free energy; None if no viewpoint is worth a visit."""
-    frontier, known = find_frontier(survey), known_space(survey.graph)
-    candidates = find_candidates(survey, frontier, known)
+    frontier, known = find_frontier(state), known_space(state.graph)
+    candidates = find_candidates(state, frontier, known)
     selected = select_viewpoints(candidates.sees, frontier.nats, candidates.target)
     if not selected:
         return None
-    cost = _travel_costs(known, [survey.pose[:2], *candidates.places[selected], survey.home])
+    cost = _travel_costs(known, [state.pose[:2], *candidates.places[selected], state.home])
     tour = shortest_tour(cost)
     if selected[0] == candidates.target:
         tour = _prefer_target(tour, cost)
@@ -122,12 +122,12 @@ def choose_viewpoint(survey: Survey) -> Viewpoint | None:
     returning_at_once = NATS_PER_METRE * cost[0, -1]
     if NATS_PER_METRE * _length(cost, tour) - information >= returning_at_once:
         return None
-    return _viewpoint(survey, candidates.places[selected][tour], frontier, candidates.sees[selected[tour[0]]])
+    return _viewpoint(state, candidates.places[selected][tour], frontier, candidates.sees[selected[tour[0]]])
 
 
-def find_frontier(survey: Survey) -> Frontier:
+def find_frontier(state: ExplorationState) -> Frontier:
     """The unknown cells beside known free ones that are not given up."""
-    free = survey.graph.free
+    free = state.graph.free
     beside = np.zeros_like(free.unknown)
     passable = ~_opaque(free)
     beside[1:] |= passable[:-1]
@@ -135,8 +135,8 @@ def find_frontier(survey: Survey) -> Frontier:
     beside[:, 1:] |= passable[:, :-1]
     beside[:, :-1] |= passable[:, 1:]
     cells = np.flatnonzero(free.unknown & beside & (free.clearance > 0))
-    scans = np.concatenate([survey.scans, np.repeat(survey.arrivals, ARRIVAL_SCANS, axis=0)])
-    misses = np.sum(_in_sight(survey, scans[:, :2], cells) & _in_sector(survey, scans, cells), axis=0)
+    scans = np.concatenate([state.scans, np.repeat(state.arrivals, ARRIVAL_SCANS, axis=0)])
+    misses = np.sum(_in_sight(state, scans[:, :2], cells) & _in_sector(state, scans, cells), axis=0)
     nats = np.log(2) * MISS_PROBABILITY**misses
     return Frontier(cells[nats >= MIN_CELL_NATS], nats[nats >= MIN_CELL_NATS])
 
@@ -149,27 +149,27 @@ def known_space(graph: FreeSpaceGraph) -> FreeSpaceGraph:
     )
 
 
-def find_candidates(survey: Survey, frontier: Frontier, known: FreeSpaceGraph) -> Candidates:
+def find_candidates(state: ExplorationState, frontier: Frontier, known: FreeSpaceGraph) -> CandidateViewpoints:
     """The place of the robot, places on a lattice that it can reach, and its present target."""
     grid = known.grid
-    field = known.cost_field(survey.pose[:2], known.min_clearance)
+    field = known.cost_field(state.pose[:2], known.min_clearance)
     if field is None or not len(frontier.cells):
-        return Candidates(np.zeros((0, 2)), np.zeros((0, len(frontier.cells)), bool), None)
+        return CandidateViewpoints(np.zeros((0, 2)), np.zeros((0, len(frontier.cells)), bool), None)
     step = max(1, round(VIEWPOINT_SPACING_M / grid.resolution))
     lattice = np.zeros(grid.shape, bool)
     lattice[step // 2 :: step, step // 2 :: step] = True
     cells = np.flatnonzero(np.isfinite(field.cost) & lattice)
     places, target = np.concatenate([field.goal[None], grid.centres(cells)]), None
-    if survey.target is not None and np.isfinite(field.cost.ravel()[grid.cell_of(survey.target)]):
-        places, target = np.concatenate([places, survey.target[None]]), len(places)
-    sees = _in_sight(survey, places, frontier.cells)
-    if len(survey.unreachable):
-        distance = np.hypot(*np.moveaxis(places[:, None] - survey.unreachable, -1, 0)).min(axis=1)
+    if state.target is not None and np.isfinite(field.cost.ravel()[grid.cell_of(state.target)]):
+        places, target = np.concatenate([places, state.target[None]]), len(places)
+    sees = _in_sight(state, places, frontier.cells)
+    if len(state.unreachable):
+        distance = np.hypot(*np.moveaxis(places[:, None] - state.unreachable, -1, 0)).min(axis=1)
         sees &= (distance > UNREACHABLE_RANGE_M)[:, None]
-    if len(survey.arrivals):
-        near = np.hypot(*np.moveaxis(places[:, None] - survey.arrivals[:, :2], -1, 0)) < ARRIVAL_RANGE_M
-        sees &= ~(near @ _in_sector(survey, survey.arrivals, frontier.cells))
-    return Candidates(places, sees, target)
+    if len(state.arrivals):
+        near = np.hypot(*np.moveaxis(places[:, None] - state.arrivals[:, :2], -1, 0)) < ARRIVAL_RANGE_M
+        sees &= ~(near @ _in_sector(state, state.arrivals, frontier.cells))
+    return CandidateViewpoints(places, sees, target)
 
 
 def select_viewpoints(sees: Mask, nats: Array, target: int | None = None) -> list[int]:
@@ -257,26 +257,26 @@ def _opaque(free: FreeSpace) -> Mask:
     return np.asarray(free.unknown | (free.clearance < free.grid.resolution / 2 - 1e-9))
 
 
-def _in_sight(survey: Survey, places: Array, cells: Cells) -> Mask:
+def _in_sight(state: ExplorationState, places: Array, cells: Cells) -> Mask:
     """Whether nothing hides the cells (F,) with these flat indices from a scanner at places (P, 2) m; (P, F)."""
-    free = survey.graph.free
+    free = state.graph.free
     size, corner = free.grid.resolution, np.array(free.grid.origin)
     targets = (free.grid.centres(cells) - corner) / size
-    reach, own_radius = survey.field_of_view.range_m / size, survey.graph.radius / size
+    reach, own_radius = state.field_of_view.range_m / size, state.graph.radius / size
     return np.asarray(visible(_opaque(free), (places - corner) / size, targets, reach, own_radius))
 
 
-def _in_sector(survey: Survey, poses: Array, cells: Cells) -> Mask:
+def _in_sector(state: ExplorationState, poses: Array, cells: Cells) -> Mask:
     """Whether cells (F,) lie in the directions that the scanner sees from poses (P, 3); (P, F)."""
-    sector = survey.field_of_view.sector
-    offset = survey.graph.grid.centres(cells) - poses[:, None, :2]
+    sector = state.field_of_view.sector
+    offset = state.graph.grid.centres(cells) - poses[:, None, :2]
     bearing = np.arctan2(offset[..., 1], offset[..., 0]) - poses[:, None, 2] - sector.centre
     return np.asarray(np.abs(se2.wrap(bearing)) <= sector.half + 1e-9)
 
 
-def _viewpoint(survey: Survey, tour: Array, frontier: Frontier, sees: Mask) -> Viewpoint:
+def _viewpoint(state: ExplorationState, tour: Array, frontier: Frontier, sees: Mask) -> Viewpoint:
     """The first place of a tour (V, 2) m as a viewpoint; it sees the frontier cells in the mask ``sees`` (F,)."""
     place, nats = tour[0], frontier.nats[sees]
-    middle = (nats[:, None] * (survey.graph.grid.centres(frontier.cells[sees]) - place)).sum(axis=0)
-    heading = float(se2.wrap(np.arctan2(middle[1], middle[0]) - survey.field_of_view.sector.centre))
+    middle = (nats[:, None] * (state.graph.grid.centres(frontier.cells[sees]) - place)).sum(axis=0)
+    heading = float(se2.wrap(np.arctan2(middle[1], middle[0]) - state.field_of_view.sector.centre))
     return Viewpoint(np.array([*place, heading]), float(nats.sum()), tour)

@@ -27,7 +27,7 @@ STANDING_SPEED = 0.02  # m/s or rad/s; anything slower counts as standing
 
 
 def delay_until_effect(robot: Robot, scan: Scan | None) -> float:
-    """Time in s from a scan's stamp until the command that answers it takes effect."""
+    """Time in s from a scan's stamp until the command that responds to it takes effect."""
     return robot.latency + (scan.sweep_time if scan is not None else 0.0)
 
 

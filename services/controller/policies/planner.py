@@ -53,7 +53,7 @@ class GeodesicPolicy:
         ``keep_heading``: a holonomic base does not turn into its direction of motion. ``epistemic``: policies are also
         judged by the information that they gain; otherwise the robot drives on as if the best hypothesis were true.
         """
-        # In a growing map, what scans would tell is unknown where the map is.
+        # In a growing map, the information of scans is unknown where the map is unknown.
         self.epistemic = epistemic and world is not None
         self.robot, self.world, self.keep_heading = robot, world, keep_heading
         self.free = NO_MAP if world is None else FreeSpace.of(world)
@@ -70,7 +70,7 @@ class GeodesicPolicy:
         # Stamp at which obstacles were last given to the graph, and their cells; whether the field is older than that.
         self._planned: tuple[int, npt.NDArray[Any]] = (-REPLAN_PERIOD_NS, np.zeros(0, int))
         self._field_outdated = False
-        self._vetted_component: int | None = None  # the component from which the goal was found to be reachable
+        self._vetted_component: int | None = None  # the component from which the goal is known to be reachable
         self._field_of_view = ALL_ROUND
         # Least distance from the goal in m, and the stamp at which the robot got there; None until it is near the goal.
         self._nearest: tuple[float, int] | None = None
@@ -131,7 +131,7 @@ class GeodesicPolicy:
         """Do nothing: `interrupt` discarded nothing that has to be restored."""
 
     def prepare(self, scan: Scan) -> None:
-        """Compute from the first scan how much information a scan gives in each place; metres with little cost more."""
+        """Compute from the first scan the information of scans in each place; metres with little of it cost more."""
         if not self.epistemic or self._information is not None:
             return
         self._information = ScanInformation.of(self.graph, scan, 1 / (STEP_S * self.robot.max_speed))

@@ -35,7 +35,7 @@ DEFAULT_SIGMA_M = 0.02  # of a range, if the scanner does not state it
 MAP_ERROR_M = 0.01  # of a surface along its normal
 MIN_INCIDENCE = 0.05  # cosine of the angle between beam and normal, below which the first order no longer holds
 MAX_RAY_STEPS = 60
-UNKNOWN_VARIANCE = 1e4  # m² and rad², of a pose of which scans tell nothing
+UNKNOWN_VARIANCE = 1e4  # m² and rad², of a pose about which scans give no information
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ MAX_SPACING_RATIO = 4.0  # of the scan's beams, relative to the model's
 
 
 @dataclass(frozen=True)
-class Fit:
+class BeamFit:
     """Converts between the B beams of a scan and the M beams of a model."""
 
     model_angles: Array  # (M,) rad, the model's beams relative to the centre of its view, ascending
@@ -64,7 +64,7 @@ class Fit:
         return found
 
 
-def fit(scanner: Scanner, angles: Array, mount: Array, remedy: str) -> Fit:
+def fit(scanner: Scanner, angles: Array, mount: Array, remedy: str) -> BeamFit:
     """Returns the conversion of scans at ``angles`` (B,) rad, of a laser at ``mount`` (3,), for a model of ``scanner``.
 
     Raises UserError with the reason if the scans do not suit the model; ``remedy`` is the command that trains another.
@@ -106,4 +106,4 @@ def fit(scanner: Scanner, angles: Array, mount: Array, remedy: str) -> Fit:
         blind = np.rad2deg(float(wrap(ascending[np.argmax(gap)] + centre + scanner.mount[2])))
         raise refuse(f"it does not look towards {blind:.0f} deg of base_link, as they do")
     share = np.where(exact, 1.0, (ascending - around[before]) / np.maximum(gap, 1e-12))
-    return Fit(ascending, order, index[before], index[after], share, centre - turned, same)
+    return BeamFit(ascending, order, index[before], index[after], share, centre - turned, same)

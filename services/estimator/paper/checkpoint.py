@@ -15,7 +15,7 @@ import numpy as np
 import safetensors.torch
 
 from common.errors import UserError
-from services.estimator.paper.training import Data, Trainer
+from services.estimator.paper.training import Trainer, TrainingData
 
 DAMAGED_FILE_ERRORS = (zipfile.BadZipFile, zlib.error, safetensors.SafetensorError)
 
@@ -33,7 +33,7 @@ class Checkpoint:
         folder.mkdir(parents=True, exist_ok=True)
         self._write("recipe.json", self.recipe)
 
-    def samples(self, name: str) -> Data | None:
+    def samples(self, name: str) -> TrainingData | None:
         """Returns the stored samples, or None if there are none. Raises UserError if they cannot be read."""
         path = self.folder / f"{name}.npz"
         if not path.exists():
@@ -42,9 +42,9 @@ class Checkpoint:
             poses, ranges = file["poses"].astype(np.float64), file["ranges"].astype(np.float64)
             if poses.ndim != 2 or ranges.ndim != 2 or poses.shape != (len(ranges), 3):
                 raise ValueError(f"poses {poses.shape} and ranges {ranges.shape} do not fit")
-            return Data(poses, ranges)
+            return TrainingData(poses, ranges)
 
-    def keep_samples(self, name: str, data: Data) -> None:
+    def keep_samples(self, name: str, data: TrainingData) -> None:
         """Stores samples for a later run."""
         partial = self.folder / f"{name}.partial.npz"
         np.savez(partial, poses=data.poses, ranges=data.ranges.astype(np.float32))

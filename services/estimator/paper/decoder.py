@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 UPSAMPLING_BLOCKS = 4  # of a transposed convolution and a convolution; each doubles the length
 
 
-class GenerativeModel(Protocol):
+class ScanPredictor(Protocol):
     """Predicts the scan at a pose."""
 
     def predict(self, pose: Array) -> tuple[Array, Array]:
@@ -30,7 +30,7 @@ class GenerativeModel(Protocol):
 
 
 @dataclass(frozen=True)
-class Shape:
+class DecoderShape:
     """Size of the network."""
 
     beams: int
@@ -41,7 +41,7 @@ class Shape:
 class Decoder(nn.Module):
     """Maps normalised positions (N, 2) in [-1, 1] to normalised ranges (N, B) >= 0."""
 
-    def __init__(self, shape: Shape) -> None:
+    def __init__(self, shape: DecoderShape) -> None:
         """Initialises the weights with torch's random generator."""
         super().__init__()
         self.shape = shape
@@ -113,7 +113,7 @@ class PaperModel:
         self._forward = ForwardMode(self.decoder.layers())
 
     def predict(self, pose: Array) -> tuple[Array, Array]:
-        """Predicts a scan (see GenerativeModel); the derivative by yaw is zero, because the heading is constant."""
+        """Predicts a scan (see ScanPredictor); the derivative by yaw is zero, because the heading is constant."""
         ranges, tangents = (rows[..., : self.decoder.shape.beams] for rows in self._forward(self.norm.normalised(pose)))
         full = np.zeros((len(ranges), 3))
         full[:, :2] = tangents.T * self.norm.range_scale / self.norm.half_size

@@ -1,4 +1,4 @@
-"""Preset `paper` behind the Estimator interface."""
+"""Preset `paper` behind the PoseEstimator interface."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from common.errors import UserError
 from common.geometry import se2
 from services.estimator.paper.beam_fitting import fit as own_fit
-from services.estimator.paper.perception import Descent, PaperEstimator
+from services.estimator.paper.perception import Descent, PaperPerception
 from services.estimator.paper.training import usable_ranges
 from services.estimator.shared.generative_models import Expected
 from services.estimator.shared.interface import Hypothesis, Observation, Posterior, Predicted
@@ -17,20 +17,25 @@ from services.estimator.shared.interface import Hypothesis, Observation, Posteri
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.robot.scanner import Scanner
-    from services.estimator.paper.beam_fitting import Fit
+    from services.estimator.paper.beam_fitting import BeamFit
     from services.estimator.paper.decoder import PaperModel
     from services.estimator.paper.weights import ModelCard
 
 HEADING_TOLERANCE_RAD = 1e-3  # between a pose and the model
 
 
-class PaperPerception:
+class PaperEstimator:
     """The paper's estimator of x and y, for the one heading of its training, without covariance."""
 
     name = "paper"
 
     def __init__(
-        self, model: PaperModel, card: ModelCard, descent: Descent, pose: Array | None = None, fit: Fit | None = None
+        self,
+        model: PaperModel,
+        card: ModelCard,
+        descent: Descent,
+        pose: Array | None = None,
+        fit: BeamFit | None = None,
     ) -> None:
         """``pose`` (3,) is the initial pose, by default the centre of the map.
 
@@ -39,7 +44,7 @@ class PaperPerception:
         self.card, self.model = card, model
         self.fit = fit or own_fit(card.scanner, card.scanner.angles(), np.array(card.scanner.mount), "")
         self._first = pose
-        self.estimator = PaperEstimator(
+        self.estimator = PaperPerception(
             model,
             card.test_l1_mean,
             card.world.bounds,
@@ -77,7 +82,7 @@ class PaperPerception:
         )
 
     def predict(self, poses: Array, angles: Array) -> Predicted:
-        """Predicts scans (see Estimator), at the decoder's heading only; +inf where it has no beams.
+        """Predicts scans (see PoseEstimator), at the decoder's heading only; +inf where it has no beams.
 
         Sigma is the decoder's mean error on test scans.
         """
@@ -92,7 +97,7 @@ class PaperPerception:
         return Predicted(ranges, np.full(ranges.shape, self.card.test_l1_mean))
 
 
-class PaperScans:
+class PaperGenerativeModel:
     """The paper's decoder as a GenerativeModel.
 
     It predicts at one heading, only the beams of its training, and without derivative by yaw.

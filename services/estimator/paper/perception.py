@@ -12,7 +12,7 @@ from services.estimator.paper.free_energy import FreeEnergy
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
-    from services.estimator.paper.decoder import GenerativeModel
+    from services.estimator.paper.decoder import ScanPredictor
 
 Mask = npt.NDArray[np.bool_]
 State = Literal["localising", "tracking", "lost"]
@@ -33,7 +33,7 @@ class Descent:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class PaperEstimate:
     """The belief after one scan."""
 
     pose: Array  # (3,) base_link in map
@@ -43,10 +43,10 @@ class Estimate:
 
 
 @dataclass
-class PaperEstimator:
+class PaperPerception:
     """Belief about (x, y), with a known constant heading, without covariance and without a motion model."""
 
-    model: GenerativeModel
+    model: ScanPredictor
     model_error: float  # m, mean absolute error of the model's beams on test scans
     bounds: tuple[float, float, float, float]  # m, x0, y0, x1, y1 of the map, within which the belief stays
     pose: Array  # (3,) initial belief
@@ -67,7 +67,7 @@ class PaperEstimator:
         self.pose, self.known = np.array(pose, float), known
         self.__post_init__()
 
-    def update(self, ranges: Array, goal: Array | None = None, measured: Mask | None = None) -> Estimate:
+    def update(self, ranges: Array, goal: Array | None = None, measured: Mask | None = None) -> PaperEstimate:
         """Descends F for a scan of usable ranges (B,) m; ``goal`` (3,) attracts the belief if beta > 0.
 
         ``measured`` (B,) is a mask of the beams to use; defaults to all.
@@ -92,7 +92,7 @@ class PaperEstimator:
         # A scan without any measured beam keeps the misfit of the previous scan.
         misfit = float(np.mean(np.abs(ranges - g[used]))) if len(ranges) else (self._misfits or [np.inf])[-1]
         state = self._update_state(float(np.hypot(*(self.pose - previous)[:2])), misfit)
-        return Estimate(self.pose.copy(), g, free_energy, state)
+        return PaperEstimate(self.pose.copy(), g, free_energy, state)
 
     def _clip_to_map(self, pose: Array) -> Array:
         x0, y0, x1, y1 = self.bounds

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from services.estimator.paper.decoder import Decoder, Normalisation, PaperModel, Shape
+from services.estimator.paper.decoder import Decoder, DecoderShape, Normalisation, PaperModel
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -41,7 +41,12 @@ class Trainer:
     """
 
     def __init__(
-        self, shape: Shape, norm: Normalisation, parameters: TrainingParameters, train: Data, test: Data
+        self,
+        shape: DecoderShape,
+        norm: Normalisation,
+        parameters: TrainingParameters,
+        train: TrainingData,
+        test: TrainingData,
     ) -> None:
         """The same seed and samples give the same weights on one machine."""
         torch.manual_seed(parameters.seed)
@@ -107,7 +112,7 @@ class Trainer:
 
 
 @dataclass(frozen=True)
-class Data:
+class TrainingData:
     """Scans with known poses: poses (N, 3) of base_link in map, ranges (N, B) m."""
 
     poses: Array

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from common.errors import UserError, first_fault
 from common.geometry.world import World
 from common.robot.scanner import Scanner
-from services.estimator.paper.decoder import Decoder, Normalisation, PaperModel, Shape
+from services.estimator.paper.decoder import Decoder, DecoderShape, Normalisation, PaperModel
 from services.estimator.shared.digest import check_digest, sha256
 
 
@@ -46,9 +46,9 @@ class ModelCard(BaseModel):
     versions: dict[str, str]
     weights_sha256: str = ""  # SHA-256 of the weights file, hexadecimal; empty in older cards
 
-    def shape(self) -> Shape:
+    def shape(self) -> DecoderShape:
         """Size of the network."""
-        return Shape(self.scanner.beams, self.hidden, self.channels)
+        return DecoderShape(self.scanner.beams, self.hidden, self.channels)
 
     def normalisation(self) -> Normalisation:
         """Normalisation of the network's inputs and outputs."""

@@ -57,7 +57,7 @@ def moments(poses: Array, weights: Array) -> tuple[Array, Array]:
     return mean, np.asarray((off * w[:, None]).T @ off)
 
 
-def hypotheses(poses: Array, weights: Array) -> tuple[Hypothesis, ...]:
+def cluster_hypotheses(poses: Array, weights: Array) -> tuple[Hypothesis, ...]:
     """The heaviest clusters of weighted poses, at most `MAX_CLUSTERS`, heaviest first; their weights sum to 1."""
     order = np.argsort(weights, kind="stable")
     kept = order[np.searchsorted(np.cumsum(weights[order]), NEGLIGIBLE_WEIGHT * weights.sum()) :]

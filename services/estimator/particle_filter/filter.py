@@ -9,10 +9,10 @@ import numpy as np
 
 from common.geometry import se2
 from services.estimator.particle_filter import motion, resampling
-from services.estimator.particle_filter.clusters import hypotheses
+from services.estimator.particle_filter.clusters import cluster_hypotheses
 from services.estimator.particle_filter.recovery import Recovery
 from services.estimator.particle_filter.sensor import Sensor
-from services.estimator.particle_filter.settings import Settings
+from services.estimator.particle_filter.settings import ParticleFilterSettings
 from services.estimator.shared.interface import Observation, Posterior, Predicted, State, start_belief
 from services.estimator.shared.motion_correction import correct_motion, pose_at_stamp
 
@@ -43,7 +43,7 @@ class ParticleFilter:
     def __init__(
         self,
         world: World,
-        settings: Settings | None = None,
+        settings: ParticleFilterSettings | None = None,
         mount: tuple[float, float, float] = (0, 0, 0),
         seed: int = 0,
         heading: float | None = None,
@@ -55,7 +55,7 @@ class ParticleFilter:
         ``sensor`` may be shared by several filters with the same world and settings; by default a new one is built.
         Raises UserError if the world is too large for the settings' resolution.
         """
-        self.world, self.settings = world, settings or Settings()
+        self.world, self.settings = world, settings or ParticleFilterSettings()
         self.mount, self.heading = np.array(mount, float), heading
         self.sensor = sensor or Sensor(world, self.settings)
         self._rng = np.random.default_rng(seed)
@@ -107,7 +107,7 @@ class ParticleFilter:
         log_weights = self.sensor.weigh(se2.compose(self.particles, self.mount), corrected, sigma, beams)
         log_weights += np.log(np.maximum(self.weights, 1e-300))
         self.weights = resampling.tempered(log_weights, share)
-        posterior = self._posterior(corrected, hypotheses(self.particles, self.weights))
+        posterior = self._posterior(corrected, cluster_hypotheses(self.particles, self.weights))
         self._update_velocity(posterior, period)
         posterior = self._at_stamp(posterior, observation, period)
         self._scans += 1
@@ -148,7 +148,7 @@ class ParticleFilter:
         return replace(posterior, hypotheses=found, predicted=self.world.ray_distances(laser, observation.angles)[0])
 
     def predict(self, poses: Array, angles: Array) -> Predicted:
-        """Predicts scans (see Estimator) by exact rays in the map; sigma is that of a hit while tracking."""
+        """Predicts scans (see PoseEstimator) by exact rays in the map; sigma is that of a hit while tracking."""
         ranges = self.world.ray_distances(se2.compose(poses, self.mount), angles)
         return Predicted(ranges, np.full(ranges.shape, self.settings.sigma_hit))
 
@@ -232,17 +232,17 @@ class ParticleFilter:
 
     def _posterior(self, observation: Observation, found: tuple[Hypothesis, ...]) -> Posterior:
         pose = found[0].pose
-        explanation = self.sensor.explain(pose, self.mount, observation)
-        self._recovery.add(explanation.fit)
-        self._health.add(explanation.fit)
+        scan_fit = self.sensor.explain(pose, self.mount, observation)
+        self._recovery.add(scan_fit.fit)
+        self._health.add(scan_fit.fit)
         self._state = self._judge(found)
         return Posterior(
             state=self._state,
             hypotheses=found,
-            accuracy=explanation.accuracy,
+            accuracy=scan_fit.accuracy,
             complexity=0.0,  # not defined, because particles have no density to compare with that of the prior
-            xi=explanation.xi,
-            curvature=explanation.curvature,
+            xi=scan_fit.xi,
+            curvature=scan_fit.curvature,
             predicted=np.zeros(0),  # of the pose at the stamp, set by _at_stamp
         )
 

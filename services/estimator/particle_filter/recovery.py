@@ -13,7 +13,7 @@ class Recovery:
     """Short- and long-term averages of how well the estimate explains the scans.
 
     AMCL averages the particles' likelihoods. These are products over many beams, which vary by e^20 between good scans
-    and change with sigma. So here the fit of a single beam at the estimate is averaged, see `Explanation.fit`.
+    and change with sigma. So here the fit of a single beam at the estimate is averaged, see `ScanFit.fit`.
     """
 
     alpha_slow: float

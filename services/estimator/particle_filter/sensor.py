@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from common.geometry.se2 import Array
     from common.geometry.world import World
-    from services.estimator.particle_filter.settings import Settings
+    from services.estimator.particle_filter.settings import ParticleFilterSettings
     from services.estimator.shared.interface import Observation
 
 SIGMA_PER_SPREAD = 1.5  # sigma of a hit, relative to the spread of the particles
@@ -23,7 +23,7 @@ MIN_SIGMA_FACTOR = 0.85  # limits how fast sigma shrinks per scan, so that one s
 GRADIENT_STEP = np.array([0.01, 0.01, 0.002])  # m, m, rad
 
 
-class Explanation(NamedTuple):
+class ScanFit(NamedTuple):
     """How well a pose explains a scan."""
 
     accuracy: float  # nats, -ln p(o | pose)
@@ -35,7 +35,7 @@ class Explanation(NamedTuple):
 class Sensor:
     """The laser model that the settings select, in one world."""
 
-    def __init__(self, world: World, settings: Settings) -> None:
+    def __init__(self, world: World, settings: ParticleFilterSettings) -> None:
         """Builds the distance field of ``world``, and the table of ranges if the settings select the beam model."""
         s = self.settings = settings
         self.field = LikelihoodField(
@@ -66,7 +66,7 @@ class Sensor:
             return self.field.log_cubes(ends, sigma, observation.range_max)
         return self.field.log_product(ends, sigma, observation.range_max)
 
-    def explain(self, pose: Array, mount: Array, observation: Observation, sigma: float | None = None) -> Explanation:
+    def explain(self, pose: Array, mount: Array, observation: Observation, sigma: float | None = None) -> ScanFit:
         """Evaluates all beams of a scan at base_link ``pose`` (3,) in map, by the product likelihood field.
 
         ``sigma`` m of a hit defaults to that of tracking. Derivatives of the distances are central differences.
@@ -81,7 +81,7 @@ class Sensor:
         p, exact = p[:-1], p[-1]
         # Only beams that a surface explains contribute to the gradient.
         pull = (1 - self.field.z_rand / observation.range_max / p) / sigma**2
-        return Explanation(
+        return ScanFit(
             accuracy=float(-np.log(p).sum()),
             xi=-slope @ (pull * d),
             curvature=(slope * pull) @ slope.T,

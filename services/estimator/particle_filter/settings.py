@@ -12,7 +12,7 @@ MotionModel = Literal["omni", "differential"]
 
 
 @dataclass(frozen=True)
-class Settings:
+class ParticleFilterSettings:
     """Parameters of the particle filter.
 
     The first ones have the names and meanings of nav2_amcl 1.x; those that it does not have come last. nav2 processes a
@@ -73,7 +73,7 @@ class Settings:
             )
 
     @classmethod
-    def tuned(cls) -> Settings:
+    def tuned(cls) -> ParticleFilterSettings:
         """Settings with which the filter localises and tracks by laser alone, with more particles for the search."""
         return cls(
             robot_model_type="omni",

@@ -24,12 +24,12 @@ from services.estimator.precise.hypotheses import (
     weigh,
 )
 from services.estimator.precise.likelihood import Likelihood
-from services.estimator.precise.local_map import KeyScan, LocalMap, LocalScan
+from services.estimator.precise.local_map import LocalMap, LocalMapScan, LocalScan
 from services.estimator.precise.motion_model import (
     Candidate,
+    clip_to_plausible_velocity,
     fuse,
     limit_to_map,
-    limit_velocity,
     predict_motion,
     reachable_poses,
     widen_unobserved,
@@ -37,7 +37,7 @@ from services.estimator.precise.motion_model import (
 from services.estimator.precise.precision import Precision
 from services.estimator.precise.protection import EstimateError
 from services.estimator.precise.search import search_around, search_everywhere, search_near
-from services.estimator.precise.settings import Settings
+from services.estimator.precise.settings import PreciseSettings
 from services.estimator.shared.interface import (
     Hypothesis,
     Observation,
@@ -87,7 +87,7 @@ class PreciseEstimator:
         seeds: Seeds,
         mount: Array,
         likelihood: Likelihood | None = None,
-        settings: Settings | None = None,
+        settings: PreciseSettings | None = None,
         rng: np.random.Generator | None = None,
         bounds: tuple[float, float, float, float] | None = None,
         optimiser: Optimiser | None = None,
@@ -99,7 +99,7 @@ class PreciseEstimator:
         of the map's surfaces beyond what the model states, as far as known; it is learned while driving.
         """
         self.model, self.seeds, self.mount = model, seeds, np.array(mount, float)
-        self.likelihood, self.settings = likelihood or Likelihood(), settings or Settings()
+        self.likelihood, self.settings = likelihood or Likelihood(), settings or PreciseSettings()
         self.bounds = bounds or (-np.inf, -np.inf, np.inf, np.inf)
         self._rng = rng or np.random.default_rng(0)
         self._optimiser, self._map_error = optimiser or GaussNewton(), map_error
@@ -203,7 +203,7 @@ class PreciseEstimator:
         return view
 
     def predict(self, poses: Array, angles: Array) -> Predicted:
-        """Predicts scans (see Estimator); sigma combines the scanner's noise and the model's stated error."""
+        """Predicts scans (see PoseEstimator); sigma combines the scanner's noise and the model's stated error."""
         return self._predicted(self.model.expect(se2.compose(poses, self.mount), angles))
 
     def _predicted(self, expected: Expected) -> Predicted:
@@ -239,7 +239,9 @@ class PreciseEstimator:
         match = self._match(view, motions, period, with_odometry=odom is not None)
         if observation.time_increment:
             # Once more, corrected for the motion that the match has shown.
-            velocity = limit_velocity(self.settings.motion, -se2.between(match.poses[0], self.modes[0].pose) / period)
+            velocity = clip_to_plausible_velocity(
+                self.settings.motion, -se2.between(match.poses[0], self.modes[0].pose) / period
+            )
             view = self._correct_motion(view, observation, velocity)
             poses, evidence = view.descend(match.poses, _prior_of([each[-1] for each in match.motions]))
             match = replace(match, poses=poses, evidence=evidence)
@@ -409,7 +411,7 @@ class PreciseEstimator:
         if self._probability() >= self.settings.tracking_probability:
             self._precision.learn_changes(view, best.pose)
         self._unknown_place.add_key_scan()
-        key = KeyScan(self._local_pose, view, self._old_beams, mapped, self._log_change, log_unknown)
+        key = LocalMapScan(self._local_pose, view, self._old_beams, mapped, self._log_change, log_unknown)
         self._local_map.add(key, best.pose, best.noise_covariance)
         self.modes = [
             replace(mode, log_evidence=mode.log_weight, present=0.0, clutter=mode.present_clutter)

@@ -36,7 +36,7 @@ CLASSES = (len(DIP_EDGES) + 1, len(DEPTH_EDGES) + 1, len(FACING_EDGES) + 1)
 
 
 @dataclass(frozen=True)
-class Traced:
+class TracedBeams:
     """Traced beams: arrays (N, B) for N laser poses and B beams."""
 
     ranges: Array  # m; +inf if nothing is met within the grid
@@ -83,14 +83,14 @@ class DistanceField:
         solid = ~ndimage.binary_dilation(crossed, iterations=SOLID_MARGIN_CELLS)
         return dataclasses.replace(self, phi=np.where(solid, -np.abs(self.phi), self.phi))
 
-    def trace(self, lasers: Array, angles: Array) -> Traced:
+    def trace(self, lasers: Array, angles: Array) -> TracedBeams:
         """Traces beams from laser poses (N, 3) in map along angles (B,) rad in the laser frame."""
         lasers, angles = np.asarray(lasers, float).reshape(-1, 3), np.asarray(angles, float)
         shape = (len(lasers), len(angles))
         ranges, dip, edge, facing = (np.empty(shape) for _ in range(4))
         jacobian = np.empty((*shape, 3))
         trace(self.phi, *self.origin, self.resolution, lasers, angles, ranges, jacobian, dip, edge, facing)
-        return Traced(ranges, jacobian, dip, edge, facing)
+        return TracedBeams(ranges, jacobian, dip, edge, facing)
 
     def trace_behind(self, lasers: Array, angles: Array, ranges: Array) -> Array:
         """Ranges (N, B) in m to the next surface behind the one at ``ranges`` (N, B) m; +inf if there is none."""
@@ -101,7 +101,7 @@ class DistanceField:
 
 
 @dataclass(frozen=True)
-class Seen:
+class SeenCells:
     """Cells of a square grid that a beam of the training scans has passed; nothing is known about the other cells."""
 
     cells: npt.NDArray[np.bool_]  # (ny, nx); cell (i, j) begins at origin + SEEN_CELL_M * (j, i)
@@ -140,7 +140,7 @@ class FieldModel:
     # m, standard deviation of the prediction error in each class
     scales: Array = dataclasses.field(default_factory=lambda: np.full(int(np.prod(CLASSES)), 1e-3))
     ripple: float = 0.0  # rad, see GenerativeModel
-    seen: Seen | None = None  # None if the whole grid counts as seen
+    seen: SeenCells | None = None  # None if the whole grid counts as seen
 
     def expect(self, lasers: Array, angles: Array) -> Expected:
         """Predicts scans; see GenerativeModel."""

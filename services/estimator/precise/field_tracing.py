@@ -90,7 +90,7 @@ def trace(
     edge: Array,
     facing: Array,
 ) -> None:
-    """Traces beams at ``angles`` (B,) from lasers (N, 3), and fills the fields of `field.Traced`.
+    """Traces beams at ``angles`` (B,) from lasers (N, 3), and fills the fields of `field.TracedBeams`.
 
     These are ranges (N, B), jacobian (N, B, 3), and dip, edge and facing (N, B). The derivative of a range is
     dr = -(n . dp + r n . u' dyaw) / (n . u). Edge is the depth one cell behind the surface, relative to a plane.

@@ -72,11 +72,11 @@ class UnknownPlace:
     weight: float = 1.0  # probability
 
     def restart(self, probability: float, unmapped: float) -> None:
-        """The robot is at none of the hypotheses with a ``probability``, a share ``unmapped`` of it outside the map."""
+        """Sets the ``probability`` that the robot is at no hypothesis, a share ``unmapped`` of it off the map."""
         self.log_evidence = self.log_unmapped = float(np.log(probability * unmapped))
 
     def allow_kidnapping(self, log_probability: float, unmapped: float) -> None:
-        """The robot may just have been carried off, a share ``unmapped`` of which to no place that a search finds."""
+        """Adds the prior of a kidnapping; with probability ``unmapped`` it was to a place that no search finds."""
         self.log_unmapped = max(self.log_unmapped, log_probability + float(np.log(unmapped)))
         self.log_evidence = max(self.log_evidence, log_probability)
 
@@ -85,13 +85,13 @@ class UnknownPlace:
         self.log_evidence = max(self.log_evidence, log_probability)
 
     def add_key_scan(self) -> None:
-        """The present scan becomes a key scan."""
+        """Keeps the evidence of the present scan, which becomes a key scan."""
         self.log_evidence += self.present
         self.log_unmapped += self.present
         self.present = 0.0
 
     def exclude_mapped_places(self) -> None:
-        """The whole map was searched, and what was found are hypotheses now."""
+        """Removes the places on the map: the whole map was searched, and what was found is among the hypotheses."""
         self.log_evidence = self.log_unmapped
 
 

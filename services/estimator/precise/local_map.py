@@ -59,8 +59,8 @@ class LocalScan:
 
 
 @dataclass(frozen=True)
-class KeyScan(LocalScan):
-    """A scan of the local map."""
+class LocalMapScan(LocalScan):
+    """A key scan of the local map."""
 
     seen: npt.NDArray[np.bool_]  # (B,) beams that are no new evidence, as they end at surfaces of earlier scans
     mapped: npt.NDArray[np.bool_]  # (B,) beams that end at surfaces of the map
@@ -73,7 +73,7 @@ class LocalMap:
     """The last key scans in a local frame; evidence from the map moves this frame, and all scans with it."""
 
     mount: Array  # (3,) laser in base_link
-    scans: deque[KeyScan] = field(default_factory=lambda: deque(maxlen=MAX_SCANS))
+    scans: deque[LocalMapScan] = field(default_factory=lambda: deque(maxlen=MAX_SCANS))
     frame: Array = field(default_factory=lambda: np.zeros(3))  # (3,) local frame in map
     covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))  # of the pose at the last key scan
     _tree: cKDTree | None = None
@@ -97,7 +97,7 @@ class LocalMap:
         off = se2.between(self.scans[-1].pose, local)
         return bool(np.hypot(off[0], off[1]) >= MIN_DISTANCE_M or abs(off[2]) >= MIN_TURN_RAD)
 
-    def add(self, key: KeyScan, pose: Array, covariance: Array) -> None:
+    def add(self, key: LocalMapScan, pose: Array, covariance: Array) -> None:
         """Adds a key scan, taken at ``pose`` (3,) in map with ``covariance`` (3, 3)."""
         self.scans.append(key)
         self.frame = se2.compose(pose, se2.inverse(key.pose))

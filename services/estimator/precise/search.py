@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from services.estimator.precise.global_seeds import Seeds
     from services.estimator.precise.likelihood import Evidence
-    from services.estimator.precise.settings import Settings
+    from services.estimator.precise.settings import PreciseSettings
 
 
 SEED_BEAMS = 75  # with which seeds are compared
@@ -31,7 +31,7 @@ SEED_SCHEDULE_M = (MEDIUM_SIGMA_M, MEDIUM_SIGMA_M, 0.05, 0.05)
 NEAR_SCHEDULE_M = (COARSE_SIGMA_M, COARSE_SIGMA_M, MEDIUM_SIGMA_M, MEDIUM_SIGMA_M, *FOLLOWING_SCHEDULE_M)
 
 
-def search_everywhere(view: View, seeds: Seeds, settings: Settings) -> list[Mode]:
+def search_everywhere(view: View, seeds: Seeds, settings: PreciseSettings) -> list[Mode]:
     """Returns the hypotheses that fit best in the whole map, best first.
 
     Descends from those of the best seeds that have the most evidence by surfaces: with few beams, and from the best
@@ -48,7 +48,7 @@ def search_everywhere(view: View, seeds: Seeds, settings: Settings) -> list[Mode
 
 
 def search_near(
-    view: View, pose: Array, covariance: Array, seeds: Seeds, settings: Settings, rng: np.random.Generator
+    view: View, pose: Array, covariance: Array, seeds: Seeds, settings: PreciseSettings, rng: np.random.Generator
 ) -> list[Mode]:
     """Returns the hypotheses that fit best near ``pose`` (3,), which is known within ``covariance`` (3, 3)."""
     starts = rng.multivariate_normal(pose, covariance, settings.near_starts)
@@ -75,7 +75,7 @@ def search_around(view: View, starts: Array, prior: Prior, extra_starts: Array) 
 
 
 def _best_modes(
-    view: View, poses: Array, evidence: Evidence, prior: Prior | None, seeds: Seeds, settings: Settings
+    view: View, poses: Array, evidence: Evidence, prior: Prior | None, seeds: Seeds, settings: PreciseSettings
 ) -> list[Mode]:
     """The hypotheses with most evidence by surfaces among ``poses`` (N, 3), best first."""
     surfaces = view.surface_evidence(poses, skip=view.surfaces.small)

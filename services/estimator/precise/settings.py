@@ -8,7 +8,7 @@ from services.estimator.precise.motion_model import MotionNoise
 
 
 @dataclass(frozen=True)
-class Settings:
+class PreciseSettings:
     """Parameters of the precise estimator; the defaults are used for every shipped world."""
 
     # Search

@@ -1,4 +1,4 @@
-"""Observation, Posterior, Hypothesis and the Estimator protocols."""
+"""The PoseEstimator protocol, and what it takes and returns: Observation, Posterior, Hypothesis, Predicted."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class Predicted:
     sigma: Array  # (N, B) m, standard deviation of the ranges
 
 
-class Estimator(Protocol):
+class PoseEstimator(Protocol):
     """Estimates the pose of one robot from its scans."""
 
     name: str

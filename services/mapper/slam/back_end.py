@@ -1,4 +1,4 @@
-"""The back end: loop closures, and the poses of the key scans that agree best with them."""
+"""The back end: finds loop closures, and optimises the poses of the key scans accordingly."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy.typing as npt
 
 from common.geometry import se2
 from services.mapper.slam.drive import Laser
-from services.mapper.slam.front_end import KeyScans
-from services.mapper.slam.joining import Joining, is_contradicted, largest
-from services.mapper.slam.loop_closure import MAX_SQUARED_DEVIATION, Closure, find_closures
+from services.mapper.slam.front_end import KeyScanGraph
+from services.mapper.slam.joining import PieceJoiner, is_contradicted, largest_component
+from services.mapper.slam.loop_closure import MAX_SQUARED_DEVIATION, LoopClosure, find_closures
 from services.mapper.slam.pose_graph import LinkTable, PoseLink, Uncertainty, components, optimise
 from services.mapper.slam.segments import Segment, segments_of
 
@@ -21,15 +21,17 @@ class BackEnd:
 
     def __init__(self, laser: Laser) -> None:
         self.laser = laser
-        self.poses = np.zeros((0, 3))  # of the key scans, corrected; comparable only if links connect them
-        self.closures: list[Closure] = []
+        self.poses = np.zeros(
+            (0, 3)
+        )  # of the key scans, corrected; relative poses are known only where links connect them
+        self.closures: list[LoopClosure] = []
         self._uncertainty: Uncertainty | None = None  # of the segments; computed again after a change
         self._tried: set[tuple[int, int]] = set()  # pairs of segments
-        self._joining = Joining()
-        self._cuts: set[int] = set()  # numbers of the key scans whose link to the one before turned out to be wrong
+        self._joiner = PieceJoiner()
+        self._cuts: set[int] = set()  # key scans whose link to the one before turned out to be wrong
 
-    def extend(self, scans: KeyScans) -> None:
-        """Adds key scans that follow those that are known, at the places where the front end sees them."""
+    def extend(self, scans: KeyScanGraph) -> None:
+        """Adds the new key scans, at their poses by the front end relative to the last known one."""
         count = len(self.poses)
         new = scans.poses[count:]
         if count:
@@ -38,7 +40,7 @@ class BackEnd:
 
     def close_loops(
         self,
-        scans: KeyScans,
+        scans: KeyScanGraph,
         window: float,
         report: Callable[[float], None] = lambda _done: None,
         *,
@@ -55,8 +57,8 @@ class BackEnd:
         found = find_closures(segments, self.poses, self._uncertainty, self._tried, window, report)
         self._add(found, scans)
 
-    def join_pieces(self, scans: KeyScans, *, growing: bool = False) -> bool:
-        """Separates contradicted pieces, then searches the map for one that is apart; returns whether it was found."""
+    def join_pieces(self, scans: KeyScanGraph, *, growing: bool = False) -> bool:
+        """Cuts off pieces that contradict the map, then tries to join one; returns whether one was joined."""
         if not scans.pieces.any():
             return False
         segments = self._segments(scans, growing=growing)
@@ -64,7 +66,7 @@ class BackEnd:
         component = self._components(scans)
         if not component.any():
             return False
-        found = self._joining.find(segments, self.poses, component)
+        found = self._joiner.find(segments, self.poses, component)
         if not found:
             return False
         self._move_later_part(found[0].link, component)
@@ -82,12 +84,12 @@ class BackEnd:
             later, origin = first, se2.compose(place, se2.inverse(self.poses[link.first]))
         self.poses[later] = se2.compose(origin, self.poses[later])
 
-    def in_map(self, scans: KeyScans) -> npt.NDArray[np.bool_]:
+    def in_map(self, scans: KeyScanGraph) -> npt.NDArray[np.bool_]:
         """Mask (K,) of the key scans that belong to the map: the largest part of the drive that links connect."""
         component = self._components(scans)
-        return np.asarray(component == largest(component))
+        return np.asarray(component == largest_component(component))
 
-    def _add(self, found: list[Closure], scans: KeyScans) -> None:
+    def _add(self, found: list[LoopClosure], scans: KeyScanGraph) -> None:
         if found:
             self._uncertainty = None
         self.closures += found
@@ -95,8 +97,8 @@ class BackEnd:
         self._drop_implausible()
         self.poses = optimise(self.poses, self._links(scans))
 
-    def _separate_contradicted(self, scans: KeyScans, segments: list[Segment]) -> None:
-        """Cuts the drive where a piece begins that contradicts the ones before: all links across are taken back."""
+    def _separate_contradicted(self, scans: KeyScanGraph, segments: list[Segment]) -> None:
+        """Cuts the drive where a piece begins that contradicts the ones before: all links across are removed."""
         for piece in range(1, segments[-1].piece + 1):
             component = self._components(scans)[[each.reference for each in segments]]
             before = [k for k, each in enumerate(segments) if each.piece < piece]
@@ -113,25 +115,25 @@ class BackEnd:
             ):
                 self._cut(len(before), int(np.searchsorted(scans.pieces, piece)), scans)
 
-    def _cut(self, segment: int, key: int, scans: KeyScans) -> None:
-        """Takes back all links across the beginning of a ``segment``, whose first key scan is number ``key``."""
+    def _cut(self, segment: int, key: int, scans: KeyScanGraph) -> None:
+        """Removes all links across the beginning of a ``segment``, whose first key scan is number ``key``."""
         self._cuts.add(key)
         self.closures = [each for each in self.closures if (each.first < segment) == (each.second < segment)]
         self._tried = {pair for pair in self._tried if (pair[0] < segment) == (pair[1] < segment)}
         self._uncertainty = None
         self.poses = optimise(self.poses, self._links(scans))
 
-    def _segments(self, scans: KeyScans, *, growing: bool) -> list[Segment]:
+    def _segments(self, scans: KeyScanGraph, *, growing: bool) -> list[Segment]:
         laser, ranges = self.laser, np.array(scans.ranges)
         return segments_of(self.poses, scans.pieces, scans.elements, ranges, laser.angles, laser.mount, growing=growing)
 
-    def _links(self, scans: KeyScans) -> list[PoseLink]:
+    def _links(self, scans: KeyScanGraph) -> list[PoseLink]:
         return [
             *(each for each in scans.links if each.second not in self._cuts),
             *(each.link for each in self.closures),
         ]
 
-    def _components(self, scans: KeyScans) -> npt.NDArray[np.int_]:
+    def _components(self, scans: KeyScanGraph) -> npt.NDArray[np.int_]:
         return components(len(self.poses), self._links(scans))
 
     def _drop_implausible(self) -> None:

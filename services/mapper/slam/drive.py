@@ -1,4 +1,4 @@
-"""A drive without reference poses."""
+"""A drive: scans, with or without odometry, and without reference poses."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Laser:
 
 @dataclass(frozen=True)
 class RawDrive:
-    """Scans in order of time, with odometry or without."""
+    """Scans in order of time, with or without odometry."""
 
     stamps: Array  # (N,) s
     ranges: Array  # (N, B) m

@@ -1,12 +1,14 @@
-"""The front end: the motion between scans, from each scan's registration to the last key scans.
+"""The front end: tracks the robot's motion by registering each scan to the last key scans.
 
-A scan that contradicts the last key scans is suspect: something hides the surroundings, or the robot was carried off.
-It gets no place. After `MAX_SUSPECT_SCANS` in a row, another piece of the drive begins, whose place relative to the
-former pieces is unknown.
+A drive consists of pieces; within a piece, tracking was never interrupted.
+
+A scan that contradicts the last key scans is suspect: something hides the surroundings, or the robot was kidnapped.
+Its pose is unknown. After `MAX_SUSPECT_SCANS` in a row a new piece begins, whose pose relative to the former pieces is
+unknown.
 
 A scan that matches, but far from where the motion model expects it, or with more contradictions than usual, also begins
-a piece: the wheels may have slipped or a door moved, or the robot was carried to a place that looks alike. The link to
-the former piece may turn out to be wrong.
+a piece: the wheels may have slipped, a door may have moved, or the robot was carried to a place that looks alike. This
+piece is linked to the former one, but the link may turn out to be wrong.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ from services.mapper.slam.registration import (
     register,
 )
 from services.mapper.slam.search import search
-from services.mapper.slam.segments import PosedScans, Segment, compare
+from services.mapper.slam.segments import PosedScans, Segment, compare_segments
 
 KEY_DISTANCE_M, KEY_TURN_RAD = 0.4, 0.5  # from the last key scan, before another one is taken
 KEY_SHARE = 0.1  # of the median range, if that is a larger distance
@@ -58,7 +60,7 @@ ODOMETRY_PATH, ODOMETRY_TURN_BY_PATH, ODOMETRY_TURN = 0.4, 0.5, 1.0  # m/m, rad/
 ACCELERATION = np.array([1.0, 1.0, 3.0])
 MAX_VELOCITY = np.array([1.0, 1.0, 1.5])
 STANDING_DEVIATION = np.array([0.002, 0.002, 0.002])  # m, m, rad: in addition to both
-MAX_MOTION = 3 * MAX_VELOCITY  # in one second; a robot that seems to move faster was carried off
+MAX_MOTION = 3 * MAX_VELOCITY  # in one second; a robot that seems to move faster was kidnapped
 # Scans over which these deviations are learned, and the largest error that counts, in deviations.
 LEARNING_SCANS, MAX_LEARNED_SIGMAS = 100, 10.0
 # Errors of a registration that do not average out, for each key scan: moving things, the surfaces' roughness.
@@ -66,36 +68,36 @@ REGISTRATION_DEVIATION = np.array([0.005, 0.005, 0.002])
 
 
 @dataclass(frozen=True)
-class KeyScans:
-    """Key scans as the front end sees them: their places are exact over some metres, and drift beyond."""
+class KeyScanGraph:
+    """Key scans and the links between them, from the front end: exact over some metres, with drift beyond."""
 
     poses: Array  # (K, 3)
     elements: list[Elements]
     ranges: list[Array]  # (B,) m
-    links: list[PoseLink]  # between successive ones, by their numbers; a piece may begin with a link to the one before
+    links: list[PoseLink]  # between successive key scans; a piece may begin with a link to the one before
     pieces: npt.NDArray[np.int_]  # (K,) piece of the drive to which each belongs
 
 
 @dataclass(frozen=True)
-class Track:
-    """A whole drive as the front end sees it."""
+class TrackedDrive:
+    """A whole drive, tracked by the front end without loop closures."""
 
     poses: Array  # (N, 3) of all scans
     pieces: npt.NDArray[np.int_]  # (N,) of the drive, or `NO_PIECE`
     keys: list[int]  # scans that are key scans
-    key_scans: KeyScans
+    key_scans: KeyScanGraph
     unmatched: int  # scans
 
 
 @dataclass(frozen=True)
-class Place:
-    """The place of one scan in the frame of the first."""
+class ScanPose:
+    """The pose of one scan in the frame of the first, and how it was found."""
 
     pose: Array  # (3,)
     covariance: Array  # (3, 3) relative to the last key scans
-    matched: bool  # otherwise only the motion model gives the pose
+    matched: bool  # False if only the motion model gives the pose
     piece: int = 0  # of the drive, or `NO_PIECE` for a suspect scan
-    linked: bool = False  # whether a piece begins here, with a link to the one before
+    linked: bool = False  # whether this scan begins a piece with a link to the one before
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ class _Scan:
 
 
 class FrontEnd:
-    """Registers scan after scan, and keeps the key scans."""
+    """Registers one scan after another, and keeps the key scans."""
 
     def __init__(self, laser: Laser) -> None:
         self.laser, self._sweep = laser, Sweep.of_angles(laser.angles)
@@ -116,14 +118,14 @@ class FrontEnd:
         self.stamps: list[float] = []  # s
         self.poses: list[Array] = []  # (3,)
         self.pieces: list[int] = []
-        self.unmatched = 0  # number of them that did not match
+        self.unmatched = 0  # number of scans that did not match
         # One entry for each key scan.
         self.keys: list[int] = []  # its number among all scans
         self._key_pieces: list[int] = []
         self._elements: list[Elements] = []
         self._ranges: list[Array] = []
         self._links: list[PoseLink] = []
-        # The local map: its surfaces, and the same with what its scans saw through.
+        # The local map: the surfaces of the last key scans, and the scans themselves, to check what they saw through.
         self._surface: Surface
         self._local: Segment
         self._first_local = 0  # number of the first key scan with a link to those that follow
@@ -135,7 +137,7 @@ class FrontEnd:
         self._suspect_scans = 0  # in a row until now
         self._recent_contradiction = 0.0  # largest share of elements, in the last scans of which little matched
 
-    def add(self, stamp: float, ranges: Array, odom: Array | None = None) -> Place:
+    def add(self, stamp: float, ranges: Array, odom: Array | None = None) -> ScanPose:
         """Registers a scan ``ranges`` (B,) m at ``stamp`` s, later than the one before, with or without odometry."""
         period = stamp - self.stamps[-1] if self.stamps else 0.0
         motion, deviation = self._predict_motion(period, odom)
@@ -150,22 +152,24 @@ class FrontEnd:
         contradiction = self._contradiction(scan, found, prior)
         suspect = contradiction > MAX_CONTRADICTION or self._is_suspect(found, prior, period)
         if found is not None and not suspect:
-            doubtful = self._is_doubtful(contradiction) or prior.off(found.pose)[1] > MAX_SLIP**2
+            doubtful = self._is_doubtful(contradiction) or prior.difference(found.pose)[1] > MAX_SLIP**2
             return self._add_matched(scan, found, prior, deviation, period, doubtful=doubtful)
         self.unmatched += 1
         if used_odometry:
             self._velocity = None
         return self._add_suspect(scan, prior.mean) if suspect else self._add_unmatched(scan, prior.mean)
 
-    def key_scans(self) -> KeyScans:
+    def key_scans(self) -> KeyScanGraph:
         """The key scans so far."""
         poses = np.array([self.poses[key] for key in self.keys])
         pieces = np.array(self._key_pieces)
-        return KeyScans(poses, self._elements.copy(), self._ranges.copy(), self._links.copy(), pieces)
+        return KeyScanGraph(poses, self._elements.copy(), self._ranges.copy(), self._links.copy(), pieces)
 
-    def track(self) -> Track:
+    def track(self) -> TrackedDrive:
         """The drive so far."""
-        return Track(np.array(self.poses), np.array(self.pieces), self.keys.copy(), self.key_scans(), self.unmatched)
+        return TrackedDrive(
+            np.array(self.poses), np.array(self.pieces), self.keys.copy(), self.key_scans(), self.unmatched
+        )
 
     def _predict_motion(self, period: float, odom: Array | None) -> tuple[Array, Array]:
         """Motion (3,) in base_link in the ``period`` since the scan before, and its standard deviations (3,)."""
@@ -216,7 +220,7 @@ class FrontEnd:
         return None if best is None or best.share < MIN_SHARE else best
 
     def _is_suspect(self, found: Registration | None, prior: PosePrior, period: float) -> bool:
-        """Whether a registration shows that the robot was carried off, or may have been found by chance."""
+        """Whether a registration implies that the robot was kidnapped, or may match by chance."""
         pose = prior.mean if found is None else found.pose
         if (np.abs(se2.between(self.poses[-1], pose)) > MAX_MOTION * period).any():
             return True
@@ -231,7 +235,7 @@ class FrontEnd:
             return 0.0
         scans = PosedScans(self.laser.mount[None], self._evenly_spaced(scan)[None], self.laser.angles)
         pose = prior.mean if found is None else found.pose
-        counted = compare(self._local, self._surface, Segment(0, 0, scan.elements, scans), pose)
+        counted = compare_segments(self._local, self._surface, Segment(0, 0, scan.elements, scans), pose)
         return counted.contradicting / (counted.agreeing + PRIOR_AGREEMENT + counted.contradicting)
 
     def _is_doubtful(self, contradiction: float) -> bool:
@@ -242,7 +246,7 @@ class FrontEnd:
 
     def _add_matched(
         self, scan: _Scan, found: Registration, prior: PosePrior, deviation: Array, period: float, *, doubtful: bool
-    ) -> Place:
+    ) -> ScanPose:
         """Adds a scan at its pose; a ``doubtful`` one begins a piece."""
         self._suspect_scans = 0
         self._velocity = None if doubtful else se2.between(self.poses[-1], found.pose) / period
@@ -250,42 +254,44 @@ class FrontEnd:
         if familiar:
             self._scale = _learn_scale(self._scale, self._scale * deviation, prior.mean, found)
         covariance = found.covariance + np.diag(REGISTRATION_DEVIATION**2)
-        place = Place(found.pose, covariance, matched=True, piece=self._key_pieces[-1] + doubtful, linked=doubtful)
-        self._append(place)
+        scan_pose = ScanPose(
+            found.pose, covariance, matched=True, piece=self._key_pieces[-1] + doubtful, linked=doubtful
+        )
+        self._append(scan_pose)
         if doubtful or self._is_key_due(scan, familiar=familiar):
             self._add_linked_key(scan, found.information)
-        return place
+        return scan_pose
 
-    def _add_unmatched(self, scan: _Scan, pose: Array) -> Place:
+    def _add_unmatched(self, scan: _Scan, pose: Array) -> ScanPose:
         """Adds a scan of which too little matches, at the pose that the motion model predicts."""
-        place = Place(pose, self._since_key, matched=False, piece=self._key_pieces[-1])
-        self._append(place)
+        scan_pose = ScanPose(pose, self._since_key, matched=False, piece=self._key_pieces[-1])
+        self._append(scan_pose)
         if self._is_key_due(scan, familiar=True):
             self._add_linked_key(scan, np.zeros((3, 3)))
-        return place
+        return scan_pose
 
-    def _add_suspect(self, scan: _Scan, pose: Array) -> Place:
+    def _add_suspect(self, scan: _Scan, pose: Array) -> ScanPose:
         """Adds a scan whose pose is unknown; after several of them, another piece begins."""
         self._suspect_scans += 1
         if self._suspect_scans >= MAX_SUSPECT_SCANS and len(scan.elements) >= MIN_PARTNERS:
             return self._begin_piece(pose, scan)
-        place = Place(pose, self._since_key, matched=False, piece=NO_PIECE)
-        self._append(place)
-        return place
+        scan_pose = ScanPose(pose, self._since_key, matched=False, piece=NO_PIECE)
+        self._append(scan_pose)
+        return scan_pose
 
-    def _begin_piece(self, pose: Array, scan: _Scan) -> Place:
-        """Begins a piece with a scan, whose pose (3,) may be any."""
+    def _begin_piece(self, pose: Array, scan: _Scan) -> ScanPose:
+        """Begins a piece with a scan at an arbitrary pose (3,)."""
         self._velocity, self._suspect_scans = None, 0
         self._first_local = len(self.keys)
         piece = max(self._key_pieces, default=-1) + 1
-        place = Place(pose, np.diag(REGISTRATION_DEVIATION**2), matched=True, piece=piece)
-        self._append(place)
+        scan_pose = ScanPose(pose, np.diag(REGISTRATION_DEVIATION**2), matched=True, piece=piece)
+        self._append(scan_pose)
         self._add_key(scan)
-        return place
+        return scan_pose
 
-    def _append(self, place: Place) -> None:
-        self.poses.append(place.pose)
-        self.pieces.append(place.piece)
+    def _append(self, scan_pose: ScanPose) -> None:
+        self.poses.append(scan_pose.pose)
+        self.pieces.append(scan_pose.piece)
 
     def _is_key_due(self, scan: _Scan, *, familiar: bool) -> bool:
         """Whether the last scan is far from the last key scan."""
@@ -323,7 +329,7 @@ class FrontEnd:
         return evenly_spaced(scan.ranges, scan.angles, self._sweep, -np.inf)
 
 
-def track_drive(drive: RawDrive, report: Callable[[float], None] = lambda _done: None) -> Track:
+def track_drive(drive: RawDrive, report: Callable[[float], None] = lambda _done: None) -> TrackedDrive:
     """Tracks the scans of a drive; reports the share that is done."""
     front_end = FrontEnd(drive.laser)
     for k, (stamp, ranges) in enumerate(zip(drive.stamps, drive.ranges, strict=True)):
@@ -339,7 +345,7 @@ def _median_range(elements: Elements) -> float:
 def _learn_scale(scale: Array, deviation: Array, expected: Array, found: Registration) -> Array:
     """The factor (3,) of the motion's deviations after one more scan, by expectation maximisation.
 
-    Odometries differ tenfold.
+    It is learned because the errors of odometries differ tenfold.
     """
     turn = se2.rotation(-float(expected[2]))
     variance = np.diag(turn @ found.covariance @ turn.T)

@@ -1,8 +1,8 @@
-"""Finds where a piece of the drive lies in the map, after the robot was carried off: nothing is known of its place.
+"""Finds the pose in the map of a piece of the drive, after the robot was kidnapped.
 
-Segments of the piece are searched for in the whole map. The rest of the piece distinguishes places that look alike:
-it is joined only if two of its segments agree on its place, no segment contradicts it, and no other place is as good.
-If a later segment contradicts it, the piece is separated again.
+Segments of the piece are searched for in the whole map. The rest of the piece distinguishes places that look alike: it
+is joined only if two of its segments agree on its pose, no segment contradicts it, and no other pose is as good. If a
+later segment contradicts it, the piece is separated again.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ import numpy.typing as npt
 
 from common.geometry import se2
 from common.geometry.se2 import Array
-from services.mapper.slam.loop_closure import MAX_DISTANCE_M, MIN_MATCHED, RIVAL_SHARE, Closure, match_segments
+from services.mapper.slam.loop_closure import MAX_DISTANCE_M, MIN_MATCHED, RIVAL_SHARE, LoopClosure, match_segments
 from services.mapper.slam.pose_graph import PoseLink
 from services.mapper.slam.registration import Surface
 from services.mapper.slam.search import search
-from services.mapper.slam.segments import Segment, compare, submap
+from services.mapper.slam.segments import Segment, compare_segments, submap
 
 TARGET_SPACING_M = 2.0  # between segments of the map in which a segment is searched for
 SEARCH_RANGE_M, TURN_STEP = 4.0, 0.06  # m from them, and rad between the headings tried
 SAME_PLACE_M, SAME_PLACE_RAD = 0.5, 0.1  # candidates that place a segment closer together than this agree
 MIN_SUPPORT = 2  # segments that agree
-# Share of contradictions with the nearest segments of the map that refutes a place, beyond those that people cause.
+# A place is refuted by this share of contradictions with the nearest segments, more than people cause.
 MAX_CONTRADICTION, NEAREST = 0.03, 3
 
 
@@ -33,24 +33,24 @@ MAX_CONTRADICTION, NEAREST = 0.03, 3
 class JoinCandidate:
     """A closure that would join a piece with the map."""
 
-    closure: Closure
+    closure: LoopClosure
     score: float
 
 
-class Joining:
-    """Collects candidates between segments of the map and of other pieces; each pair of segments is searched once."""
+class PieceJoiner:
+    """Joins pieces with the map; searches each pair of segments once, and keeps the candidates."""
 
     def __init__(self) -> None:
         self._searched: set[tuple[int, int]] = set()
         self._candidates: list[JoinCandidate] = []
 
-    def find(self, segments: Sequence[Segment], poses: Array, component: npt.NDArray[np.int_]) -> list[Closure]:
-        """The closures that join a piece with the map, or nothing.
+    def find(self, segments: Sequence[Segment], poses: Array, component: npt.NDArray[np.int_]) -> list[LoopClosure]:
+        """Returns the loop closures that join a piece with the map, or an empty list.
 
         ``poses`` (N, 3) are of the key scans; those of one ``component`` (N,) are linked. The largest one is the map.
         """
         of_segment = component[[segment.reference for segment in segments]]
-        in_map = of_segment == largest(component)
+        in_map = of_segment == largest_component(component)
         targets = _spaced_out(segments, poses, np.flatnonzero(in_map))
         for second in np.flatnonzero(~in_map).tolist():
             for first in targets:
@@ -63,7 +63,7 @@ class Joining:
             ]
             parts = np.flatnonzero(in_map).tolist(), np.flatnonzero(of_part).tolist()
             if found := _agreed_closures(candidates, parts, segments, poses):
-                # Once only: if this join is taken back, the same candidates must not lead to it again.
+                # Each candidate is used once: if this join is undone, the same candidates must not lead to it again.
                 self._candidates = [
                     each for each in self._candidates if all(each.closure is not used for used in found)
                 ]
@@ -71,7 +71,7 @@ class Joining:
         return []
 
 
-def largest(component: npt.NDArray[np.int_]) -> int:
+def largest_component(component: npt.NDArray[np.int_]) -> int:
     """The label of the component (N,) with most poses."""
     return int(np.argmax(np.bincount(component)))
 
@@ -103,8 +103,8 @@ def _search_segment(segments: Sequence[Segment], first: int, second: int, poses:
 
 def _agreed_closures(
     candidates: Sequence[JoinCandidate], parts: tuple[list[int], list[int]], segments: Sequence[Segment], poses: Array
-) -> list[Closure]:
-    """The closures that agree on the place of one part of the drive in another, if no other place is as good.
+) -> list[LoopClosure]:
+    """The loop closures that agree on the pose of one part of the drive in another, if no other pose is as good.
 
     ``parts`` are the numbers of their segments, those of the map first.
     """
@@ -152,7 +152,7 @@ def _place_of_piece(link: PoseLink, poses: Array) -> Array:
 def _is_place_contradicted(
     place: Array, parts: tuple[list[int], list[int]], segments: Sequence[Segment], poses: Array
 ) -> bool:
-    """Whether some segment of the second part contradicts the first one, if the frame of the second is at a place."""
+    """Whether, with the frame of the second part at ``place`` (3,), some segment of it contradicts the first part."""
     targets, moved = parts
     return any(
         is_contradicted(number, se2.compose(place, poses[segments[number].reference]), targets, segments, poses)
@@ -193,6 +193,6 @@ def _contradicting_share(
     """Share of contradictions between a segment at a pose (3,) and others."""
     agreeing = contradicting = 0
     for target in (segments[k] for k in others):
-        found = compare(target, Surface(target.elements), moved, se2.between(poses[target.reference], pose))
+        found = compare_segments(target, Surface(target.elements), moved, se2.between(poses[target.reference], pose))
         agreeing, contradicting = agreeing + found.agreeing, contradicting + found.contradicting
     return contradicting / max(MIN_MATCHED, agreeing + contradicting)

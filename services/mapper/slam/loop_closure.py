@@ -16,12 +16,12 @@ from common.geometry.se2 import Array
 from services.mapper.slam.pose_graph import PoseLink, Uncertainty
 from services.mapper.slam.registration import Surface, register
 from services.mapper.slam.search import search
-from services.mapper.slam.segments import Agreement, Segment, compare, submap
+from services.mapper.slam.segments import Agreement, Segment, compare_segments, submap
 
 MAX_DISTANCE_M = 6.0  # between the references of segments that are matched
 MIN_APART = 3  # segments between two that are matched
 MAX_TARGETS = 2  # for each segment in one round
-SIGMAS = 3.0  # standard deviations of the graph within which to look
+SEARCH_SIGMAS = 3.0  # standard deviations of the graph, half the width of the search window
 NO_SEARCH_WINDOW = np.array([0.3, 0.3, 0.1])  # m, m, rad: a smaller window needs no search
 MIN_MATCHED, MIN_SHARE = 60, 0.85  # elements, and their share among those that match or contradict
 RIVAL_SHARE = 0.8  # of the best score: a better match at another place means that the place is not unique
@@ -32,7 +32,7 @@ MATCH_DEVIATION = np.array([0.01, 0.01, 0.003])
 
 
 @dataclass(frozen=True)
-class Closure:
+class LoopClosure:
     """A match of one segment with another."""
 
     first: int  # segment
@@ -48,7 +48,7 @@ def find_closures(
     tried: set[tuple[int, int]],
     window: float,
     report: Callable[[float], None] = lambda _done: None,
-) -> list[Closure]:
+) -> list[LoopClosure]:
     """Closures between pairs of segments whose position relative to one another is known to within ``window`` m.
 
     ``poses`` (N, 3) are of the key scans, ``uncertainty`` that of the segments' references, ``tried`` the pairs
@@ -78,7 +78,9 @@ def _targets(
             continue
         if any(abs(first - other) < MIN_APART for other in chosen):
             continue
-        deviation = SIGMAS * float(np.sqrt(np.linalg.eigvalsh(uncertainty.of_pair(int(first), second)[:2, :2])[1]))
+        deviation = SEARCH_SIGMAS * float(
+            np.sqrt(np.linalg.eigvalsh(uncertainty.of_pair(int(first), second)[:2, :2])[1])
+        )
         if deviation < window and distance[first] < MAX_DISTANCE_M + deviation:
             chosen.append(int(first))
     return chosen
@@ -102,10 +104,10 @@ class SegmentMatch:
         """Whether enough elements match, and few contradict."""
         return self.agreement.matched >= MIN_MATCHED and self.agreement.share >= MIN_SHARE
 
-    def closure(self, first: int, second: int, references: tuple[int, int], *, wide: bool) -> Closure:
+    def closure(self, first: int, second: int, references: tuple[int, int], *, wide: bool) -> LoopClosure:
         """The loop closure between two segments with these ``references``."""
         link = PoseLink(*references, self.pose, np.asarray(np.linalg.inv(self.covariance), float), robust=True)
-        return Closure(first, second, link, wide)
+        return LoopClosure(first, second, link, wide)
 
 
 def match_segments(first: Segment, surface: Surface, second: Segment, start: Array) -> SegmentMatch | None:
@@ -114,17 +116,17 @@ def match_segments(first: Segment, surface: Surface, second: Segment, start: Arr
     if found is None:
         return None
     covariance = np.linalg.inv(found.information + np.eye(3)) + np.diag(MATCH_DEVIATION**2)
-    return SegmentMatch(compare(first, surface, second, found.pose), found.pose, np.asarray(covariance, float))
+    return SegmentMatch(compare_segments(first, surface, second, found.pose), found.pose, np.asarray(covariance, float))
 
 
 def _close_loop(
     segments: Sequence[Segment], first: int, second: int, poses: Array, uncertainty: Uncertainty
-) -> Closure | None:
+) -> LoopClosure | None:
     """The closure between two segments; None if they do not match well, or at several places."""
     target, moved = submap(segments, first, poses), segments[second]
     predicted = se2.between(poses[target.reference], poses[moved.reference])
     covariance = uncertainty.of_pair(first, second)
-    window = SIGMAS * np.sqrt(np.diag(covariance))
+    window = SEARCH_SIGMAS * np.sqrt(np.diag(covariance))
     wide = bool((window > NO_SEARCH_WINDOW).any())
     surface = Surface(target.elements)
     starts = search(surface.elements, moved.elements, predicted, window) if wide else predicted[None]
@@ -147,14 +149,14 @@ def _is_plausible(match: SegmentMatch, predicted: Array, covariance: Array) -> b
 
 
 def _is_rival(match: SegmentMatch, best: SegmentMatch) -> bool:
-    """Whether a match is at another place than the best one, and nearly as good."""
+    """Whether a match is at another pose than the best one, and nearly as good."""
     off = match.pose - best.pose
     elsewhere = bool(np.hypot(off[0], off[1]) > SAME_PLACE_M or abs(se2.wrap(off[2])) > SAME_PLACE_RAD)
     return match.score > RIVAL_SHARE * best.score and elsewhere
 
 
-def _consistent(closures: list[Closure], poses: Array, uncertainty: Uncertainty) -> list[Closure]:
-    """The closures that agree with one another: narrow ones, and wide ones that another one supports."""
+def _consistent(closures: list[LoopClosure], poses: Array, uncertainty: Uncertainty) -> list[LoopClosure]:
+    """The closures that were found by a narrow search, or by a wide one and are supported by another closure."""
     return [
         closure
         for closure in closures
@@ -163,8 +165,8 @@ def _consistent(closures: list[Closure], poses: Array, uncertainty: Uncertainty)
     ]
 
 
-def _supports(a: Closure, b: Closure, poses: Array, uncertainty: Uncertainty) -> bool:
-    """Whether two closures confirm one another: the circle through both of them closes, and could have failed to."""
+def _supports(a: LoopClosure, b: LoopClosure, poses: Array, uncertainty: Uncertainty) -> bool:
+    """Whether two closures confirm one another: the loop through both closes, which would be unlikely by chance."""
     if not (uncertainty.linked(a.first, b.first) and uncertainty.linked(a.second, b.second)):
         return False
     there = uncertainty.of_pair(a.first, b.first)
@@ -179,8 +181,8 @@ def _supports(a: Closure, b: Closure, poses: Array, uncertainty: Uncertainty) ->
     return bool(off @ np.linalg.solve(by_headings + covariance, off) < MAX_SQUARED_DEVIATION)
 
 
-def _covariance_by_headings(a: Closure, b: Closure, poses: Array) -> Array:
-    """Covariance (3, 3) that headings add over the distances in a circle through two closures."""
+def _covariance_by_headings(a: LoopClosure, b: LoopClosure, poses: Array) -> Array:
+    """Covariance (3, 3) of the loop through two closures that is due to errors of heading over its length."""
     reach = max(
         float(np.hypot(*se2.between(poses[i], poses[j])[:2]))
         for i, j in ((a.link.first, b.link.first), (a.link.second, b.link.second))

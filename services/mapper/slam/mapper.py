@@ -1,4 +1,4 @@
-"""Maps while driving: each scan gets its place at once, and loop closures correct the map behind it."""
+"""Maps while driving: each scan gets a pose at once, and loop closures correct the map later."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from common.geometry.occupancy_grid import OccupancyGrid
 from common.geometry.se2 import Array
 from services.mapper.slam.back_end import BackEnd
 from services.mapper.slam.drive import Laser
-from services.mapper.slam.front_end import FrontEnd, KeyScans, Place
+from services.mapper.slam.front_end import FrontEnd, KeyScanGraph, ScanPose
 from services.mapper.slam.grid import grid_of_scans
 from services.mapper.slam.segments import KEY_SCANS_PER_SEGMENT
 from services.mapper.slam.trajectory import poses_of_all_scans
@@ -21,49 +21,50 @@ WINDOWS_M = (1.0, 3.0, 10.0, 30.0)  # of the rounds of loop closing after each s
 
 
 @dataclass(frozen=True)
-class GrownMap:
+class MapSnapshot:
     """The map after some key scans."""
 
     grid: OccupancyGrid
-    poses: Array  # (K, 3) of all key scans; NaN for those of pieces whose place in the map is unknown
+    poses: Array  # (K, 3) of all key scans in map; NaN where the piece is not connected to the map
     closures: npt.NDArray[np.int_]  # (C, 2) numbers of the key scans that loop closures link
 
 
 class Mapper:
-    """Builds a map scan after scan; its origin is the place of the first one.
+    """Builds a map from one scan after another; its origin is the pose of the first one.
 
-    `update` takes long. It may run in another thread than the other methods, but not twice at the same time.
+    `update` takes seconds in a large building. It may run in another thread than the other methods, but not twice at
+    the same time.
     """
 
     def __init__(self, laser: Laser, cell: float) -> None:
         """``cell`` is the edge length of the map's cells in m."""
         self.laser, self.cell = laser, cell
-        self.map: GrownMap | None = None  # after the last `use`
+        self.map: MapSnapshot | None = None  # after the last `use`
         self._front_end = FrontEnd(laser)
         self._back_end = BackEnd(laser)
         self._origin = np.zeros(3)  # of the front end's frame, in map
-        self._pieces = {0}  # whose place in the map is known, or follows from a link that no update has taken back
+        self._pieces = {0}  # connected to the map, by the last update or by a link that no update has removed
 
-    def add(self, stamp: float, ranges: Array, odom: Array | None = None) -> Place:
-        """The place in map of a scan ``ranges`` (B,) m at ``stamp`` s, with or without odometry (3,)."""
-        place = self._front_end.add(stamp, ranges, odom)
-        if place.linked and place.piece - 1 in self._pieces:
-            self._pieces.add(place.piece)
+    def add(self, stamp: float, ranges: Array, odom: Array | None = None) -> ScanPose:
+        """Returns the pose in map of a scan ``ranges`` (B,) m at ``stamp`` s, with or without odometry (3,)."""
+        scan_pose = self._front_end.add(stamp, ranges, odom)
+        if scan_pose.linked and scan_pose.piece - 1 in self._pieces:
+            self._pieces.add(scan_pose.piece)
         turn = se2.rotation(float(self._origin[2]))
-        pose = se2.compose(self._origin, place.pose)
-        matched = place.matched and place.piece in self._pieces
-        return replace(place, pose=pose, covariance=turn @ place.covariance @ turn.T, matched=matched)
+        pose = se2.compose(self._origin, scan_pose.pose)
+        matched = scan_pose.matched and scan_pose.piece in self._pieces
+        return replace(scan_pose, pose=pose, covariance=turn @ scan_pose.covariance @ turn.T, matched=matched)
 
     @property
     def outdated(self) -> bool:
         """Whether there are key scans that are not in the map yet."""
         return self.map is None or len(self.map.poses) < len(self._front_end.keys)
 
-    def key_scans(self) -> KeyScans:
+    def key_scans(self) -> KeyScanGraph:
         """The key scans so far, for `update`."""
         return self._front_end.key_scans()
 
-    def update(self, scans: KeyScans) -> GrownMap:
+    def update(self, scans: KeyScanGraph) -> MapSnapshot:
         """The map of the key scans, after loop closing if they complete a segment."""
         back_end = self._back_end
         segments_before = len(back_end.poses) // KEY_SCANS_PER_SEGMENT
@@ -76,22 +77,22 @@ class Mapper:
         grid = grid_of_scans(back_end.poses[in_map], np.array(scans.ranges)[in_map], self.laser, self.cell)
         pairs = np.array([(each.link.first, each.link.second) for each in back_end.closures], int).reshape(-1, 2)
         poses = np.where(in_map[:, None], back_end.poses, np.nan)
-        return GrownMap(grid, poses, pairs[in_map[pairs].all(axis=1)])
+        return MapSnapshot(grid, poses, pairs[in_map[pairs].all(axis=1)])
 
-    def use(self, grown: GrownMap) -> None:
-        """Places the following scans in a map that `update` returned."""
-        self.map = grown
-        placed = np.flatnonzero(np.isfinite(grown.poses[:, 0]))
+    def use(self, snapshot: MapSnapshot) -> None:
+        """Replaces the map by one that `update` returned; the following scans are placed in it."""
+        self.map = snapshot
+        placed = np.flatnonzero(np.isfinite(snapshot.poses[:, 0]))
         last = self._front_end.poses[self._front_end.keys[placed[-1]]]
-        self._origin = se2.compose(grown.poses[placed[-1]], se2.inverse(last))
+        self._origin = se2.compose(snapshot.poses[placed[-1]], se2.inverse(last))
         scans = self._front_end.key_scans()
         self._pieces = set(scans.pieces[placed].tolist())
         for link in scans.links:
-            if link.second >= len(grown.poses) and scans.pieces[link.first] in self._pieces:
+            if link.second >= len(snapshot.poses) and scans.pieces[link.first] in self._pieces:
                 self._pieces.add(int(scans.pieces[link.second]))
 
     def trajectory(self) -> tuple[Array, Array]:
-        """Stamps (N,) in s and poses (N, 3) in map of all scans whose place is known."""
+        """Stamps (N,) in s and poses (N, 3) in map of all scans that are connected to the map."""
         track = self._front_end.track()
         known = np.isin(track.key_scans.pieces, list(self._pieces))
         poses = np.where(known[:, None], se2.compose(self._origin, track.key_scans.poses), np.nan)

@@ -1,4 +1,4 @@
-"""Registration of surface elements: the pose at which a scan continues a map.
+"""Registration of surface elements: finds the pose at which a scan fits a map.
 
 Point-to-line iterative closest point (Censi, ICRA 2008) with a Gaussian prior. Partners are nearest in position and
 direction together, so that a surface is never matched with its back.
@@ -18,8 +18,8 @@ from services.mapper.slam.elements import Elements
 NORMAL_DIFFERENCE_M = 0.3  # distance as which a difference of 1 between two unit normals counts
 PARTNER_RADII_M = (0.6, 0.6, 0.5, 0.4, 0.3, 0.2, 0.2, 0.2)  # largest distance of partners, iteration by iteration
 RESIDUAL_M = 0.03  # standard deviation of the distance between partners, and scale of the Cauchy weights
-PRIOR_SCALE = 2.0  # standard deviations, of the prior's Cauchy weight: wheels slip
-PRIOR_INFLATION = 2.0  # of the deviations of the prior, because those of the elements are stated too large as well
+PRIOR_SCALE = 2.0  # standard deviations, scale of the prior's Cauchy weight: wheels slip
+PRIOR_INFLATION = 2.0  # factor on the deviations of the prior, because those of the elements are too large as well
 MATCHED_M = 0.15  # an element whose partner is nearer than this is matched
 MIN_PARTNERS = 10
 CORRELATED_ELEMENTS = 10.0  # that match or fail together, because they belong to one thing
@@ -27,7 +27,7 @@ CORRELATED_ELEMENTS = 10.0  # that match or fail together, because they belong t
 
 @dataclass
 class Surface:
-    """Elements that others are registered to."""
+    """The target of a registration: surface elements and their search tree."""
 
     elements: Elements
     tree: cKDTree = field(init=False)
@@ -43,13 +43,13 @@ class Surface:
 
 @dataclass(frozen=True)
 class PosePrior:
-    """What is known of a pose before its scan is registered; with heavy tails (Cauchy), because wheels slip."""
+    """Prior of a pose, with the heavy tails of a Cauchy distribution, because wheels slip."""
 
     mean: Array  # (3,)
     information: Array  # (3, 3)
 
-    def off(self, pose: Array) -> tuple[Array, float]:
-        """The mean's distance (3,) from a pose, and its square in squared standard deviations."""
+    def difference(self, pose: Array) -> tuple[Array, float]:
+        """Difference (3,) of the mean from a pose, and its squared Mahalanobis distance."""
         off = self.mean - pose
         off[2] = se2.wrap(off[2])
         return off, float(off @ self.information @ off)
@@ -70,7 +70,7 @@ class Registration:
 
 
 def register(surface: Surface, elements: Elements, start: Array, prior: PosePrior = NO_PRIOR) -> Registration | None:
-    """Registers elements from ``start`` (3,); None if too few match."""
+    """Registers elements, starting at the pose ``start`` (3,); returns None if too few match."""
     pose = np.array(start, float)
     for radius in PARTNER_RADII_M:
         placed = elements.transformed(pose)
@@ -85,7 +85,7 @@ def register(surface: Surface, elements: Elements, start: Array, prior: PosePrio
         J = np.column_stack([normal, normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]])
         weight = 1 / (1 + (error / RESIDUAL_M) ** 2) / RESIDUAL_M**2
         H = (J.T * weight) @ J
-        off, squared = prior.off(pose)
+        off, squared = prior.difference(pose)
         held = prior.information / PRIOR_INFLATION**2 / (1 + squared / PRIOR_SCALE**2)
         step = np.linalg.solve(H + held + 1e-6 * np.eye(3), held @ off - (J.T * weight) @ error)
         pose = pose + step
@@ -94,7 +94,7 @@ def register(surface: Surface, elements: Elements, start: Array, prior: PosePrio
     missed = np.where(matched, 0.0, MATCHED_M)
     missed[paired & matched] = error[matched[paired]]
     cost = np.log1p((missed / RESIDUAL_M) ** 2).sum() / 2 / CORRELATED_ELEMENTS
-    cost += PRIOR_SCALE**2 * np.log1p(prior.off(pose)[1] / PRIOR_SCALE**2) / 2
+    cost += PRIOR_SCALE**2 * np.log1p(prior.difference(pose)[1] / PRIOR_SCALE**2) / 2
     covariance = np.linalg.inv(H + held + 1e-6 * np.eye(3))
     return Registration(pose, H, covariance, float(matched.mean()), float(cost))
 

@@ -1,4 +1,4 @@
-"""Segments: some metres of the drive as one rigid piece, with more surroundings than a single scan."""
+"""Segments: a few successive key scans as one rigid submap, which shows more of the surroundings than one scan."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from services.mapper.slam.elements import Elements, concatenate
 from services.mapper.slam.registration import MATCHED_M, Surface
 
 KEY_SCANS_PER_SEGMENT = 8
-PERSON_M, GAP_M = 0.7, 0.3  # size of the largest moving thing, and between its parts
+PERSON_M, GAP_M = 0.7, 0.3  # size of a person, the largest moving object, and largest gap between its parts
 PASSED_M = 0.3  # behind an element, along its normal, from where a beam counts as having passed through it
 
 
@@ -100,11 +100,11 @@ def submap(segments: Sequence[Segment], middle: int, poses: Array) -> Segment:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well two segments agree, in numbers of elements. An element of which the other saw nothing does not count."""
+    """How well two segments agree, in numbers of elements. Elements outside the other segment's view do not count."""
 
     matched: int  # elements of the second segment that match
     agreeing: int  # elements of both that match
-    contradicting: int  # elements of both, of larger things than a person, in places through which the other one saw
+    contradicting: int  # elements of both, of objects larger than a person, through which the other one saw
 
     @property
     def share(self) -> float:
@@ -112,7 +112,7 @@ class Agreement:
         return self.agreeing / max(1, self.agreeing + self.contradicting)
 
 
-def compare(first: Segment, surface: Surface, second: Segment, pose: Array) -> Agreement:
+def compare_segments(first: Segment, surface: Surface, second: Segment, pose: Array) -> Agreement:
     """Compares two segments, the second at ``pose`` (3,) in the first; ``surface`` has the elements of the first."""
     placed = second.elements.transformed(pose)
     second_matches = surface.partner_distances(placed) < MATCHED_M

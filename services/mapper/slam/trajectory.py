@@ -12,8 +12,8 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from services.mapper.slam.back_end import BackEnd
 from services.mapper.slam.drive import RawDrive
-from services.mapper.slam.front_end import Track, track_drive
-from services.mapper.slam.loop_closure import Closure
+from services.mapper.slam.front_end import TrackedDrive, track_drive
+from services.mapper.slam.loop_closure import LoopClosure
 
 WINDOWS_M = (1.0, 1.0, 3.0, 3.0, 10.0, 10.0, 30.0, 30.0, 1.0, 1.0)  # of the rounds of loop closing
 
@@ -23,13 +23,13 @@ class DriveTrajectory:
     """Poses of all scans of a drive."""
 
     poses: Array  # (N, 3) base_link in map; NaN where it is unknown
-    keys: list[int]  # key scans
-    closures: list[Closure]
+    keys: list[int]  # numbers of the key scans
+    closures: list[LoopClosure]
     unmatched: int  # scans that did not match the ones before
 
 
 def build_trajectory(drive: RawDrive, report: Callable[[str, float], None] = lambda _t, _d: None) -> DriveTrajectory:
-    """The poses from which all scans of a drive agree best."""
+    """Finds the poses at which all scans of a drive agree best."""
     tracked = track_drive(drive, lambda done: report("tracking", done))
     back_end = BackEnd(drive.laser)
     back_end.extend(tracked.key_scans)
@@ -48,10 +48,10 @@ def build_trajectory(drive: RawDrive, report: Callable[[str, float], None] = lam
     return DriveTrajectory(poses_of_all_scans(tracked, poses), keys, back_end.closures, tracked.unmatched)
 
 
-def poses_of_all_scans(tracked: Track, poses: Array) -> Array:
+def poses_of_all_scans(tracked: TrackedDrive, poses: Array) -> Array:
     """Poses (N, 3) of all scans, from the corrected ``poses`` (K, 3) of the key scans.
 
-    The poses of scans that belong to no piece, or to one whose key scans have no pose, are NaN.
+    Scans of no piece, and of pieces whose key scans have no pose, get NaN.
     """
     keys, pieces = np.array(tracked.keys), tracked.key_scans.pieces
     before = np.searchsorted(keys, np.arange(len(tracked.poses)), side="right") - 1

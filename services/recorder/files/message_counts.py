@@ -17,7 +17,7 @@ MAX_REORDER_DISTANCE = 64  # a larger step back means that the publisher restart
 
 
 @dataclass
-class Sequence:
+class SequenceNumbers:
     """Counts gaps and restarts in the sequence numbers (0, 1, 2, ...) of one publisher on one key."""
 
     gaps: int = 0  # places where at least one number is missing
@@ -26,7 +26,7 @@ class Sequence:
     reordered: int = 0  # numbers that came late or twice, or from a second publisher
     _next: int | None = None  # None before the first number: earlier messages do not count as missing
 
-    def see(self, number: int) -> None:
+    def add(self, number: int) -> None:
         """Counts the next received number."""
         expected = number if self._next is None else self._next
         if number > expected:
@@ -41,7 +41,7 @@ class Sequence:
 
 
 @dataclass
-class Count:
+class KeyCounts:
     """Messages of one key, as stored in a recording's metadata `counters`."""
 
     received: int = 0  # by the recorder process
@@ -56,15 +56,15 @@ class Count:
 
 
 @dataclass
-class Ledger:
+class MessageCounts:
     """Counts the messages of all keys."""
 
     written: dict[str, int] = field(default_factory=dict)
     unreadable: dict[str, int] = field(default_factory=dict)
     # By key and instance: several processes of one service publish under one key, each with its own numbers.
-    sequences: dict[str, dict[str, Sequence]] = field(default_factory=dict)
+    sequences: dict[str, dict[str, SequenceNumbers]] = field(default_factory=dict)
 
-    def see(self, key: str, payload: bytes) -> None:
+    def add(self, key: str, payload: bytes) -> None:
         """Counts a payload that was written."""
         self.written[key] = self.written.get(key, 0) + 1
         numbered = sequence_of(payload)
@@ -75,11 +75,11 @@ class Ledger:
             instances = self.sequences.setdefault(key, {})
             if instance not in instances and len(instances) >= MAX_INSTANCES:
                 instance = ""
-            instances.setdefault(instance, Sequence()).see(number)
+            instances.setdefault(instance, SequenceNumbers()).add(number)
 
-    def lost(self, key: str) -> Sequence:
+    def lost(self, key: str) -> SequenceNumbers:
         """Gaps and missing messages of a key, summed over all instances."""
-        total = Sequence()
+        total = SequenceNumbers()
         for sequence in self.sequences.get(key, {}).values():
             total.gaps += sequence.gaps
             total.missing = min(MAX_COUNT, total.missing + sequence.missing)
@@ -89,13 +89,13 @@ class Ledger:
 
     def counts(
         self, received: Mapping[str, int], dropped: Mapping[str, int], oversized: Mapping[str, int]
-    ) -> dict[str, Count]:
+    ) -> dict[str, KeyCounts]:
         """Counts by key, combined with the given counts of the receiving queue."""
         keys = sorted(set(received) | set(self.written))
         found = {}
         for key in keys:
             numbers = self.lost(key)
-            found[key] = Count(
+            found[key] = KeyCounts(
                 received=received.get(key, 0),
                 written=self.written.get(key, 0),
                 dropped=dropped.get(key, 0),
@@ -109,17 +109,17 @@ class Ledger:
         return found
 
 
-def as_metadata(counts: Mapping[str, Count]) -> dict[str, str]:
+def as_metadata(counts: Mapping[str, KeyCounts]) -> dict[str, str]:
     """The metadata record `counters` at the end of a file: counts as JSON, by key."""
     return {key: json.dumps(asdict(count)) for key, count in counts.items()}
 
 
-def from_metadata(record: Mapping[str, str]) -> dict[str, Count]:
+def from_metadata(record: Mapping[str, str]) -> dict[str, KeyCounts]:
     """Counts by key from a recording's metadata `counters`. Leaves out invalid entries."""
     found = {}
     for key, text in record.items():
         try:
-            found[key] = Count(**json.loads(text))
+            found[key] = KeyCounts(**json.loads(text))
         except (ValueError, TypeError):
             continue
     return found

@@ -13,7 +13,7 @@ Ending = Callable[[], Mapping[str, Mapping[str, str]]]  # returns metadata recor
 
 
 @dataclass(frozen=True)
-class Limits:
+class PartLimits:
     """Limits of one part. 0 means no limit."""
 
     size: int = 0  # bytes
@@ -26,7 +26,7 @@ class PartsWriter:
     Has the interface of RecordingWriter and raises the same errors.
     """
 
-    def __init__(self, open_part: Callable[[int], RecordingWriter], limits: Limits, ending: Ending = dict) -> None:
+    def __init__(self, open_part: Callable[[int], RecordingWriter], limits: PartLimits, ending: Ending = dict) -> None:
         """Opens part 1. ``ending`` returns the metadata records that are written at the end of each part."""
         self._open, self._limits, self._ending = open_part, limits, ending
         self._metadata: dict[str, dict[str, str]] = {}  # by name; the last record of each name

@@ -18,13 +18,13 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from common.bus.bus import Bus, Link, open_bus, wait_until
-from common.bus.inbox import Call, Inbox
+from common.bus.inbox import Inbox, IncomingRequest
 from common.errors import UserError
 from common.messages.requests import PlayerReply, PlayerRequest, WorldReply
 from common.messages.topics import CONFIG, PLAYER, SCAN, WORLD, Topic
 from common.messages.wire import DecodeError
 from common.runtime.protocol_check import build_config_reply
-from services.recorder.reader import Raw, Recording, read_recording
+from services.recorder.reader import RawMessage, Recording, read_recording
 from services.recorder.replaying.player import (
     Player,
     find_conflicts,
@@ -67,7 +67,7 @@ class ReplayControl:
 
     def send(self, request: PlayerRequest) -> None:
         """Queues a request. Requests are executed in order."""
-        self._inbox.put(Call(PLAYER, request.encode(), lambda _: None, lambda _: None))
+        self._inbox.put(IncomingRequest(PLAYER, request.encode(), lambda _: None, lambda _: None))
 
     def state(self) -> PlayerReply:
         """Current state of the replay."""
@@ -159,7 +159,7 @@ class Replay:
         while True:
             wait = self.player.wait(position, time.monotonic())
             entry = self.inbox.get(min(wait, POLL_PERIOD_S))
-            if isinstance(entry, Call):
+            if isinstance(entry, IncomingRequest):
                 self._answer(entry)
             if entry is not None or wait > 0:
                 on_progress(self.player.state(time.monotonic()))
@@ -173,16 +173,16 @@ class Replay:
         while not (stop.is_set() or self.control.quitting or self.player.seek_pending):
             self.player.finish(time.monotonic())
             on_progress(self.player.state(time.monotonic()))
-            if isinstance(entry := self.inbox.get(POLL_PERIOD_S), Call):
+            if isinstance(entry := self.inbox.get(POLL_PERIOD_S), IncomingRequest):
                 self._answer(entry)
 
-    def _send(self, raw: Raw, position: float) -> None:
+    def _send(self, raw: RawMessage, position: float) -> None:
         topic, key = self.topics[raw.key], self.keys[raw.key]
         self.bus.put(topic, raw.payload, key=key)
         self.counts[key] += 1
         self.player.mark_sent(position, time.monotonic(), completes_step=self._step_topic in (None, topic))
 
-    def _answer(self, call: Call) -> None:
+    def _answer(self, call: IncomingRequest) -> None:
         if call.query is CONFIG:
             config = {"file": str(self.recording.path), **asdict(self.options)}
             plain = json.dumps(config, default=sorted)

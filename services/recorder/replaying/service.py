@@ -26,7 +26,7 @@ from services.recorder.replaying.replay import NAME, ReplayControl, ReplayOption
 HEARTBEAT_PERIOD_S = 1.0
 
 
-class PlayingSettings(ServiceSettings):
+class ReplaySettings(ServiceSettings):
     """Replays a recording in place of the simulator: its scan, odom and truth, in a loop.
 
     Publishes under the robot name given by --robot. Refuses to start while a simulator of that robot is alive.
@@ -58,7 +58,7 @@ class PlayingSettings(ServiceSettings):
         return path
 
 
-def options_for(path: Path, settings: PlayingSettings) -> ReplayOptions:
+def options_for(path: Path, settings: ReplaySettings) -> ReplayOptions:
     """Options that replay the simulator's topics in a loop. Raises UserError if the recording has no scans."""
     of_simulator = {topic.name for topic in TOPICS if topic.publisher == SCAN.publisher}
     recorded = {topic.name for topic in read_recording(path).topics().values()} & of_simulator
@@ -70,7 +70,7 @@ def options_for(path: Path, settings: PlayingSettings) -> ReplayOptions:
 class ReplayHeartbeat:
     """Writes heartbeats during the replay. An instance is the replay's progress callback."""
 
-    def __init__(self, settings: PlayingSettings) -> None:
+    def __init__(self, settings: ReplaySettings) -> None:
         self._heart = Heartbeat(settings.heartbeat, NAME, settings.robot)
         self._next_at = 0.0  # monotonic time of the next heartbeat, s
         self._bus: Bus | None = None
@@ -103,7 +103,7 @@ def main(argv: list[str] | None = None) -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
     try:
-        settings = load_settings(PlayingSettings, argv)
+        settings = load_settings(ReplaySettings, argv)
         set_up_logging(settings.log_level, as_json=settings.log_json)
         path = settings.file()
         options, heartbeat, log = options_for(path, settings), ReplayHeartbeat(settings), logger(NAME)

@@ -35,7 +35,7 @@ Json = dict[str, Any]
 COMPACT = (",", ":")
 
 
-def encode(header: Json, arrays: Mapping[str, npt.NDArray[np.float32]]) -> bytes:
+def encode_frame(header: Json, arrays: Mapping[str, npt.NDArray[np.float32]]) -> bytes:
     """Encodes a frame, and adds ``arrays`` to the header. Raises ValueError if the header has a non-finite number."""
     places, offset = {}, 0
     for name, array in arrays.items():
@@ -66,58 +66,60 @@ def arrays_of(
     }
 
 
-def pose_of(pose: Pose) -> Json:
+def pose_as_json(pose: Pose) -> Json:
     """Position in m and yaw in rad."""
     return {"x": pose.x, "y": pose.y, "yaw": pose.yaw}
 
 
-def twist_of(twist: Twist) -> Json:
+def twist_as_json(twist: Twist) -> Json:
     """Velocity in m/s and turn rate in rad/s."""
     return {"vx": twist.vx, "vy": twist.vy, "wz": twist.wz}
 
 
-def truth_of(truth: Truth | None) -> Json | None:
+def truth_as_json(truth: Truth | None) -> Json | None:
     """True pose in map, and whether the robot touches something or is held by the obstacle stop."""
     if truth is None:
         return None
-    return {**pose_of(truth.pose), "contact": truth.contact, "stopped": truth.stopped}
+    return {**pose_as_json(truth.pose), "contact": truth.contact, "stopped": truth.stopped}
 
 
-def odom_of(odom: Odom | None) -> Json | None:
+def odom_as_json(odom: Odom | None) -> Json | None:
     """Pose in odom, and velocity in base_link."""
-    return None if odom is None else {**pose_of(odom.pose), **twist_of(odom.twist)}
+    return None if odom is None else {**pose_as_json(odom.pose), **twist_as_json(odom.twist)}
 
 
-def cmd_of(command: CmdVel | None) -> Json | None:
+def cmd_as_json(command: CmdVel | None) -> Json | None:
     """Commanded velocity."""
-    return None if command is None else twist_of(command.twist)
+    return None if command is None else twist_as_json(command.twist)
 
 
-def belief_of(belief: Belief | None) -> Json | None:
+def belief_as_json(belief: Belief | None) -> Json | None:
     """Belief with its hypotheses. ``cov`` is the (3, 3) covariance of x, y, yaw, row by row."""
     if belief is None:
         return None
     return {
         "state": belief.state,
         "stamp_ns": belief.stamp_ns,
-        **pose_of(belief.pose),
+        **pose_as_json(belief.pose),
         "cov": _flat(belief.covariance),
         "free_energy": belief.free_energy,
         "accuracy": belief.accuracy,
         "complexity": belief.complexity,
         "probability": belief.probability,
         "protection": None if belief.protection is None else belief.protection.tolist(),
-        "hypotheses": [{**pose_of(h.pose), "weight": h.weight, "cov": _flat(h.covariance)} for h in belief.hypotheses],
+        "hypotheses": [
+            {**pose_as_json(h.pose), "weight": h.weight, "cov": _flat(h.covariance)} for h in belief.hypotheses
+        ],
         "estimator": belief.estimator,
         "field_version": belief.field_version,
     }
 
 
-def status_of(status: Status | None, goals: Mapping[int, Goal]) -> Json | None:
+def status_as_json(status: Status | None, goals: Mapping[int, Goal]) -> Json | None:
     """The controller's status. Includes the goal's tolerances if the goal is one of ``goals`` (by sequence number)."""
     if status is None:
         return None
-    goal: Json | None = pose_of(status.goal) if status.goal is not None else None
+    goal: Json | None = pose_as_json(status.goal) if status.goal is not None else None
     message = goals.get(status.goal_seq)
     if goal is not None and message is not None and message.pose == status.goal:
         goal |= {"tolerance": message.tolerance, "yaw_tolerance": message.yaw_tolerance}
@@ -133,7 +135,7 @@ def status_of(status: Status | None, goals: Mapping[int, Goal]) -> Json | None:
     }
 
 
-def map_of(message: Map, robot: str) -> str:
+def map_as_json(message: Map, robot: str) -> str:
     """A map as a message of type ``map``: a world, the path of the key scans, and the ends of loop closures, in m."""
     world = World.model_validate({"name": "map", "grid": message.grid})
     parts = {
@@ -146,13 +148,13 @@ def map_of(message: Map, robot: str) -> str:
     return json.dumps(parts, separators=COMPACT)
 
 
-def scan_of(scan: Scan) -> Json:
+def scan_as_json(scan: Scan) -> Json:
     """Beam angles, maximum range and mount of a scan."""
     return {
         "angle_min": scan.angle_min,
         "angle_increment": scan.angle_increment,
         "range_max": scan.range_max,
-        "mount": pose_of(scan.mount),
+        "mount": pose_as_json(scan.mount),
     }
 
 

@@ -8,7 +8,7 @@ from contextlib import suppress
 import numpy as np
 
 from common.messages.definitions import Preference
-from services.viewer.state.frames import encode, pose_of
+from services.viewer.state.frames import encode_frame, pose_as_json
 
 MAX_CELLS = 40_000  # 160 kB per message
 MAX_STORED_FIELDS = 32  # of a replay, which may seek back to earlier fields
@@ -56,10 +56,10 @@ def field_of(message: Preference, robot: str) -> bytes:
         "type": "field",
         "robot": robot,
         "t": message.stamp_ns * 1e-9,
-        "goal": pose_of(message.goal),
+        "goal": pose_as_json(message.goal),
         "origin": {"x": message.origin.x + shift, "y": message.origin.y + shift},
         "resolution": message.resolution * step,
         "width": values.shape[1],
         "height": values.shape[0],
     }
-    return encode(header, {"distance": values.ravel()})
+    return encode_frame(header, {"distance": values.ravel()})

@@ -176,7 +176,7 @@ class RobotView:
     def _store_map(self, message: Map) -> None:
         if self.map is None:
             self._change_frame()
-        self.map, self.map_changed = frames.map_of(message, self.robot), True
+        self.map, self.map_changed = frames.map_as_json(message, self.robot), True
 
     def _change_frame(self) -> None:
         """Forgets what was measured with the truth: with a map, all that is shown is in another frame than without."""
@@ -255,18 +255,20 @@ class RobotView:
             "t": scan.stamp_ns * 1e-9,
             "stamp_ns": scan.stamp_ns,
             "robot": self.robot,
-            "truth": frames.truth_of(self.fresh(TRUTH, Truth, now)),
-            "belief": frames.belief_of(belief),
-            "odom": frames.odom_of(self.fresh(ODOM, Odom, now)),
-            "status": frames.status_of(self.status, self._goals),
-            "cmd": frames.cmd_of(self.fresh(CMD_VEL, CmdVel, now)),
+            "truth": frames.truth_as_json(self.fresh(TRUTH, Truth, now)),
+            "belief": frames.belief_as_json(belief),
+            "odom": frames.odom_as_json(self.fresh(ODOM, Odom, now)),
+            "status": frames.status_as_json(self.status, self._goals),
+            "cmd": frames.cmd_as_json(self.fresh(CMD_VEL, CmdVel, now)),
             "error": self._error(belief) if belief is not None else None,
             "speed": self._speed(),
             "latency_ms": self._latency_ms,
-            "scan": frames.scan_of(scan),
+            "scan": frames.scan_as_json(scan),
         }
         prediction, plan = self.fresh(PREDICTION, Prediction, now), self.fresh(PLAN, Plan, now)
-        self.frame = frames.encode(header, frames.arrays_of(scan, prediction, plan, self.fresh(TRUTH, Truth, now)))
+        self.frame = frames.encode_frame(
+            header, frames.arrays_of(scan, prediction, plan, self.fresh(TRUTH, Truth, now))
+        )
         return self.frame
 
 

@@ -107,7 +107,7 @@ def test_subscription_to_all_services(bus, other):
 def result(bus, timeout=1.0, **options) -> str:
     """The reason in the reply to a blocking request, or the error."""
     try:
-        return bus.ask(TELEPORT, PoseRequest(pose=Pose(x=1.0, y=2.0)), Reply, timeout=timeout, **options).reason
+        return bus.query(TELEPORT, PoseRequest(pose=Pose(x=1.0, y=2.0)), Reply, timeout=timeout, **options).reason
     except UserError as error:
         return str(error)
 
@@ -115,7 +115,7 @@ def result(bus, timeout=1.0, **options) -> str:
 def result_without_waiting(bus, number, timeout, x=1.0) -> str:
     """The reason in the reply to a request that does not block; checks that there is exactly one reply."""
     inbox = Inbox()
-    bus.request(TELEPORT, PoseRequest(pose=Pose(x=x, y=2.0)), number, inbox, timeout)
+    bus.send_request(TELEPORT, PoseRequest(pose=Pose(x=x, y=2.0)), number, inbox, timeout)
     assert wait_until(lambda: len(inbox) > 0, PATIENCE)
     answer = inbox.get(0)
     assert (answer.query, answer.number, len(inbox)) == (TELEPORT, number, 0)
@@ -160,7 +160,7 @@ def test_requests_do_not_block(bus, other):
     with answering(other, TELEPORT, answer):
         assert wait_until(lambda: result_without_waiting(bus, 1, PATIENCE, x=-1.0) == "at -1", PATIENCE)
         for number in range(20):
-            bus.request(TELEPORT, PoseRequest(pose=Pose(x=float(number), y=0.0)), number, inbox, PATIENCE)
+            bus.send_request(TELEPORT, PoseRequest(pose=Pose(x=float(number), y=0.0)), number, inbox, PATIENCE)
         assert len(inbox) == 0  # all requests are sent and none is answered yet
         may_answer.set()
         assert wait_until(lambda: len(inbox) >= 20, PATIENCE)
@@ -174,7 +174,7 @@ def test_a_requester_may_disappear(bus, other):
 
     def asked() -> bool:
         with pytest.raises(UserError, match="no service answers"):
-            bus.ask(TELEPORT, Request(), Reply, timeout=0.2)
+            bus.query(TELEPORT, Request(), Reply, timeout=0.2)
         return len(calls) > 0
 
     assert wait_until(asked, PATIENCE)
@@ -205,7 +205,7 @@ def test_closing_a_session_in_use(link):
         with suppress(zenoh.ZError):  # that it is closed
             while True:
                 with suppress(UserError):
-                    bus.ask(CONFIG, Request(), Reply, timeout=0.01)
+                    bus.query(CONFIG, Request(), Reply, timeout=0.01)
         ended.set()
 
     for _ in range(10):

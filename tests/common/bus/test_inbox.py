@@ -12,7 +12,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from common.bus.inbox import MAX_KEYS, Answer, Call, Inbox, Sample
+from common.bus.inbox import MAX_KEYS, Inbox, IncomingRequest, RequestResult, Sample
 from common.messages.requests import Reply
 from common.messages.topics import HEALTH, MAX_BYTES, SCAN, TELEPORT
 from tests.conftest import ROOT
@@ -87,7 +87,7 @@ def test_oversized_payloads():
     inbox, refused = Inbox(), []
     for size in (MAX_BYTES, MAX_BYTES + 1):
         inbox.put(sample("scan", bytes(size)))
-    inbox.put(Call(TELEPORT, bytes(64 * MAX_BYTES + 1), lambda _: None, refused.append))
+    inbox.put(IncomingRequest(TELEPORT, bytes(64 * MAX_BYTES + 1), lambda _: None, refused.append))
     assert (len(inbox), len(refused)) == (1, 1)
     assert inbox.oversized == {"scan": 1, "teleport": 1}
     assert inbox.received == {"scan": 2, "teleport": 1}
@@ -96,10 +96,10 @@ def test_oversized_payloads():
 def test_full_queues():
     inbox, refused = Inbox(capacity=1), []
     for _ in range(2):
-        inbox.put(Call(TELEPORT, b"", lambda _: None, refused.append))
+        inbox.put(IncomingRequest(TELEPORT, b"", lambda _: None, refused.append))
     assert refused == ["too many requests are waiting"]
-    inbox.put(Answer(TELEPORT, 7, Reply(reason="here").encode()))
-    inbox.put(Answer(TELEPORT, 8, bytes(64 * MAX_BYTES + 1)))
+    inbox.put(RequestResult(TELEPORT, 7, Reply(reason="here").encode()))
+    inbox.put(RequestResult(TELEPORT, 8, bytes(64 * MAX_BYTES + 1)))
     _, answer, large = (inbox.get(0) for _ in range(3))
     assert answer.reply() == Reply(reason="here")
     assert (large.number, large.payload) == (8, b"")
@@ -107,7 +107,7 @@ def test_full_queues():
 
 
 def test_undecodable_answers():
-    reply = Answer(TELEPORT, 1, b"\xc1").reply()
+    reply = RequestResult(TELEPORT, 1, b"\xc1").reply()
     assert not reply.ok
     assert "cannot be decoded" in reply.reason
 

@@ -15,8 +15,8 @@ from common.bus.security import (
     client_rules,
     credentials,
     may_answer,
-    may_ask,
     may_put,
+    may_query,
     router_rules,
     rules_of,
     service_of,
@@ -49,7 +49,7 @@ def test_roles_of_topics_and_queries():
         assert [role for role in ROLES if may_put(role, topic)], topic.name
     for query in QUERIES:
         assert [role for role in ROLES if may_answer(role, query)], query.name
-        assert [role for role in ROLES if may_ask(role, query)], query.name
+        assert [role for role in ROLES if may_query(role, query)], query.name
 
 
 def test_publishers_of_scans_and_commands():

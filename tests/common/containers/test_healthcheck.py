@@ -59,10 +59,10 @@ def test_invalid_heartbeat_files_are_ignored(tmp_path):
 def check(service, folder=None, **environment):
     """Exit status and message of the command."""
     clean = {k: v for k, v in os.environ.items() if not k.startswith("PRESAGE_")}
-    said = {"PYTHONPATH": str(ROOT), **({"PRESAGE_HEARTBEAT": str(folder)} if folder else {})}
+    variables = {"PYTHONPATH": str(ROOT), **({"PRESAGE_HEARTBEAT": str(folder)} if folder else {})}
     done = subprocess.run(
         [sys.executable, "-m", "common.containers.healthcheck", service],
-        env={**clean, **said, **environment}, capture_output=True, text=True, timeout=60,
+        env={**clean, **variables, **environment}, capture_output=True, text=True, timeout=60,
     )  # fmt: skip
     return done.returncode, done.stderr.strip()
 

@@ -95,10 +95,10 @@ def test_once_ends_with_the_worst_status(fleet, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("mode", "count", "told"), [("together", "2", "here robot-1,robot-2"), ("each", "1", "here None")]
+    ("mode", "count", "expected"), [("together", "2", "here robot-1,robot-2"), ("each", "1", "here None")]
 )
-def test_single_process(fleet, tmp_path, mode, count, told):
+def test_single_process(fleet, tmp_path, mode, count, expected):
     running = fleet(mode, count)
-    running.wait_for(told)
+    running.wait_for(expected)
     assert started(tmp_path, "robot-1" if count == "2" else "robot") == [running.child.pid]
     assert running.stop() == 0

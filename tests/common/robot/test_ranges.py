@@ -22,15 +22,15 @@ def test_driver_ranges_have_four_meanings(ranges, limits):
     least, most = limits
     scan = normalise_driver_ranges(ranges, least, most)
     assert scan.dtype == ranges.dtype
-    for said, found in zip(ranges.tolist(), scan.tolist(), strict=True):
-        if np.isnan(said) or -np.inf < said <= 0:
+    for sent, found in zip(ranges.tolist(), scan.tolist(), strict=True):
+        if np.isnan(sent) or -np.inf < sent <= 0:
             assert found == 0
-        elif said >= most:
+        elif sent >= most:
             assert found == np.inf
-        elif said < least:
+        elif sent < least:
             assert found == -np.inf
         else:
-            assert found == said
+            assert found == sent
     np.testing.assert_array_equal(normalise_driver_ranges(scan, least, most), scan)  # a scan is one already
 
 

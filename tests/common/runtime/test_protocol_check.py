@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from common.bus.bus import open_bus, wait_until
-from common.bus.inbox import Answer, Call, Inbox
+from common.bus.inbox import Inbox, IncomingRequest, RequestResult
 from common.errors import UserError
 from common.log import logger
 from common.messages.definitions import Health
@@ -69,11 +69,11 @@ class LateBus:
     def linked(self):
         return True
 
-    def ask_each(self, query, _request, inbox, _timeout):
+    def query_all(self, query, _request, inbox, _timeout):
         if self.unanswered:
             self.unanswered -= 1
         else:
-            inbox.put(Answer(query, 0, self.other.encode()))
+            inbox.put(RequestResult(query, 0, self.other.encode()))
         done = threading.Event()
         done.set()
         return done
@@ -105,7 +105,7 @@ def test_earlier_service_continues(process, bus, link):
         newcomer.serve(CONFIG, calls, "careless")
         newcomer.declare_alive("careless")
         call = calls.get(WAIT_TIMEOUT_S)
-        assert isinstance(call, Call)
+        assert isinstance(call, IncomingRequest)
         call.reply(reply_of("careless", OTHER).encode())
         small.wait_for(f"protocol {OTHER} in the careless")
     assert small.stop() == 0
@@ -119,7 +119,7 @@ def test_other_versions_are_one_warning(process, bus):
     small.wait_for("other versions in the foreign")
     small.wait_for("ready")
     inbox = Inbox()
-    assert bus.ask_each(CONFIG, Request(), inbox).wait(WAIT_TIMEOUT_S)  # both have turned since
+    assert bus.query_all(CONFIG, Request(), inbox).wait(WAIT_TIMEOUT_S)  # both have turned since
     replies = {answer.reply().service: answer.reply() for answer in iter(lambda: inbox.get(0), None)}
     assert replies["foreign"].versions["presage"] == "9.9"
     assert replies["small"].protocol == PROTOCOL
@@ -155,7 +155,7 @@ def test_both_instances_answer(link, bus):
         answers = Inbox()
 
         def both_received() -> bool:
-            done = bus.ask_each(CONFIG, Request(), answers, 1.0, "twice")
+            done = bus.query_all(CONFIG, Request(), answers, 1.0, "twice")
             calls = [inbox.get(2.0) for inbox in inboxes]
             for call in calls:
                 if call is not None:
@@ -166,4 +166,4 @@ def test_both_instances_answer(link, bus):
         assert wait_until(both_received, WAIT_TIMEOUT_S)
         assert len({answer.session for answer in iter(lambda: answers.get(0), None)}) == 2
     with pytest.raises(UserError, match="no service answers"):
-        bus.ask(CONFIG, Request(), ConfigReply, timeout=0.1, service="none")
+        bus.query(CONFIG, Request(), ConfigReply, timeout=0.1, service="none")

@@ -23,8 +23,8 @@ def test_the_default_robot(settings):
 
 @pytest.mark.parametrize("settings", ALL)
 def test_settings_define_the_robot(settings):
-    told = load_settings(settings, [*BURGER, "--turn-acceleration=3.2"]).build_robot()
-    assert told == Robot(
+    robot = load_settings(settings, [*BURGER, "--turn-acceleration=3.2"]).build_robot()
+    assert robot == Robot(
         drive="differential", radius=0.105, max_speed=0.22, max_turn=2.84, acceleration=0.5, turn_acceleration=3.2
     )
 

@@ -143,17 +143,17 @@ def test_requests_to_itself(small):
 
 def test_results_of_requests(small):
     def ask(x: float) -> Reply:
-        return small.bus.ask(TELEPORT, PoseRequest(pose=Pose(x=x, y=0.0)), Reply)
+        return small.bus.query(TELEPORT, PoseRequest(pose=Pose(x=x, y=0.0)), Reply)
 
     assert ask(3.0) == Reply(reason="at 3")
     assert ask(-3.0) == Reply(ok=False, reason="inside a wall")
     with pytest.raises(UserError, match="refused: small failed: ValueError: a bug in on_request"):
         ask(101.0)
     with pytest.raises(UserError, match=r"refused: PoseRequest\.pose"):
-        small.bus.ask(TELEPORT, Request(), Reply)
+        small.bus.query(TELEPORT, Request(), Reply)
     assert small.until(lambda h: any(row.key == "teleport" and row.undecodable == 1 for row in h.topics))
     assert small.latest.counters["failed"] == 1
-    reply = small.bus.ask(CONFIG, Request(), ConfigReply, service="small")
+    reply = small.bus.query(CONFIG, Request(), ConfigReply, service="small")
     config = json.loads(reply.config)
     assert (reply.service, config["robot"]) == ("small", small.bus.robot)
     assert config["connect"].startswith("tcp/127.0.0.1:")

@@ -10,8 +10,8 @@ import pytest
 from common.robot.scan_geometry import ALL_ROUND, Sector
 from services.controller.policies.exploration import (
     MIN_VIEWPOINT_NATS,
+    ExplorationState,
     FieldOfView,
-    Survey,
     choose_viewpoint,
     find_candidates,
     find_frontier,
@@ -26,7 +26,9 @@ from services.controller.policies.visibility import visible
 CELL, RADIUS = 0.1, 0.1
 
 
-def survey_of(rows: str, pose=(1.2, 1.2, 0.0), *, scans=(), arrivals=(), sector=ALL_ROUND, target=None) -> Survey:
+def exploration_state_of(
+    rows: str, pose=(1.2, 1.2, 0.0), *, scans=(), arrivals=(), sector=ALL_ROUND, target=None
+) -> ExplorationState:
     """What is known of a map that is drawn with # wall, . free, ? unknown, the highest row first.
 
     Each character is a square of 8 by 8 cells.
@@ -38,7 +40,7 @@ def survey_of(rows: str, pose=(1.2, 1.2, 0.0), *, scans=(), arrivals=(), sector=
     if len(walls):
         clearance = np.abs(centres[:, None] - walls).max(axis=2).min(axis=1) - CELL / 2
     graph = FreeSpaceGraph(FreeSpace(grid, clearance.reshape(grid.shape), drawn == "?"), RADIUS)
-    return Survey(
+    return ExplorationState(
         graph,
         np.reshape(scans, (-1, 3)),
         np.reshape(arrivals, (-1, 3)),
@@ -77,36 +79,36 @@ def test_cells_that_are_seen():
 
 
 def test_frontier():
-    survey = survey_of(CORRIDOR)
-    frontier = find_frontier(survey)
-    x, y = survey.graph.grid.centres(frontier.cells).T
+    state = exploration_state_of(CORRIDOR)
+    frontier = find_frontier(state)
+    x, y = state.graph.grid.centres(frontier.cells).T
     assert np.allclose(x, 5.65)
     assert np.allclose(np.sort(y), 0.85 + 0.1 * np.arange(8))
     assert np.allclose(frontier.nats, np.log(2))
-    assert not len(find_frontier(survey_of(CLOSED)).cells)
+    assert not len(find_frontier(exploration_state_of(CLOSED)).cells)
 
 
 @pytest.mark.parametrize(("yaw", "halved"), [(0.0, True), (np.pi, False)])
 def test_each_scan_that_saw_nothing_halves_the_information(yaw, halved):
     """Only scans that looked there count."""
-    frontier = find_frontier(survey_of(CORRIDOR, scans=[(1.2, 1.2, yaw)], sector=Sector(0.0, np.pi / 2)))
+    frontier = find_frontier(exploration_state_of(CORRIDOR, scans=[(1.2, 1.2, yaw)], sector=Sector(0.0, np.pi / 2)))
     assert np.allclose(frontier.nats.max(), np.log(2))  # the cells beside the walls are not in full view
     assert bool(np.isclose(frontier.nats.min(), np.log(2) / 2)) is halved
 
 
 def test_information_of_a_viewpoint_is_that_of_the_cells_it_sees():
     """Against a line from each place to each cell, sampled densely."""
-    survey = survey_of(CROSSROADS, pose=(2.8, 2.0, 0.0))
-    frontier, known = find_frontier(survey), known_space(survey.graph)
-    candidates = find_candidates(survey, frontier, known)
+    state = exploration_state_of(CROSSROADS, pose=(2.8, 2.0, 0.0))
+    frontier, known = find_frontier(state), known_space(state.graph)
+    candidates = find_candidates(state, frontier, known)
     assert len(candidates.places) > 3
-    centres, free = survey.graph.grid.centres(frontier.cells), survey.graph.free
+    centres, free = state.graph.grid.centres(frontier.cells), state.graph.free
     opaque = (free.unknown | (free.clearance < 0)).ravel()
     for place, row in zip(candidates.places, candidates.sees, strict=True):
         for cell, says in zip(centres, row, strict=True):
             line = place + np.linspace(0, 1, 200)[:, None] * (cell - place)
             line = line[np.hypot(*(line - cell).T) > 2 * CELL]
-            clear = not opaque[survey.graph.grid.cell_of(line)].any()
+            clear = not opaque[state.graph.grid.cell_of(line)].any()
             assert clear or not says  # what is seen is in sight; at the edge of a shadow the reverse need not hold
 
 
@@ -133,12 +135,12 @@ def test_tour_is_the_shortest_of_all(seed):
 
 def test_choice_is_the_first_place_of_the_tour_of_least_expected_free_energy():
     """Against all orders of the viewpoints: both ends are worth the way, so the shorter tour decides."""
-    survey = survey_of(CROSSROADS, pose=(2.8, 2.0, 0.0))
-    viewpoint = choose_viewpoint(survey)
+    state = exploration_state_of(CROSSROADS, pose=(2.8, 2.0, 0.0))
+    viewpoint = choose_viewpoint(state)
     assert viewpoint is not None
     assert viewpoint.nats >= MIN_VIEWPOINT_NATS - 1.5
-    known = known_space(survey.graph)
-    stops = [survey.pose[:2], *viewpoint.tour, survey.home]
+    known = known_space(state.graph)
+    stops = [state.pose[:2], *viewpoint.tour, state.home]
 
     def length(order):
         tour = [stops[0], *(stops[k] for k in order), stops[-1]]
@@ -154,14 +156,14 @@ def test_choice_is_the_first_place_of_the_tour_of_least_expected_free_energy():
 
 
 def test_nothing_is_left_to_see():
-    assert choose_viewpoint(survey_of(CLOSED)) is None
+    assert choose_viewpoint(exploration_state_of(CLOSED)) is None
     # The robot has arrived where it sees the end of the corridor, and the map is still the same.
-    survey = survey_of(CORRIDOR)
-    viewpoint = choose_viewpoint(survey)
+    state = exploration_state_of(CORRIDOR)
+    viewpoint = choose_viewpoint(state)
     assert viewpoint is not None
-    assert choose_viewpoint(survey_of(CORRIDOR, arrivals=[(*viewpoint.pose[:2], 0.0)] * 2)) is None
+    assert choose_viewpoint(exploration_state_of(CORRIDOR, arrivals=[(*viewpoint.pose[:2], 0.0)] * 2)) is None
 
 
 def test_unreachable_places_are_not_chosen():
     shut = CORRIDOR.replace("#......?", "#..#...?")
-    assert choose_viewpoint(survey_of(shut)) is None
+    assert choose_viewpoint(exploration_state_of(shut)) is None

@@ -11,7 +11,7 @@ import torch
 
 from common.errors import UserError
 from services.estimator.paper.checkpoint import Checkpoint
-from services.estimator.paper.decoder import Shape
+from services.estimator.paper.decoder import DecoderShape
 from services.estimator.paper.training import Trainer, TrainingParameters
 from tests.estimator.paper.training_scans import normalisation, posed_scans
 
@@ -20,7 +20,7 @@ RECIPE = {"epochs": 3, "world": "room"}
 
 
 def trainer() -> Trainer:
-    return Trainer(Shape(64, 8, 2), normalisation(), TrainingParameters(epochs=3, batch=20), DATA, DATA)
+    return Trainer(DecoderShape(64, 8, 2), normalisation(), TrainingParameters(epochs=3, batch=20), DATA, DATA)
 
 
 @pytest.fixture

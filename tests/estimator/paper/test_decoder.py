@@ -8,12 +8,12 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.estimator.paper.decoder import Decoder, PaperModel, Shape
+from services.estimator.paper.decoder import Decoder, DecoderShape, PaperModel
 from services.estimator.paper.training import Trainer, TrainingParameters, usable_ranges
 from tests.estimator.paper.training_scans import normalisation, posed_scans
 
 TRAIN, TEST = posed_scans(400, 1), posed_scans(100, 2)
-SHAPE = Shape(64, hidden=32, channels=4)
+SHAPE = DecoderShape(64, hidden=32, channels=4)
 PARAMETERS = TrainingParameters(epochs=4, batch=50, learning_rate=5e-3)
 
 
@@ -24,7 +24,7 @@ def trainer() -> Trainer:
 @pytest.mark.parametrize("beams", [2, 64, 181, 622, 811])
 def test_number_of_beams(beams):
     torch.manual_seed(0)
-    assert Decoder(Shape(beams))(torch.zeros(3, 2)).shape == (3, beams)
+    assert Decoder(DecoderShape(beams))(torch.zeros(3, 2)).shape == (3, beams)
 
 
 @given(st.floats(0.5, 5.5), st.floats(0.5, 3.5))
@@ -45,7 +45,11 @@ def test_jacobian(x, y):
 
 def test_learning():
     one = Trainer(
-        Shape(64, 64, 8), normalisation(), TrainingParameters(epochs=40, batch=50, learning_rate=5e-3), TRAIN, TEST
+        DecoderShape(64, 64, 8),
+        normalisation(),
+        TrainingParameters(epochs=40, batch=50, learning_rate=5e-3),
+        TRAIN,
+        TEST,
     )
     one.run()
     flat = np.abs(TEST.ranges - np.median(TRAIN.ranges, axis=0)).mean()  # error of a constant prediction

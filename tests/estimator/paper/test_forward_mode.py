@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import nn
 
-from services.estimator.paper.decoder import Decoder, Shape
+from services.estimator.paper.decoder import Decoder, DecoderShape
 from services.estimator.paper.forward_mode import ForwardMode
 
 UNIT = st.floats(-1, 1)
@@ -18,7 +18,7 @@ UNIT = st.floats(-1, 1)
 @given(seed=st.integers(0, 100), beams=st.integers(2, 90), channels=st.integers(1, 5), x=UNIT, y=UNIT)
 def test_same_as_torch(seed, beams, channels, x, y):
     torch.manual_seed(seed)
-    decoder = Decoder(Shape(beams, hidden=7, channels=channels)).double()
+    decoder = Decoder(DecoderShape(beams, hidden=7, channels=channels)).double()
     position = torch.tensor([x, y], dtype=torch.float64)
     ranges, tangents = ForwardMode(decoder.layers())(position.numpy())
     with torch.no_grad():
@@ -29,7 +29,7 @@ def test_same_as_torch(seed, beams, channels, x, y):
 
 
 def test_single_precision():
-    decoder = Decoder(Shape(33, hidden=7, channels=3))
+    decoder = Decoder(DecoderShape(33, hidden=7, channels=3))
     ranges, tangents = ForwardMode(decoder.layers())(np.zeros(2))
     assert ranges.dtype == tangents.dtype == np.float32
 

@@ -8,13 +8,13 @@ import pytest
 from common.geometry import se2
 from common.geometry.world import load_world
 from services.estimator.paper import weights
-from services.estimator.paper.perception import Descent, PaperEstimator
+from services.estimator.paper.perception import Descent, PaperPerception
 from services.estimator.shared.model_folder import SHIPPED
 from tests.estimator.models import HEADING, ROOM, ExactModel
 
 
-def estimator(pose, **settings) -> PaperEstimator:
-    return PaperEstimator(ExactModel(ROOM), 0.02, ROOM.bounds, np.array([*pose, HEADING]), Descent(**settings))
+def estimator(pose, **settings) -> PaperPerception:
+    return PaperPerception(ExactModel(ROOM), 0.02, ROOM.bounds, np.array([*pose, HEADING]), Descent(**settings))
 
 
 def scan(pose, rng) -> np.ndarray:
@@ -101,7 +101,7 @@ def test_shipped_weights(beams):
         pose = np.array([*truth, card.heading])
         exact = world.ray_distances(se2.compose(pose, card.scanner.mount)[None], card.scanner.angles())[0]
         start = np.array([*world.center(), card.heading])
-        found = PaperEstimator(model, card.test_l1_mean, world.bounds, start, metric=model.norm.metric)
+        found = PaperPerception(model, card.test_l1_mean, world.bounds, start, metric=model.norm.metric)
         for _ in range(25):
             found.update(exact + 0.02 * rng.standard_normal(beams))
         errors.append(np.hypot(*(found.pose - pose)[:2]))

@@ -6,15 +6,15 @@ import numpy as np
 
 from common.geometry.world import World
 from services.estimator.paper.decoder import Normalisation
-from services.estimator.paper.training import Data
+from services.estimator.paper.training import TrainingData
 from tests.estimator.models import HEADING, ROOM, ExactModel
 
 
-def posed_scans(count: int, seed: int, world: World = ROOM) -> Data:
+def posed_scans(count: int, seed: int, world: World = ROOM) -> TrainingData:
     """Scans from random places at one heading."""
     places = world.sample_free(count, np.random.default_rng(seed), 0.3)
     poses = np.column_stack([places, np.full(count, HEADING)])
-    return Data(poses, ExactModel(world).ranges(poses))
+    return TrainingData(poses, ExactModel(world).ranges(poses))
 
 
 def normalisation(world: World = ROOM) -> Normalisation:

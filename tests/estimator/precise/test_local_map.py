@@ -12,7 +12,7 @@ from common.geometry.world import World
 from lab.accuracy.scenes import Scene
 from services.estimator.precise.gauss_newton import View
 from services.estimator.precise.likelihood import Likelihood
-from services.estimator.precise.local_map import MIN_DISTANCE_M, KeyScan, LocalMap, LocalScan, _beams_towards
+from services.estimator.precise.local_map import MIN_DISTANCE_M, LocalMap, LocalMapScan, LocalScan, _beams_towards
 from services.estimator.precise.motion_model import Candidate
 from services.estimator.shared.generative_models import RayCaster
 from tests.estimator.models import ROOM
@@ -33,7 +33,7 @@ def local_map(scene, *poses, frame=(0.0, 0.0, 0.0)):
     for pose in poses:
         scan = view(scene, pose)
         nothing, everything = np.zeros(len(scan.ranges), np.bool_), np.ones(len(scan.ranges), np.bool_)
-        key = KeyScan(made.to_local(np.array(pose)), scan, nothing, everything, 0.0, 0.0)
+        key = LocalMapScan(made.to_local(np.array(pose)), scan, nothing, everything, 0.0, 0.0)
         made.add(key, np.array(pose), np.diag([1e-4, 1e-4, 1e-5]))
     return made
 
@@ -125,7 +125,7 @@ def test_surface_in_place_of_another():
     seen, arrived = made.find_old_beams(here, scan, mapped)
     assert np.flatnonzero(~seen).tolist() == list(range(100, 150))
     assert not arrived.any()
-    made.add(KeyScan(here, scan, nothing, mapped, 0.0, 0.0), HERE, np.diag([1e-4, 1e-4, 1e-5]))
+    made.add(LocalMapScan(here, scan, nothing, mapped, 0.0, 0.0), HERE, np.diag([1e-4, 1e-4, 1e-5]))
     assert made.find_old_beams(here, view(scene, HERE), mapped)[0].all()
 
 

@@ -17,7 +17,7 @@ from lab.accuracy.report import _markdown, bench_accuracy, cell, scanners_of
 from lab.accuracy.runner import AccuracyJob, _row
 from lab.accuracy.scenes import TWINS, Scene, alike, twin_of, twin_path
 from services.estimator.shared.interface import Hypothesis, Posterior
-from services.simulator.odometry import Drift
+from services.simulator.odometry import OdometryNoise
 
 CONSOLE = Console(quiet=True)
 
@@ -52,10 +52,10 @@ def test_bound_by_finite_differences():
 def test_bound_along_a_path():
     scene = Scene.of(load_world("maze"), 200, 0)
     path = scene.path(3)
-    alone, along = bound.single(scene, path), bound.recursive(scene, path, Drift())
+    alone, along = bound.single(scene, path), bound.recursive(scene, path, OdometryNoise())
     assert (bound.position(along) <= bound.position(alone) + 1e-12).all()
     still = np.tile(path[:1], (20, 1))
-    last = bound.recursive(scene, still, Drift(0, 0, 0, 0))[-1]
+    last = bound.recursive(scene, still, OdometryNoise(0, 0, 0, 0))[-1]
     assert last == pytest.approx(bound.single(scene, path[:1], 20)[0], rel=1e-3)
 
 
@@ -64,7 +64,7 @@ def test_bound_with_a_prior():
     path = scene.path(2)
     one = bound.single(scene, path)
     start = np.diag([1e-3, 1e-3, 1e-3]) ** 2
-    first = bound.recursive(scene, path, Drift(), start)[0]
+    first = bound.recursive(scene, path, OdometryNoise(), start)[0]
     assert np.linalg.inv(first) == pytest.approx(np.linalg.inv(one[0]) + np.linalg.inv(start), rel=1e-6)
     known = bound.heading_known(one)
     assert (bound.position(known) <= bound.position(one)).all()
@@ -72,7 +72,9 @@ def test_bound_with_a_prior():
 
 
 def test_median_of_the_bound():
-    assert bound.median(np.tile(np.diag([1.0, 1.0, 1.0]), (3, 1, 1))) == pytest.approx(np.sqrt(np.log(4)), rel=0.03)
+    assert bound.median_error(np.tile(np.diag([1.0, 1.0, 1.0]), (3, 1, 1))) == pytest.approx(
+        np.sqrt(np.log(4)), rel=0.03
+    )
 
 
 def test_blocked_ranges():

@@ -7,10 +7,9 @@ import pytest
 import torch
 
 from common.errors import UserError
-from lab.accuracy.panorama import Shape, train_panorama
-from services.estimator.paper.decoder import Decoder, PaperModel, use_one_core
-from services.estimator.paper.decoder import Shape as PaperShape
-from services.estimator.paper.estimator import PaperScans
+from lab.accuracy.panorama import PanoramaShape, train_panorama
+from services.estimator.paper.decoder import Decoder, DecoderShape, PaperModel, use_one_core
+from services.estimator.paper.estimator import PaperGenerativeModel
 from tests.estimator.models import HEADING, ROOM, SCANNER
 from tests.estimator.paper.training_scans import normalisation
 
@@ -26,7 +25,9 @@ def lasers(count, seed):
 
 def trained(steps=150, seed=0, **shape):
     poses = lasers(300, 0)
-    return train_panorama(Shape(**{**SMALL, **shape}), poses, ANGLES, ROOM.ray_distances(poses, ANGLES), steps, seed)
+    return train_panorama(
+        PanoramaShape(**{**SMALL, **shape}), poses, ANGLES, ROOM.ray_distances(poses, ANGLES), steps, seed
+    )
 
 
 @pytest.mark.parametrize("shape", [{}, {"inputs": "grid"}, {"activation": "relu", "loss": "l1"}])
@@ -64,8 +65,8 @@ def test_jacobian():
 
 def test_decoder_of_the_paper():
     torch.manual_seed(0)
-    model = PaperModel(Decoder(PaperShape(SCANNER.beams, 16, 4)).double(), normalisation())
-    scans = PaperScans(model, SCANNER, HEADING, 0.3)
+    model = PaperModel(Decoder(DecoderShape(SCANNER.beams, 16, 4)).double(), normalisation())
+    scans = PaperGenerativeModel(model, SCANNER, HEADING, 0.3)
     laser = np.array([[2.0, 1.5, HEADING + 1.0]])  # the heading is ignored, because the decoder is trained for one only
     expected = scans.expect(laser, SCANNER.angles())
     base = np.array([2.0, 1.5, 0.0]) - [*(np.array([np.cos(HEADING + 1), np.sin(HEADING + 1)]) * SCANNER.mount[0]), 0]

@@ -12,7 +12,7 @@ from lab.exploration.drive import explore, measure
 from lab.exploration.experiment import EXPLORERS, summarise, table
 from lab.exploration.nearest_frontier import nearest_frontier
 from services.controller.policies.exploration import choose_viewpoint
-from tests.controller.policies.test_exploration import CLOSED, CROSSROADS, survey_of
+from tests.controller.policies.test_exploration import CLOSED, CROSSROADS, exploration_state_of
 
 # A room, and behind a wall with a door another one that cannot be seen from the start.
 ROOMS = World(
@@ -34,11 +34,11 @@ def test_two_rooms_are_explored():
 
 
 def test_the_baseline_drives_to_the_nearest_frontier():
-    survey = survey_of(CROSSROADS, pose=(2.8, 2.0, 0.0))
-    viewpoint = nearest_frontier(survey)
+    state = exploration_state_of(CROSSROADS, pose=(2.8, 2.0, 0.0))
+    viewpoint = nearest_frontier(state)
     assert viewpoint is not None
     assert viewpoint.pose[1] > 2.4  # the way up and left is shorter than that down and right
-    assert nearest_frontier(survey_of(CLOSED)) is None
+    assert nearest_frontier(exploration_state_of(CLOSED)) is None
 
 
 def test_reachable_area():

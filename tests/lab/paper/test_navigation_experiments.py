@@ -102,13 +102,13 @@ def test_missing_message():
 
 
 def test_estimator_without_a_service(tmp_path):
-    job = navigation.NavigationJob(0, 1, estimators=("particle-filter, heading known",))
+    job = navigation.JourneyJob(0, 1, estimators=("particle-filter, heading known",))
     with pytest.raises(UserError, match="heading known"):
         navigation.run(job, 1, tmp_path, 1, QUIET)
 
 
 def test_e3_through_real_processes(tmp_path):
-    job = navigation.NavigationJob(0, 7, apart=3.0, estimators=("precise",), field=ExperimentWorld(beams=101))
+    job = navigation.JourneyJob(0, 7, apart=3.0, estimators=("precise",), field=ExperimentWorld(beams=101))
     result = navigation.run(job, 1, tmp_path, 1, QUIET)
     summary = result.summary["precise"]
     assert (summary["reached"], summary["trials_with_contact"]) == (1, 0)
@@ -143,7 +143,7 @@ def test_iterations_of_the_paper():
     Each iteration reduces the distance to 80 %.
     """
     stiff = Linear.beams
-    outcome = linear_travel(teleports.Steps(alpha=0.5 / stiff, beta=1.0, gamma=0.4 / stiff))
+    outcome = linear_travel(teleports.StepSizes(alpha=0.5 / stiff, beta=1.0, gamma=0.4 / stiff))
     ratios = outcome.distance[1:] / outcome.distance[:-1]
     assert ratios == pytest.approx(0.8)
     assert outcome.reached
@@ -152,7 +152,7 @@ def test_iterations_of_the_paper():
 
 def test_summed_action():
     stiff = Linear.beams
-    steps = teleports.Steps(alpha=0.5 / stiff, beta=1.0, gamma=0.02 / stiff, form="sum")
+    steps = teleports.StepSizes(alpha=0.5 / stiff, beta=1.0, gamma=0.02 / stiff, form="sum")
     summed = linear_travel(steps)
     speed = -np.diff(summed.distance)
     assert summed.reached
@@ -161,7 +161,7 @@ def test_summed_action():
 
 def test_printed_signs_diverge():
     stiff = Linear.beams
-    steps = teleports.Steps(alpha=0.1 / stiff, beta=1.0, gamma=0.05 / stiff, form="printed")
+    steps = teleports.StepSizes(alpha=0.1 / stiff, beta=1.0, gamma=0.05 / stiff, form="printed")
     printed = linear_travel(steps, limit=8)
     assert printed.error[-1] > 2.0
     assert printed.error[-1] > printed.error[2]
@@ -183,9 +183,9 @@ def test_displacement_in_free_space(x, y, dx, dy):
 
 def test_small_step_sizes(tmp_path, monkeypatch):
     few = [
-        stepping.Setting("displacement", teleports.Steps(stepping.ALPHA, 1.0, 5e-3)),
-        stepping.Setting("displacement", teleports.Steps(stepping.ALPHA, 1.0, 1e-3)),
-        stepping.Setting("velocity", teleports.Steps(beta=0.0, gamma=0.3)),
+        stepping.Setting("displacement", teleports.StepSizes(stepping.ALPHA, 1.0, 5e-3)),
+        stepping.Setting("displacement", teleports.StepSizes(stepping.ALPHA, 1.0, 1e-3)),
+        stepping.Setting("velocity", teleports.StepSizes(beta=0.0, gamma=0.3)),
     ]
     monkeypatch.setattr(stepping, "settings", lambda: few)
     job = stepping.StepSizeJob(0, 1, limit=60, velocity_limit=40)

@@ -14,7 +14,7 @@ from common.geometry.world import load_world, save_world
 from lab.accuracy.scenes import Scene
 from lab.integrity.maps import noisy_grid
 from lab.peers import experiment
-from lab.peers.scans import map_file, read_posed_scans
+from lab.peers.scans import map_file, read_trial_scans
 
 BEAMS = 120
 
@@ -62,7 +62,7 @@ def test_run(folder, tmp_path):
 
 
 def test_drives_for_learning(folder):
-    scans = read_posed_scans(folder / "track.npz")
+    scans = read_trial_scans(folder / "track.npz")
     drive = scans.drive(range(2))
     assert drive.ranges.shape == (112, BEAMS)
     assert (np.diff(drive.stamps) > 0).all()

@@ -29,7 +29,7 @@ from lab.real_logs.filter_tuning import starting_point
 from presage.learning.train_drive import TrainDriveOptions as Training
 from presage.learning.train_drive import split, train_from_drive
 from presage.logs.log import Reading
-from services.estimator.particle_filter import Settings as ParticleSettings
+from services.estimator.particle_filter import ParticleFilterSettings
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.field_learning import Recipe
 from services.estimator.precise.motion_model import MotionNoise
@@ -123,16 +123,16 @@ def test_motion_model_of_amcl(folder):
     job = StretchJob(
         str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), "amcl-defaults", LASER, 100
     )
-    assert create_estimator(job).settings == ParticleSettings(robot_model_type="omni")
+    assert create_estimator(job).settings == ParticleFilterSettings(robot_model_type="omni")
 
 
 def test_odometry_of_a_kidnapping():
     rng = np.random.default_rng(0)
     odom = np.cumsum(rng.normal(0, 0.1, (20, 3)), axis=0)
-    told = hide_kidnapping(odom, 12)
-    assert told[:12] == pytest.approx(odom[:12])
-    assert told[12] == pytest.approx(odom[11])
-    assert se2.between(told[12], told[15]) == pytest.approx(se2.between(odom[12], odom[15]))
+    hidden = hide_kidnapping(odom, 12)
+    assert hidden[:12] == pytest.approx(odom[:12])
+    assert hidden[12] == pytest.approx(odom[11])
+    assert se2.between(hidden[12], hidden[15]) == pytest.approx(se2.between(odom[12], odom[15]))
 
 
 def test_time_of_a_kidnapping(folder):

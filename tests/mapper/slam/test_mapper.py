@@ -14,14 +14,14 @@ from lab.accuracy.scenes import Scene
 from services.mapper.slam.mapper import Mapper
 from services.mapper.slam.segments import KEY_SCANS_PER_SEGMENT
 from services.mapper.slam.trajectory import build_trajectory
-from services.simulator.odometry import Drift, Odometer
+from services.simulator.odometry import Odometer, OdometryNoise
 from tests.mapper.drives import driven
 
 OFFICE = load_world("office")
 
 
 def odometry(truth):
-    odometer, poses = Odometer(Drift(), np.random.default_rng(0)), [np.zeros(3)]
+    odometer, poses = Odometer(OdometryNoise(), np.random.default_rng(0)), [np.zeros(3)]
     for before, after in pairwise(truth):
         odometer.move(before, after)
         poses.append(odometer.pose)

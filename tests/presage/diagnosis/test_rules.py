@@ -12,8 +12,8 @@ from common.messages.topics import BELIEF, CMD_VEL, SCAN, TOPICS, TRUTH
 from common.runtime.liveness import REPORT_TIMEOUT_S, RESULT_TIMEOUT_S, RobotLiveness
 from common.runtime.protocol_check import build_config_reply
 from presage.diagnosis.bus_observation import BusObservation, check_endpoint
-from presage.diagnosis.rules import MAX_CLOCK_DIFFERENCE_S, evaluate
-from services.recorder.files.message_counts import Sequence
+from presage.diagnosis.rules import MAX_CLOCK_DIFFERENCE_S, evaluate_observation
+from services.recorder.files.message_counts import SequenceNumbers
 
 SECOND = 1_000_000_000
 NAMES = ("simulator", "estimator", "controller")
@@ -34,9 +34,9 @@ def observed(alive=NAMES, *, seconds=3.0, reporting=NAMES) -> BusObservation:
         seen.replies[name] = [build_config_reply(name, "{}", 5.0)]
         seen.health[name] = [health(name, n * SECOND, received=100 + 15 * n) for n in (1, 2, 3)]
         seen.liveness.add_health(seen.health[name][0][1], seconds)
-    numbers = seen.sequences[SCAN.key("robot")] = Sequence()
+    numbers = seen.sequences[SCAN.key("robot")] = SequenceNumbers()
     for number in (7, 8, 9, 0, 1, 2):  # its publisher was restarted
-        numbers.see(number)
+        numbers.add(number)
     return seen
 
 
@@ -46,11 +46,17 @@ def scan_message(**changes) -> Scan:
 
 
 def findings(seen: BusObservation, code: str):
-    return [finding for finding in evaluate(seen, build_config_reply("doctor", "{}")) if finding.code == code]
+    return [
+        finding for finding in evaluate_observation(seen, build_config_reply("doctor", "{}")) if finding.code == code
+    ]
 
 
 def problems(seen: BusObservation) -> set[str]:
-    return {finding.code for finding in evaluate(seen, build_config_reply("doctor", "{}")) if finding.ok is False}
+    return {
+        finding.code
+        for finding in evaluate_observation(seen, build_config_reply("doctor", "{}"))
+        if finding.ok is False
+    }
 
 
 @pytest.mark.parametrize(

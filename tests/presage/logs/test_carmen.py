@@ -26,8 +26,8 @@ def write(tmp_path, lines, pack=None, name="drive.log"):
     return file
 
 
-def read(path, **said):
-    log = open_log(path, Reading(**said))
+def read(path, **options):
+    log = open_log(path, Reading(**options))
     return log, list(log.valid_scans())
 
 
@@ -37,9 +37,9 @@ def close(poses, wanted):
 
 @pytest.mark.parametrize("kind", ["FLASER", "ROBOTLASER1", "OLD", "RAWLASER1"])
 def test_kinds_of_lines(tmp_path, kind):
-    said = FOV if kind == "FLASER" else {}
-    said |= {"mount": MOUNT} if kind == "RAWLASER1" else {}
-    log, sweeps = read(write(tmp_path, carmen(kind)), **said)
+    options = FOV if kind == "FLASER" else {}
+    options |= {"mount": MOUNT} if kind == "RAWLASER1" else {}
+    log, sweeps = read(write(tmp_path, carmen(kind)), **options)
     assert log.scans == SCANS
     kept = sweeps[:-1] if kind == "RAWLASER1" else sweeps  # no ODOM comes after the last scan
     np.testing.assert_allclose([sweep.stamp_ns for sweep in sweeps], STAMPS, atol=1000)

@@ -17,7 +17,7 @@ from presage.logs.importing import ImportOptions, import_command
 from presage.logs.log import Reading
 from presage.logs.options import LogSettings
 from presage.logs.scan_files import read_scans
-from presage.recordings.info import survey
+from presage.recordings.info import collect_facts
 from presage.recordings.session_figure import draw_session
 from presage.replay.localize import LocalizeOptions, build_estimator_options, localize
 from services.recorder.reader import read_recording
@@ -86,7 +86,7 @@ def test_recording_equals_log(tmp_path, name):
 def test_recording_is_complete(tmp_path):
     out, _ = imported(make(tmp_path, "mcap"), robot="truck")
     recording = read_recording(out)
-    facts = survey(recording, check=True)
+    facts = collect_facts(recording, check=True)
     assert facts.complete
     assert facts.robots == ["truck"]
     assert facts.missing == 0

@@ -14,8 +14,8 @@ from presage.logs.resampling import resample
 from tests.presage.logs.drives import ANGLES, BEAMS, MOUNT, SCANS, STAMPS, Bag, believed, odom, ranges, truth, write_bag
 
 
-def read(path, **said):
-    log = open_log(path, Reading(**said))
+def read(path, **options):
+    log = open_log(path, Reading(**options))
     return log, list(log.valid_scans())
 
 

@@ -15,7 +15,7 @@ from common.messages.definitions import Odom, Pose, Twist
 from common.messages.topics import BELIEF, ODOM, SCAN, TRUTH
 from presage.cli.main import app
 from presage.recordings import info as information
-from presage.recordings.info import survey
+from presage.recordings.info import collect_facts
 from presage.recordings.printing import echo_either, info
 from services.recorder.reader import read_recording
 from tests.lab.navigation import drives as driven
@@ -31,7 +31,7 @@ def odoms(*numbers, began=driven.BEGAN_NS):
 
 
 def facts_of(path, check=None):
-    facts = survey(read_recording(path), check)
+    facts = collect_facts(read_recording(path), check)
     return facts, {row.key: row for row in facts.topics}
 
 
@@ -75,7 +75,7 @@ def test_counts_of_the_recorder(tmp_path):
     recording = read_recording(driven.write(tmp_path / "run.mcap", ODOM))
     counted = {"received": 9, "written": 8, "dropped": 1, "oversized": 0, "gaps": 2, "missing": 3, "restarts": 0}
     recording.metadata["counters"] = {KEY: json.dumps(counted), SCAN.key("rob"): "nonsense"}
-    rows = {row.key: row for row in survey(recording, check=False).topics}
+    rows = {row.key: row for row in collect_facts(recording, check=False).topics}
     assert (rows[KEY].messages, rows[KEY].dropped, rows[KEY].gaps, rows[KEY].missing) == (0, 1, 2, 3)
     assert rows[KEY].counters["received"] == 9
     assert rows[SCAN.key("rob")].counters == {}

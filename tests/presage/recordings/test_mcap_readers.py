@@ -8,7 +8,7 @@ from rich.console import Console
 
 from common.messages.topics import TOPICS
 from presage.recordings.foxglove import export_foxglove
-from services.recorder.files.parts import Limits, PartsWriter
+from services.recorder.files.parts import PartLimits, PartsWriter
 from services.recorder.files.writer import RecordingWriter
 from services.recorder.reader import read_recording
 from services.recorder.recover import recover
@@ -33,7 +33,7 @@ def split(folder):
     def part(number):
         return RecordingWriter(folder / f"run-{number}.mcap")
 
-    return fill(PartsWriter(part, Limits(seconds=0.4), lambda: {"end": {"a": "b"}}))
+    return fill(PartsWriter(part, PartLimits(seconds=0.4), lambda: {"end": {"a": "b"}}))
 
 
 def recovered(folder):

@@ -55,7 +55,7 @@ def test_lines_of_panels(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("missing", "world", "said"),
+    ("missing", "world", "expected"),
     [
         (TOPICS, False, ["world and no path", "predicted scan", "belief", "truth beside beliefs"]),
         ((TRUTH,), True, ["truth beside beliefs"]),
@@ -67,13 +67,13 @@ def test_lines_of_panels(tmp_path):
     ],
     ids=["everything", "truth", "belief", "prediction", "scan", "goal", "world"],
 )
-def test_missing_topics(tmp_path, missing, world, said):
+def test_missing_topics(tmp_path, missing, world, expected):
     figure = figure_of(load_session(made.write(tmp_path / "part.mcap", *missing, world=world)), "part")
     png = BytesIO()
     figure.savefig(png, dpi=30)
     png.seek(0)
     assert imread(png)[..., :3].std() > 0.01
-    assert texts(figure) == " | ".join(f"no {what} in this recording" for what in said)
+    assert texts(figure) == " | ".join(f"no {what} in this recording" for what in expected)
 
 
 def test_beliefs_without_free_energy(tmp_path):

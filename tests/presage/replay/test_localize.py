@@ -200,9 +200,9 @@ def test_summary_of_selected_scans(tmp_path, capsys):
     out = tmp_path / "poses.json"
     file = npz(tmp_path, reference=reference)
     rows = localize(job(file, start=0.1, every=4, out=out), Console(width=150))  # scans 2 and 6
-    said = capsys.readouterr().out
-    assert "2 of 10 scans: 2 tracking" in said
-    middle, most = (float(said.split("reference: ")[1].split(",")[k].split()[0]) for k in (0, 2))
+    output = capsys.readouterr().out
+    assert "2 of 10 scans: 2 tracking" in output
+    middle, most = (float(output.split("reference: ")[1].split(",")[k].split()[0]) for k in (0, 2))
     assert [middle, most] == pytest.approx([4e3 * 2**0.5, 6e3 * 2**0.5], abs=20)  # mm
     data = json.loads(out.read_text())
     assert data["rows"] == rows

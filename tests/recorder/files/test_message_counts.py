@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from common.messages.definitions import Goal, Health, Pose, TopicHealth, Truth, Twist
 from services.recorder.files.message_counts import (
     MAX_INSTANCES,
-    Count,
-    Ledger,
-    Sequence,
+    KeyCounts,
+    MessageCounts,
+    SequenceNumbers,
     as_metadata,
     from_metadata,
     sequence_of,
@@ -24,9 +24,9 @@ SCAN, GOAL, TRUTH = "presage/r/scan", "presage/r/goal", "presage/r/truth"
 
 
 def counts_of(numbers):
-    sequence = Sequence()
+    sequence = SequenceNumbers()
     for number in numbers:
-        sequence.see(number)
+        sequence.add(number)
     return sequence.gaps, sequence.missing, sequence.restarts, sequence.reordered
 
 
@@ -54,33 +54,35 @@ def test_missing_numbers(numbers):
 
 
 def test_ledger():
-    ledger = Ledger()
+    message_counts = MessageCounts()
     for number in (0, 1, 5):
-        ledger.see(TRUTH, Truth(stamp_ns=0, seq=number, pose=Pose(x=0.0, y=0.0), twist=Twist()).encode())
-    ledger.see(TRUTH, b"\xc1")
+        message_counts.add(TRUTH, Truth(stamp_ns=0, seq=number, pose=Pose(x=0.0, y=0.0), twist=Twist()).encode())
+    message_counts.add(TRUTH, b"\xc1")
     for number in (10**18, 5):  # goals have several publishers, so that their numbers are not counted
-        ledger.see(GOAL, Goal(stamp_ns=0, seq=number, pose=Pose(x=0.0, y=0.0)).encode())
-    counts = ledger.counts({TRUTH: 6, SCAN: 2}, {SCAN: 1}, {SCAN: 1})
-    assert counts[TRUTH] == Count(received=6, written=4, unreadable=1, gaps=1, missing=3)
-    assert counts[GOAL] == Count(written=2)
-    assert counts[SCAN] == Count(received=2, dropped=1, oversized=1)
+        message_counts.add(GOAL, Goal(stamp_ns=0, seq=number, pose=Pose(x=0.0, y=0.0)).encode())
+    counts = message_counts.counts({TRUTH: 6, SCAN: 2}, {SCAN: 1}, {SCAN: 1})
+    assert counts[TRUTH] == KeyCounts(received=6, written=4, unreadable=1, gaps=1, missing=3)
+    assert counts[GOAL] == KeyCounts(written=2)
+    assert counts[SCAN] == KeyCounts(received=2, dropped=1, oversized=1)
     assert from_metadata(as_metadata(counts) | {"a": "no JSON", "b": '{"unknown": 1}'}) == counts
 
 
 def test_two_instances():
-    ledger, key = Ledger(), "presage/r/health/recorder"
+    message_counts, key = MessageCounts(), "presage/r/health/recorder"
     for first, second in enumerate([0, 1, 2, 4]):
         for name, number in (("a", 100 + first), ("b", second)):
-            ledger.see(key, Health(stamp_ns=0, seq=number, service="recorder", uptime=1, instance=name).encode())
-    lost = ledger.lost(key)
+            message_counts.add(
+                key, Health(stamp_ns=0, seq=number, service="recorder", uptime=1, instance=name).encode()
+            )
+    lost = message_counts.lost(key)
     assert (lost.gaps, lost.missing, lost.restarts, lost.reordered) == (1, 1, 0, 0)
 
 
 def test_invented_instances():
-    ledger = Ledger()
+    message_counts = MessageCounts()
     for number in range(3 * MAX_INSTANCES):
-        ledger.see(SCAN, msgpack.packb({"seq": 0, "instance": str(number)}))
-    assert len(ledger.sequences[SCAN]) == MAX_INSTANCES + 1
+        message_counts.add(SCAN, msgpack.packb({"seq": 0, "instance": str(number)}))
+    assert len(message_counts.sequences[SCAN]) == MAX_INSTANCES + 1
 
 
 @given(st.binary(max_size=100))
@@ -92,7 +94,7 @@ def test_any_payload(payload):
 @pytest.mark.parametrize("numbers", [[0, 2**63 - 1], [0, 2**64 - 1, 5], [0, 2**62] * 4])
 def test_forged_numbers(numbers):
     """The counts still fit into a health message."""
-    ledger = Ledger()
+    message_counts = MessageCounts()
     for number in numbers:
-        ledger.see(SCAN, msgpack.packb({"seq": number}))
-    assert TopicHealth(key="k", missing=ledger.lost(SCAN).missing).missing > 0
+        message_counts.add(SCAN, msgpack.packb({"seq": number}))
+    assert TopicHealth(key="k", missing=message_counts.lost(SCAN).missing).missing > 0

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from common.errors import UserError
 from common.messages.definitions import Pose, Truth, Twist
 from common.messages.topics import SCAN, TRUTH
-from services.recorder.files.parts import Limits, PartsWriter
+from services.recorder.files.parts import PartLimits, PartsWriter
 from services.recorder.reader import read_recording
 from services.recorder.recording import parts_of
 from services.recorder.settings import RecorderSettings
@@ -31,7 +31,7 @@ def writer_in(folder, limits, **changes):
 @given(count=st.integers(1, 30), seconds=st.integers(1, 30))
 def test_parts_by_time(tmp_path_factory, count, seconds):
     folder = tmp_path_factory.mktemp("parts")
-    writer = writer_in(folder, Limits(seconds=seconds))
+    writer = writer_in(folder, PartLimits(seconds=seconds))
     writer.metadata("presage", {"robot": "r"})
     writer.metadata("presage", {"robot": "r", "later": "yes"})
     writer.attachment("world.yaml", b"name: x", "application/yaml", 1)
@@ -55,7 +55,7 @@ def test_parts_by_time(tmp_path_factory, count, seconds):
 
 
 def test_parts_by_size(tmp_path):
-    writer = writer_in(tmp_path, Limits(size=20_000), compression="none", chunk_size=1024)
+    writer = writer_in(tmp_path, PartLimits(size=20_000), compression="none", chunk_size=1024)
     for number in range(500):
         writer.write(TRUTH, KEY, truth(number), number, number)
     files = writer.finish()
@@ -64,7 +64,7 @@ def test_parts_by_size(tmp_path):
 
 
 def test_next_name_is_taken(tmp_path):
-    writer = writer_in(tmp_path, Limits(seconds=1))
+    writer = writer_in(tmp_path, PartLimits(seconds=1))
     (tmp_path / "run-002.mcap").write_bytes(b"another file")
     writer.write(TRUTH, KEY, truth(0), 0, 0)
     with pytest.raises(UserError, match=r"run-002\.mcap: is there already"):

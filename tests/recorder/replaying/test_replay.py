@@ -108,7 +108,7 @@ def control(bus):
     """A function that sends a request to the replay."""
 
     def send(action, value=0.0):
-        return bus.ask(PLAYER, PlayerRequest(action=action, value=value), PlayerReply, timeout=20)
+        return bus.query(PLAYER, PlayerRequest(action=action, value=value), PlayerReply, timeout=20)
 
     return send
 
@@ -244,15 +244,15 @@ def test_hostile_requests(start, bus, control):
 
 def test_descriptions(start, bus, session):
     start(replace(ON_REQUEST, paused=True), session)
-    reply = bus.ask(CONFIG, Request(), ConfigReply, timeout=20, service="replay")
+    reply = bus.query(CONFIG, Request(), ConfigReply, timeout=20, service="replay")
     assert json.loads(reply.config)["file"] == str(session)
-    world = bus.ask(WORLD, Request(), WorldReply, timeout=20)
+    world = bus.query(WORLD, Request(), WorldReply, timeout=20)
     assert (world.world, world.scanner, world.robot.radius) == (sessions.WORLD, sessions.SCANNER, 0.3)
 
 
 def test_recording_without_world(start, bus):
     start(ON_REQUEST)
-    reply = bus.ask(WORLD, Request(), WorldReply, timeout=20)
+    reply = bus.query(WORLD, Request(), WorldReply, timeout=20)
     assert (reply.ok, reply.reason) == (False, "run.mcap does not hold its world")
 
 
@@ -263,7 +263,7 @@ def test_world_beside_a_simulator(start, session, bus):
     start(replace(ON_REQUEST, paused=True, force=True), session)
     answering = threading.Thread(target=lambda: inbox.get(20).reply(WorldReply(ok=False, reason="mine").encode()))
     answering.start()
-    assert bus.ask(WORLD, Request(), WorldReply, timeout=20).reason == "mine"
+    assert bus.query(WORLD, Request(), WorldReply, timeout=20).reason == "mine"
     answering.join()
 
 

@@ -12,7 +12,7 @@ import pytest
 from common.geometry.occupancy_grid import OccupancyGrid
 from common.messages.definitions import Goal, Map, Plan, Pose, Twist
 from common.messages.topics import BELIEF, CMD_VEL, GOAL, MAP, ODOM, PLAN, PREDICTION, PREFERENCE, SCAN, STATUS, TRUTH
-from services.viewer.state.frames import encode
+from services.viewer.state.frames import encode_frame
 from services.viewer.state.history import ChartSample, History
 from services.viewer.state.replay_moments import QUIET_TIME_S
 from services.viewer.state.robot_view import ANSWER_TIMEOUT_S, RobotView
@@ -85,7 +85,9 @@ def test_frames():
 
 @pytest.mark.parametrize("name", ["a", "ab", "abc", "abcd"])
 def test_binary_layout(name):
-    data = encode({name: "ü"}, {"ranges": np.array([1, np.inf], np.float32), "sigma": np.array([-np.inf], np.float32)})
+    data = encode_frame(
+        {name: "ü"}, {"ranges": np.array([1, np.inf], np.float32), "sigma": np.array([-np.inf], np.float32)}
+    )
     (length,) = struct.unpack_from("<I", data)
     assert (4 + length) % 4 == 0
     header = json.loads(data[4 : 4 + length])
@@ -95,7 +97,7 @@ def test_binary_layout(name):
 
 def test_frames_have_finite_numbers():
     with pytest.raises(ValueError, match="JSON"):
-        encode({"error": float("nan")}, {})
+        encode_frame({"error": float("nan")}, {})
 
 
 def test_waiting_for_answers():

@@ -17,7 +17,7 @@ from common.geometry import se2
 from services.estimator.precise.gauss_newton import View, difference, polish
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.motion_model import MotionNoise
-from services.estimator.precise.settings import Settings
+from services.estimator.precise.settings import PreciseSettings
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -50,10 +50,10 @@ class Calibration:
     nees_mean: float  # ideal: 3
     coverage: tuple[tuple[float, float], ...]  # pairs of a range's cumulative probability and the share of beams below
 
-    def settings(self) -> Settings:
+    def settings(self) -> PreciseSettings:
         """Parameters of the estimator, with shares of explained beams relative to the usual one in this place."""
-        default = Settings()
-        return Settings(
+        default = PreciseSettings()
+        return PreciseSettings(
             min_explained_share=0.77 * self.usual,
             max_explained_drop=max(default.max_explained_drop, self.usual - self.unusual),
             inflation=self.inflation,

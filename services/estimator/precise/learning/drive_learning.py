@@ -36,7 +36,7 @@ Report = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
-class Learned:
+class LearningResult:
     """Result of learning from a drive."""
 
     model: FieldModel
@@ -47,7 +47,7 @@ class Learned:
 
 def learn_drive(
     drive: ReferenceDrive, recipe: Recipe, simulated: Beams | None, report: Report, *, replayed: bool = False
-) -> Learned:
+) -> LearningResult:
     """Learns the model of a drive, and calibrates it.
 
     ``simulated`` are beams simulated in a map of the place, used where the drive saw nothing. If they are ``replayed``
@@ -85,7 +85,7 @@ def learn_drive(
         visited = np.concatenate([visited, free_places(final, np.unique(simulated.starts, axis=0))])
     places = seed_places(final.field, visited, final.seen)
     report("learned", 1.0)
-    return Learned(final, places, calibration, np.abs(held_out.ranges[both] - expected.ranges[both]))
+    return LearningResult(final, places, calibration, np.abs(held_out.ranges[both] - expected.ranges[both]))
 
 
 def _learn_model(
@@ -94,7 +94,7 @@ def _learn_model(
     measured = Beams.of(drive.poses, drive.mount, drive.angles, drive.ranges)
     beams = measured
     if simulated is not None and replayed:
-        beams = measured.joined(still_valid(measured, simulated, recipe.resolution))
+        beams = measured.joined(remove_contradicted(measured, simulated, recipe.resolution))
     elif simulated is not None:
         beams = measured.joined(_outside_of(measured, simulated))
     return learn_model(beams, recipe, report)
@@ -119,7 +119,7 @@ def _outside_of(measured: Beams, simulated: Beams) -> Beams:
     return simulated.part(~seen_cells(measured).contains(simulated.ends()))
 
 
-def replay(model: GenerativeModel, places: Array, drive: ReferenceDrive, samples: int, seed: int) -> Beams:
+def replay_model(model: GenerativeModel, places: Array, drive: ReferenceDrive, samples: int, seed: int) -> Beams:
     """Scans of the drive's scanner as a model predicts them, at random ``places`` of (S, 2) m that it knows."""
     rng = np.random.default_rng(seed)
     lasers = np.column_stack([rng.choice(places, samples), rng.uniform(-np.pi, np.pi, samples)])
@@ -128,7 +128,7 @@ def replay(model: GenerativeModel, places: Array, drive: ReferenceDrive, samples
     return Beams.of(lasers, np.zeros(3), drive.angles, np.where(known, expected.ranges, -np.inf))
 
 
-def still_valid(measured: Beams, replayed: Beams, h: float) -> Beams:
+def remove_contradicted(measured: Beams, replayed: Beams, h: float) -> Beams:
     """The beams replayed from a former model that the measured ones do not contradict.
 
     Left out are those that end at a surface that is gone, or would pass through one that is new: from any side, also

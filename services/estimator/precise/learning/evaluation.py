@@ -19,7 +19,7 @@ NOISE_DRAWS = 4  # noisy copies of each test scan
 
 
 @dataclass(frozen=True)
-class Quality:
+class ModelErrors:
     """Errors of a model, as the model card states them."""
 
     range_error_median: float  # m
@@ -30,7 +30,7 @@ class Quality:
     inflation: float  # factor on the covariance: mean normalised squared error of poses from noisy scans, at least 1
 
 
-def evaluate(
+def evaluate_model(
     model: GenerativeModel,
     poses: Array,
     mount: Array,
@@ -39,7 +39,7 @@ def evaluate(
     range_max: float,
     sigma: float,
     relative: float = 0.0,
-) -> Quality:
+) -> ModelErrors:
     """Compares the model with noiseless scans ``ranges`` (N, B) m at base_link poses (N, 3).
 
     ``sigma`` m is the scanner's noise, ``relative`` its part that grows with the range, as a share of the range.
@@ -61,7 +61,7 @@ def evaluate(
                 misfits.append(float(off @ np.linalg.pinv(covariance, hermitian=True) @ off) / 3)
             else:
                 offsets.append(float(np.hypot(off[0], off[1])))
-    return Quality(
+    return ModelErrors(
         float(np.median(error)),
         float(error.mean()),
         float((error > 0.05).mean()),

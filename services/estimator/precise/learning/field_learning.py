@@ -18,7 +18,7 @@ from scipy import ndimage
 
 from common.geometry.se2 import Array, compose, wrap
 from common.robot.stray_beams import has_neighbours
-from services.estimator.precise.field import CLASSES, SEEN_CELL_M, DistanceField, Floats, Seen
+from services.estimator.precise.field import CLASSES, SEEN_CELL_M, DistanceField, Floats, SeenCells
 from services.estimator.precise.global_seeds import SEED_SPACING_M, thin_places
 from services.estimator.precise.learning.beam_cells import mark_seen_cells
 from services.estimator.precise.learning.surfaces import (
@@ -71,22 +71,22 @@ def learn_field(
     return DistanceField(phi, field.origin, field.resolution)
 
 
-def seen_cells(beams: Beams) -> Seen:
+def seen_cells(beams: Beams) -> SeenCells:
     """The cells in which the beams passed or ended."""
     ends = beams.ends()
     low = np.minimum(ends.min(0), beams.starts.min(0)) - SEEN_CELL_M
     shape = np.ceil((np.maximum(ends.max(0), beams.starts.max(0)) - low) / SEEN_CELL_M).astype(int)[::-1] + 1
     cells = np.zeros(shape, np.bool_)
     mark_seen_cells(beams.starts - low, beams.unit(), beams.ranges, SEEN_CELL_M, cells)
-    return Seen(cells, (float(low[0]), float(low[1])))
+    return SeenCells(cells, (float(low[0]), float(low[1])))
 
 
-def seed_places(field: DistanceField, visited: Array, seen: Seen | None = None) -> Array:
+def seed_places(field: DistanceField, visited: Array, seen: SeenCells | None = None) -> Array:
     """Places (K, 2), m in map, where a search for the laser begins: visited ones, and those `reachable` from them."""
     return thin_places(np.concatenate([visited, reachable(field, visited, seen)]), SEED_SPACING_M)
 
 
-def reachable(field: DistanceField, visited: Array, seen: Seen | None = None) -> Array:
+def reachable(field: DistanceField, visited: Array, seen: SeenCells | None = None) -> Array:
     """Places (K, 2), m in map, that are connected with the visited places (N, 2) through free space.
 
     They are the nodes of the field at least `SEED_CLEARANCE_M` from surfaces, and within the cells ``seen`` if given.

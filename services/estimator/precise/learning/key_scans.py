@@ -50,8 +50,8 @@ class KeyScan:
         return int(x // size), int(y // size), int(yaw // (2 * np.pi / HEADINGS))
 
 
-class KeyScans:
-    """Collects key scans of one scanner; the newest of each place and heading."""
+class KeyScanCollector:
+    """Collects the key scans of one scanner, and keeps the newest one of each place and heading."""
 
     def __init__(self, angles: Array, mount: Array, range_max: float) -> None:
         """``angles`` (B,) rad are those of the scanner's beams, ``mount`` (3,) is the laser in base_link."""

@@ -16,8 +16,8 @@ from services.estimator.precise.learning.drive_learning import (
     HELD_OUT_EVERY,
     free_places,
     learn_model,
-    replay,
-    still_valid,
+    remove_contradicted,
+    replay_model,
 )
 from services.estimator.precise.learning.field_learning import (
     MAX_ERROR_M,
@@ -49,7 +49,7 @@ ALIGNMENT_DEVIATION = np.array([0.05, 0.05, 0.02])  # m, m, rad: of the poses of
 
 
 @dataclass(frozen=True)
-class Version:
+class ModelVersion:
     """A new version of a model."""
 
     model: FieldModel
@@ -61,7 +61,7 @@ class Version:
 
 def learn_version(
     original: GenerativeModel, places: Array, present: GenerativeModel, keys: ReferenceDrive, recipe: Recipe = RECIPE
-) -> Version | None:
+) -> ModelVersion | None:
     """Learns a field from key scans and the ``original`` model, which knows the surroundings of ``places`` (S, 2) m.
 
     Returns None if the model in use, ``present``, predicts the key scans as well.
@@ -69,7 +69,7 @@ def learn_version(
     tracked = remove_moving_objects(keys)
     sigma = estimate_noise(tracked.ranges, tracked.angles)
     error = _estimate_map_error(original, tracked, sigma)
-    replayed = replay(original, places, tracked, min(len(places), MAX_REPLAYED_SCANS), recipe.seed)
+    replayed = replay_model(original, places, tracked, min(len(places), MAX_REPLAYED_SCANS), recipe.seed)
     beside, elsewhere = _split_replayed_beams(replayed, tracked, error, recipe.seed)
     aligned = tracked
     for _ in range(ALIGNMENTS):
@@ -92,7 +92,7 @@ def learn_version(
     starts = seed_places(final.field, np.concatenate([visited, free_places(final, places)]), final.seen)
     starts, scales = (values.astype(np.float32).astype(np.float64) for values in (starts, scales))  # as published
     model = replace(final, field=final.field.with_solids(starts), scales=scales, ripple=ripple)
-    return Version(model, Seeds.at(model, starts), len(keys.poses), errors, present_errors)
+    return ModelVersion(model, Seeds.at(model, starts), len(keys.poses), errors, present_errors)
 
 
 def remove_moving_objects(keys: ReferenceDrive) -> ReferenceDrive:
@@ -152,7 +152,7 @@ def _learn(keys: ReferenceDrive, replayed: Beams, recipe: Recipe, epochs: int) -
     beams = replayed
     for part in np.array_split(np.arange(len(keys.poses)), epochs):
         measured = Beams.of(keys.poses[part], keys.mount, keys.angles, keys.ranges[part])
-        beams = measured.joined(still_valid(measured, beams, recipe.resolution))
+        beams = measured.joined(remove_contradicted(measured, beams, recipe.resolution))
     return learn_model(beams, recipe)
 
 

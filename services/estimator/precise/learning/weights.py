@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from common.errors import UserError, first_fault
 from common.geometry.world import World
 from common.robot.scanner import Scanner
-from services.estimator.precise.field import CLASSES, DistanceField, FieldModel, Seen
+from services.estimator.precise.field import CLASSES, DistanceField, FieldModel, SeenCells
 from services.estimator.precise.global_seeds import PANORAMA_PHASES, RANKED_HEADINGS, Seeds
 from services.estimator.precise.learning.calibration import Calibration
 from services.estimator.shared.digest import check_digest, sha256
@@ -178,11 +178,11 @@ def _load_card(path: Path) -> FieldCard:
         raise UserError(f"model card {path.with_suffix('.json')}: {first_fault(error)}") from None
 
 
-def _seen(tensors: Tensors) -> Seen | None:
+def _seen(tensors: Tensors) -> SeenCells | None:
     if "seen" not in tensors:
         return None
     x, y = tensors["seen_origin"].astype(float).tolist()
-    return Seen(tensors["seen"].astype(bool), (x, y))
+    return SeenCells(tensors["seen"].astype(bool), (x, y))
 
 
 def train_command(world: str, folder: Path = SHIPPED) -> str:

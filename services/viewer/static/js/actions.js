@@ -1,9 +1,9 @@
-// What a visitor can ask for, and how the answer is told.
+// The requests that a visitor can send, and the messages that show their results.
 
 import { moved } from "./geometry.js";
 
 const at = ({ x, y }) => `${x.toFixed(2)}, ${y.toFixed(2)} m`;
-const neat = (pose) => Object.fromEntries(Object.entries(pose).filter(([, v]) => Number.isFinite(v)).map(([k, v]) => [k, Math.round(v * 1e4) / 1e4]));
+const rounded = (pose) => Object.fromEntries(Object.entries(pose).filter(([, v]) => Number.isFinite(v)).map(([k, v]) => [k, Math.round(v * 1e4) / 1e4]));
 
 export class Actions {
   constructor(store, connection, toast) {
@@ -12,45 +12,45 @@ export class Actions {
     this.changed = () => {};
   }
 
-  /** Ask, and say how it went; `done` in words where the answer has none. */
-  async ask(action, fields, done, { quiet = false } = {}) {
-    const answer = await this.connection.ask(action, fields);
-    if (!answer.ok) this.toast(answer.reason || `${action} was refused`, false);
-    else if (!quiet) this.toast(answer.reason || done, true);
+  /** Sends a request and shows its result: the reply's reason, else the text `done`. */
+  async request(action, fields, done, { quiet = false } = {}) {
+    const reply = await this.connection.request(action, fields);
+    if (!reply.ok) this.toast(reply.reason || `${action} was refused`, false);
+    else if (!quiet) this.toast(reply.reason || done, true);
     this.changed();
-    return answer;
+    return reply;
   }
 
   watch(robot) {
-    return this.ask("watch", { robot }, "", { quiet: true });
+    return this.request("watch", { robot }, "", { quiet: true });
   }
 
   goal(pose) {
-    return this.ask("goal", neat(pose), `Goal set: ${at(pose)}`);
+    return this.request("goal", rounded(pose), `Goal set: ${at(pose)}`);
   }
 
   cancel() {
-    return this.ask("cancel", {}, "Goal cancelled");
+    return this.request("cancel", {}, "Goal cancelled");
   }
 
   explore() {
-    return this.ask("explore", {}, "Exploring");
+    return this.request("explore", {}, "Exploring");
   }
 
   teleport(pose) {
-    return this.ask("teleport", neat(pose), `Carried to ${at(pose)}; the estimator is not informed`);
+    return this.request("teleport", rounded(pose), `Carried to ${at(pose)}; the estimator is not informed`);
   }
 
   localise() {
-    return this.ask("localise", {}, "Searching the whole map");
+    return this.request("localise", {}, "Searching the whole map");
   }
 
   addObstacle(obstacle) {
-    return this.ask("obstacle", { action: "add", name: obstacle.name, obstacle }, `${obstacle.name} added; the robot's map does not know it`);
+    return this.request("obstacle", { action: "add", name: obstacle.name, obstacle }, `${obstacle.name} added; the robot's map does not know it`);
   }
 
   moveObstacle(obstacle, last) {
-    return this.ask("obstacle", { action: "move", name: obstacle.name, obstacle }, `${obstacle.name} moved`, { quiet: !last });
+    return this.request("obstacle", { action: "move", name: obstacle.name, obstacle }, `${obstacle.name} moved`, { quiet: !last });
   }
 
   turnObstacle(obstacle, turn) {
@@ -58,49 +58,49 @@ export class Actions {
   }
 
   removeObstacle(name) {
-    return this.ask("obstacle", { action: "remove", name }, `${name} removed`);
+    return this.request("obstacle", { action: "remove", name }, `${name} removed`);
   }
 
   async pause(paused) {
-    const answer = await this.ask(paused ? "pause" : "resume", {}, paused ? "Paused" : "Running", { quiet: true });
-    if (answer.ok) Object.assign(this.store, { paused, pausedAt: performance.now() });
+    const reply = await this.request(paused ? "pause" : "resume", {}, paused ? "Paused" : "Running", { quiet: true });
+    if (reply.ok) Object.assign(this.store, { paused, pausedAt: performance.now() });
     this.changed();
   }
 
   async step() {
-    const answer = await this.ask("step", {}, "", { quiet: true });
-    if (answer.ok) this.store.pausedAt = performance.now();
+    const reply = await this.request("step", {}, "", { quiet: true });
+    if (reply.ok) this.store.pausedAt = performance.now();
   }
 
   async reset() {
-    const answer = await this.ask("reset", {}, "Simulation restarted");
-    if (answer.ok) this.store.forget();
+    const reply = await this.request("reset", {}, "Simulation restarted");
+    if (reply.ok) this.store.forget();
   }
 
   speed(factor) {
-    return this.ask("speed", { factor }, `${factor} × real time`);
+    return this.request("speed", { factor }, `${factor} × real time`);
   }
 
   async record(action) {
-    const answer = await this.ask("record", { action }, action === "start" ? "Recording" : "Recording saved", { quiet: action === "status" });
-    if (answer.ok && typeof answer.recording === "boolean") this.recording = answer.recording;
-    else if (answer.ok && action !== "status") this.recording = action === "start";
+    const reply = await this.request("record", { action }, action === "start" ? "Recording" : "Recording saved", { quiet: action === "status" });
+    if (reply.ok && typeof reply.recording === "boolean") this.recording = reply.recording;
+    else if (reply.ok && action !== "status") this.recording = action === "start";
     this.changed();
-    return answer;
+    return reply;
   }
 
-  /** The state of the recorder, without a word about it. */
+  /** Updates the state of the recorder without showing a message. */
   async recordStatus() {
-    const answer = await this.connection.ask("record", { action: "status" });
-    this.recording = Boolean(answer.ok && answer.recording);
+    const reply = await this.connection.request("record", { action: "status" });
+    this.recording = Boolean(reply.ok && reply.recording);
     this.changed();
   }
 
   saveMap(name) {
-    return this.ask("save_map", { name }, "Map saved");
+    return this.request("save_map", { name }, "Map saved");
   }
 
   drive(twist) {
-    return this.connection.ask("drive", twist);
+    return this.connection.request("drive", twist);
   }
 }

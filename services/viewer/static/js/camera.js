@@ -1,14 +1,14 @@
-// From metres to pixels and back; pan, zoom, fit, follow.
+// Converts between metres and pixels; pans, zooms, fits, follows.
 
-const MIN = 2, MAX = 2000; // pixels a metre
+const MIN = 2, MAX = 2000; // pixels per metre
 
 export class Camera {
   constructor() {
     this.width = this.height = 1;
-    this.x = this.y = 0; // m, in the middle of the picture
+    this.x = this.y = 0; // m, at the centre of the view
     this.scale = 40;
     this.padding = { left: 24, right: 24, top: 24, bottom: 24 };
-    this.fitted = null; // bounds that are kept in view until a visitor moves the view
+    this.fitted = null; // bounds that stay in view until the visitor moves the view
     this.follow = false;
   }
 
@@ -26,7 +26,7 @@ export class Camera {
     if (this.fitted) this.fit(this.fitted);
   }
 
-  /** The whole of x0, y0, x1, y1 in view, clear of what floats over the map. */
+  /** Shows the whole rectangle x0, y0, x1, y1, beside the controls that cover parts of the map. */
   fit(bounds) {
     const [x0, y0, x1, y1] = bounds;
     const { left, right, top, bottom } = this.padding;
@@ -38,7 +38,7 @@ export class Camera {
     this.follow = false;
   }
 
-  /** The point under the pointer stays where it is. */
+  /** Zooms; the point under the pointer stays where it is. */
   zoomAt(px, py, factor) {
     const [x, y] = this.toWorld(px, py);
     this.scale = clamp(this.scale * factor);
@@ -57,9 +57,9 @@ export class Camera {
     this.follow = false;
   }
 
-  /** A step towards the followed point; whether another one is needed. */
-  approach(x, y, still) {
-    const share = still ? 1 : 0.2;
+  /** Moves a step towards the followed point; returns whether another step is needed. */
+  approach(x, y, atOnce) {
+    const share = atOnce ? 1 : 0.2;
     this.x += (x - this.x) * share;
     this.y += (y - this.y) * share;
     this.fitted = null;

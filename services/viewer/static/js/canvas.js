@@ -1,7 +1,7 @@
-// A canvas that is as sharp as the screen.
+// Canvases at the resolution of the screen, and the axes of plots.
 
-/** Calls `resized` with each new size in CSS pixels; the context is scaled to them. */
-export function sharp(canvas, resized) {
+/** Gives the canvas the resolution of the screen; calls `resized` with each new size in CSS pixels. */
+export function fitToScreen(canvas, resized) {
   const context = canvas.getContext("2d");
   const state = { context, width: 0, height: 0 };
   const fit = () => {
@@ -16,24 +16,24 @@ export function sharp(canvas, resized) {
     Object.assign(state, { width, height });
     resized(state);
   };
-  new ResizeObserver(fit).observe(canvas); // says the first size too
+  new ResizeObserver(fit).observe(canvas); // reports the first size too
   return state;
 }
 
-/** A function that draws once in the next picture, however often it is asked; it may ask again. */
-export function eachPicture(draw) {
-  let asked = false;
+/** Returns a function that schedules `draw` for the next animation frame; repeated calls draw only once. */
+export function oncePerFrame(draw) {
+  let scheduled = false;
   return () => {
-    if (asked) return;
-    asked = true;
+    if (scheduled) return;
+    scheduled = true;
     requestAnimationFrame((now) => {
-      asked = false;
+      scheduled = false;
       draw(now);
     });
   };
 }
 
-/** Round tick values between two numbers, about `count` of them. */
+/** About `count` round tick values between two numbers. */
 export function ticks(low, high, count) {
   const raw = (high - low) / Math.max(1, count);
   if (!(raw > 0) || !Number.isFinite(raw)) return [];
@@ -44,7 +44,7 @@ export function ticks(low, high, count) {
   return values;
 }
 
-/** A tick's label: no more digits than its step needs. */
+/** Label of a tick, with no more digits than the step needs. */
 export function tickLabel(value, step) {
   const digits = Math.max(0, Math.ceil(-Math.log10(step) - 1e-9) + (Math.abs((step / 10 ** Math.floor(Math.log10(step))) - 2.5) < 1e-6 ? 1 : 0));
   return (Math.abs(value) < step * 1e-6 ? 0 : value).toFixed(Math.min(6, digits)).replace("-", "−");
@@ -52,13 +52,13 @@ export function tickLabel(value, step) {
 
 const axisFont = (colours) => `10.5px ${colours.sans}`;
 
-/** Pixels left of a plot that hold its level lines' labels, `[value, text]` each, and `gap`; at least `least`. */
+/** Width in px that the labels of a plot's grid lines, `[value, text]` each, and a `gap` need; at least `least`. */
 export function leftMargin(ctx, lines, colours, gap, least) {
   ctx.font = axisFont(colours);
   return Math.max(least, ...lines.map(([, text]) => Math.ceil(ctx.measureText(text).width) + gap + 2));
 }
 
-/** Begins the path of a plot's grid with its level lines, `[value, text]` each, `gap` px between text and plot. */
+/** Begins the path of a plot's grid with its horizontal lines, `[value, text]` each; `gap` px from text to plot. */
 export function beginGrid(ctx, plot, lines, y, colours, gap) {
   ctx.strokeStyle = colours.line;
   ctx.fillStyle = colours["ink-3"];

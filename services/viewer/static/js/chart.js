@@ -1,19 +1,19 @@
-// Numbers over the last minute on a canvas; one cursor for all charts.
+// Charts of the last minute; one cursor for all charts.
 
-import { beginGrid, leftMargin, sharp, tickLabel, ticks } from "./canvas.js";
+import { beginGrid, leftMargin, fitToScreen, tickLabel, ticks } from "./canvas.js";
 import { palette } from "./theme.js";
 import { WINDOW } from "./store.js";
 
 const LEFT = 44, GAP = 6, RIGHT = 8, TOP = 6, BOTTOM = 17;
 
-/** The time under the pointer, for all charts; null where it is elsewhere. */
+/** The time under the pointer, shared by all charts; null if it is over none. */
 export const cursor = { t: null, changed: () => {} };
 
 export class Chart {
-  /** `series`: {key, tone, width?, fill?}; `log`, `low`, `high` (never narrower), `axis` false leaves the times out. */
+  /** `series`: {key, tone, width?, fill?}. Options: `log`; `low` and `high`, which are always in view; `axis: false` hides the times. */
   constructor(canvas, store, series, options = {}) {
     Object.assign(this, { store, series, options, left: LEFT });
-    this.surface = sharp(canvas, () => this.draw());
+    this.surface = fitToScreen(canvas, () => this.draw());
     canvas.addEventListener("pointermove", (event) => this.point(event.offsetX));
     canvas.addEventListener("pointerleave", () => this.point(null));
   }
@@ -33,7 +33,7 @@ export class Chart {
     return times.length ? times[times.length - 1] : null;
   }
 
-  /** Lowest and highest value in view, with some air; null without any. */
+  /** Lowest and highest value to show, with a margin; null if there are no values. */
   range() {
     let low = Infinity, high = -Infinity;
     for (const { key } of this.series) {
@@ -47,9 +47,9 @@ export class Chart {
     const { log, low: least = Infinity, high: most = -Infinity } = this.options;
     low = Math.min(low, least);
     high = Math.max(high, most);
-    if (log) return [least, 10 ** Math.ceil(Math.log10(Math.max(high, 10 * least)) - 1e-9)]; // less than `low` is drawn as it
-    const air = Math.max((high - low) * 0.08, Math.abs(high) * 0.002, 1e-6);
-    return [least === low ? low : low - air, high + air];
+    if (log) return [least, 10 ** Math.ceil(Math.log10(Math.max(high, 10 * least)) - 1e-9)]; // smaller values are drawn at `low`
+    const margin = Math.max((high - low) * 0.08, Math.abs(high) * 0.002, 1e-6);
+    return [least === low ? low : low - margin, high + margin];
   }
 
   draw() {
@@ -184,7 +184,7 @@ export class Chart {
   }
 }
 
-/** The sample nearest to a time; -1 of none. */
+/** Index of the sample nearest to a time; -1 if there are no samples. */
 export function indexAt(times, t) {
   let low = 0, high = times.length - 1;
   while (low < high) {

@@ -1,23 +1,23 @@
-// The socket: questions with answers, and its own return after a loss.
+// The web socket: requests with replies, and reconnection after a loss.
 
 import { decode } from "./protocol.js";
 
-const SILENCE = 6000; // ms without a message: the other side is gone, services are told every second
-const ANSWER = 20000; // ms until a question counts as unanswered
-const WAITS = [400, 800, 1500, 3000, 5000]; // ms between attempts
+const SILENCE_TIMEOUT = 6000; // ms without a message after which the connection counts as lost; one comes every second
+const REQUEST_TIMEOUT = 20000; // ms
+const RETRY_DELAYS = [400, 800, 1500, 3000, 5000]; // ms, after the first and the following failures
 
 export class Connection {
   /** `on.message(json)`, `on.frame(frame)`, `on.state("open" | "waiting", ms until the next attempt)`. */
   constructor(on) {
     this.on = on;
-    this.questions = new Map();
+    this.pending = new Map();
     this.nextId = 1;
     this.failures = 0;
     this.undecodable = 0;
     this.socket = null;
     addEventListener("online", () => this.retry());
     document.addEventListener("visibilitychange", () => document.hidden || this.retry());
-    setInterval(() => this.watch(), 1000);
+    setInterval(() => this.checkSilence(), 1000);
     this.connect();
   }
 
@@ -33,12 +33,12 @@ export class Connection {
     const socket = new WebSocket(address);
     socket.binaryType = "arraybuffer";
     this.socket = socket;
-    this.heard = performance.now();
+    this.lastMessageAt = performance.now();
     socket.onmessage = (event) => {
-      this.heard = performance.now();
+      this.lastMessageAt = performance.now();
       if (this.socket === socket) this.receive(event.data);
     };
-    socket.onclose = () => this.socket === socket && this.lost();
+    socket.onclose = () => this.socket === socket && this.reconnect();
   }
 
   receive(data) {
@@ -50,55 +50,55 @@ export class Connection {
       return;
     }
     if (!message?.type) this.undecodable += 1;
-    else if (message.type === "answer") this.answered(message);
+    else if (message.type === "answer") this.settle(message);
     else if (message.type === "frame") this.on.frame(message);
     else {
       if (message.type === "hello" && this.failures >= 0) {
-        this.failures = -1; // from here on a loss is a new one
+        this.failures = -1; // a loss from here on counts as the first
         this.on.state("open", 0);
       }
       this.on.message(message);
     }
   }
 
-  lost() {
+  reconnect() {
     this.socket = null;
     this.failures = Math.max(0, this.failures);
-    const wait = WAITS[Math.min(this.failures, WAITS.length - 1)];
+    const wait = RETRY_DELAYS[Math.min(this.failures, RETRY_DELAYS.length - 1)];
     this.failures += 1;
-    for (const id of [...this.questions.keys()]) this.answered({ id, ok: false, reason: "the connection was lost" });
+    for (const id of [...this.pending.keys()]) this.settle({ id, ok: false, reason: "the connection was lost" });
     this.timer = setTimeout(() => this.connect(), wait);
     this.on.state("waiting", wait);
   }
 
-  watch() {
-    if (this.open && performance.now() - this.heard > SILENCE) {
+  checkSilence() {
+    if (this.open && performance.now() - this.lastMessageAt > SILENCE_TIMEOUT) {
       const socket = this.socket;
-      this.lost();
+      this.reconnect();
       socket.close();
     }
   }
 
-  /** At once instead of after the wait. */
+  /** Connects at once instead of after the delay. */
   retry() {
     if (this.socket === null) this.connect();
   }
 
-  answered(message) {
-    const question = this.questions.get(message.id);
-    if (!question) return;
-    this.questions.delete(message.id);
-    clearTimeout(question.timer);
-    question.resolve(message);
+  settle(message) {
+    const request = this.pending.get(message.id);
+    if (!request) return;
+    this.pending.delete(message.id);
+    clearTimeout(request.timer);
+    request.resolve(message);
   }
 
-  /** Ask for an action; resolves to {ok, reason, …}, never rejects. */
-  ask(action, fields = {}) {
+  /** Sends a request; resolves to {ok, reason, …}, never rejects. */
+  request(action, fields = {}) {
     if (!this.open) return Promise.resolve({ ok: false, reason: "not connected" });
     const id = this.nextId++;
     return new Promise((resolve) => {
-      const timer = setTimeout(() => this.answered({ id, ok: false, reason: `no answer to ${action} within 20 s` }), ANSWER);
-      this.questions.set(id, { resolve, timer });
+      const timer = setTimeout(() => this.settle({ id, ok: false, reason: `no reply to ${action} within 20 s` }), REQUEST_TIMEOUT);
+      this.pending.set(id, { resolve, timer });
       this.socket.send(JSON.stringify({ id, do: action, ...fields }));
     });
   }

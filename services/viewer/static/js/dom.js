@@ -1,8 +1,8 @@
-// Elements made by hand: text is always text, so nothing from the bus is ever read as HTML.
+// Creates DOM elements. Text is always set as text, so nothing from the bus is ever parsed as HTML.
 
 export const $ = (id) => document.getElementById(id);
 
-/** An element; `on…` are listeners, `data` the data attributes, null and false leave an attribute out. */
+/** Creates an element; `on…` are listeners, `data` the data attributes; null and false leave an attribute out. */
 export function h(tag, attributes = {}, ...children) {
   const element = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) {
@@ -17,7 +17,7 @@ export function h(tag, attributes = {}, ...children) {
 
 const SVG = "http://www.w3.org/2000/svg";
 
-/** An icon of index.html's sprite. */
+/** Creates an icon from the sprite in index.html. */
 export function icon(name, className = "") {
   const svg = document.createElementNS(SVG, "svg");
   if (className) svg.setAttribute("class", className);
@@ -28,18 +28,18 @@ export function icon(name, className = "") {
   return svg;
 }
 
-/** Another icon in a button that has one. */
+/** Replaces the icon of a button. */
 export function setIcon(button, name) {
   button.querySelector("use").setAttribute("href", `#${name}`);
 }
 
-/** Text only where it differs: the page is not laid out anew for nothing. */
+/** Sets a text only if it differs, to avoid needless layout. */
 export function setText(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
 
-/** A setting of this browser; it may keep none. */
-export function remembered(key, value) {
+/** Reads a setting of this browser, or stores it if there is a `value`; null if the browser stores none. */
+export function storedSetting(key, value) {
   try {
     if (value === undefined) return localStorage.getItem(`presage.${key}`);
     localStorage.setItem(`presage.${key}`, value);
@@ -47,4 +47,4 @@ export function remembered(key, value) {
   return value ?? null;
 }
 
-export const stillness = matchMedia("(prefers-reduced-motion: reduce)");
+export const reducedMotion = matchMedia("(prefers-reduced-motion: reduce)");

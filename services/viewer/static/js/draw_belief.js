@@ -1,12 +1,12 @@
-// The robot: as it believes, as it is, where else it might be, and where it wants to go.
+// Draws the robot: believed pose, true pose, other hypotheses, and goal.
 
 import { degrees, metres, percent } from "./format.js";
 import { ellipse, niceAtLeast } from "./geometry.js";
 import { label } from "./draw_world.js";
 
-const VISIBLE = 16; // px, a smaller 2 sigma ellipse is drawn enlarged, with the factor beside it
+const MIN_ELLIPSE = 16; // px; a smaller 2 sigma ellipse is drawn enlarged, with the factor beside it
 
-/** A path over the last minute, older parts fainter. */
+/** Draws the path of the last minute, older parts fainter. */
 export function drawTrail(ctx, camera, path, colour, { dash = [], width = 2 } = {}) {
   const parts = 6, size = Math.ceil(path.length / parts);
   ctx.strokeStyle = colour;
@@ -30,7 +30,7 @@ export function drawTrail(ctx, camera, path, colour, { dash = [], width = 2 } = 
   ctx.globalAlpha = 1;
 }
 
-/** The round body with a wedge ahead; never so small that it is lost. */
+/** Draws the round body with a wedge that points ahead, large enough to be seen at any zoom. */
 export function drawBody(ctx, camera, pose, radius, { stroke, fill, dash = [], width = 2, alpha = 1 }) {
   const [px, py] = camera.toScreen(pose.x, pose.y);
   const r = Math.max(radius * camera.scale, 7);
@@ -63,11 +63,11 @@ export function drawBody(ctx, camera, pose, radius, { stroke, fill, dash = [], w
   ctx.restore();
 }
 
-/** Two standard deviations of the position; returns the factor it is enlarged by. */
+/** Draws the ellipse of two standard deviations of the position; returns the factor by which it is enlarged. */
 export function drawCovariance(ctx, camera, pose, cov, colour, { enlarge = true, alpha = 1 } = {}) {
   const { major, minor, angle } = ellipse(cov);
   const size = 2 * major * camera.scale;
-  const factor = enlarge && size > 0 && size < VISIBLE ? niceAtLeast(VISIBLE / size) : 1;
+  const factor = enlarge && size > 0 && size < MIN_ELLIPSE ? niceAtLeast(MIN_ELLIPSE / size) : 1;
   const [px, py] = camera.toScreen(pose.x, pose.y);
   ctx.beginPath();
   ctx.ellipse(px, py, Math.max(size * factor, 0.5), Math.max(2 * minor * camera.scale * factor, 0.5), -angle, 0, 2 * Math.PI);
@@ -83,21 +83,21 @@ export function drawCovariance(ctx, camera, pose, cov, colour, { enlarge = true,
   return factor;
 }
 
-/** The believed pose, its ellipse and what is to be said beside it. */
+/** Draws the believed pose, its ellipse and the text beside it. */
 export function drawBelief(ctx, camera, frame, radius, colours) {
   const { belief } = frame;
   const vague = belief.state !== "tracking";
   drawBody(ctx, camera, belief, radius, { stroke: colours.predicted, fill: colours.predicted, dash: vague ? [5, 3] : [] });
   const factor = belief.cov ? drawCovariance(ctx, camera, belief, belief.cov, colours.predicted) : 1;
   const [px, py] = camera.toScreen(belief.x, belief.y);
-  const gap = Math.max(radius * camera.scale, VISIBLE) + 9;
+  const gap = Math.max(radius * camera.scale, MIN_ELLIPSE) + 9;
   const left = px + gap + 160 > camera.width - camera.padding.right; // 160 px: the longest text
   const beside = (text, y, colour) => label(ctx, text, px + (left ? -gap : gap), y, colours, { align: left ? "right" : "left", colour, size: 10.5 });
   if (factor > 1) beside(`uncertainty enlarged ${factor}×`, py - 7, colours.predicted);
   if (frame.error > 0.1) beside(`${metres(frame.error)} from the true position`, py + 7, colours.ink);
 }
 
-/** The true pose, and a line to what is believed where the two differ. */
+/** Draws the true pose, and a line to the believed one if they differ. */
 export function drawTruth(ctx, camera, frame, radius, colours) {
   const { truth, belief } = frame;
   if (belief && frame.error > radius) {
@@ -115,7 +115,7 @@ export function drawTruth(ctx, camera, frame, radius, colours) {
   drawBody(ctx, camera, truth, radius, { stroke: colours.truth, dash: [3, 3], width: 1.6 });
 }
 
-/** The mixture's other modes: the heavier, the stronger. */
+/** Draws all hypotheses, stronger with more weight. */
 export function drawHypotheses(ctx, camera, frame, radius, colours) {
   const all = frame.belief.hypotheses ?? [];
   if (all.length < 2) return;
@@ -129,7 +129,7 @@ export function drawHypotheses(ctx, camera, frame, radius, colours) {
   }
 }
 
-/** The goal with its tolerance, the heading it asks for, and a straight line to it from `from`. */
+/** Draws the goal with its tolerance and heading, and a straight line to it from `from`. */
 export function drawGoal(ctx, camera, goal, from, colours, { planned = false } = {}) {
   const [px, py] = camera.toScreen(goal.x, goal.y);
   ctx.strokeStyle = ctx.fillStyle = colours.goal;
@@ -158,7 +158,7 @@ export function drawGoal(ctx, camera, goal, from, colours, { planned = false } =
   if (planned ? Number.isFinite(goal.yaw) : goal.yaw_tolerance != null) drawHeading(ctx, px, py, goal.yaw, Math.max(0.45 * camera.scale, 24));
 }
 
-/** An arrow from a point in pixels. */
+/** Draws an arrow from a point in pixels. */
 export function drawHeading(ctx, px, py, yaw, length) {
   const tx = px + length * Math.cos(yaw), ty = py - length * Math.sin(yaw);
   ctx.lineWidth = 2;
@@ -173,14 +173,14 @@ export function drawHeading(ctx, px, py, yaw, length) {
   ctx.stroke();
 }
 
-/** What a belief amounts to, in a few words, after the probability that it is right. */
+/** Describes a belief in a few words, after the probability that it is right. */
 export function describeBelief(belief) {
   const probability = belief.probability != null ? [percent(belief.probability)] : [];
   const version = belief.field_version ? [`map v${belief.field_version}`] : [];
   return [...probability, describeState(belief), ...version].filter(Boolean).join(", ");
 }
 
-/** Explains `describeBelief`. */
+/** Explains the values of `describeBelief`. */
 export function explainBelief(belief) {
   const lines = [belief.estimator];
   if (belief.probability != null) lines.push(`${percent(belief.probability)}: probability that the pose is within 0.2 m and 5° of the truth`);

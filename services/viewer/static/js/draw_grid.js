@@ -1,32 +1,32 @@
-// A ROS map as a world: its free and its occupied cells, each as a picture of a pixel a cell.
+// Draws the free and the occupied cells of a ROS map, each as an image with one pixel per cell.
 
 const FREE = 0, OCCUPIED = 100;
-let kept = { cells: "", values: null, pictures: new Map() }; // of the map that was drawn last
+let cache = { cells: "", values: null, images: new Map() }; // of the map that was drawn last
 
-/** Base64 of zlib of a byte a cell, row by row from the lower left. */
+/** Decodes cells: base64 of zlib of one byte per cell, row by row from the lower left. */
 async function unpack(cells) {
   const packed = Uint8Array.from(atob(cells), (letter) => letter.charCodeAt(0));
   const plain = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
   return new Uint8Array(await new Response(plain).arrayBuffer());
 }
 
-/** The cells of one value in one colour, or null until they are there; `ready` is called then. */
-function picture(grid, value, colour, ready) {
-  if (kept.cells !== grid.cells) {
-    const fresh = { cells: grid.cells, values: null, pictures: new Map() };
-    kept = fresh;
+/** Image of the cells of one value in one colour; null until they are decoded, after which `ready` is called. */
+function imageOf(grid, value, colour, ready) {
+  if (cache.cells !== grid.cells) {
+    const fresh = { cells: grid.cells, values: null, images: new Map() };
+    cache = fresh;
     unpack(grid.cells).then((values) => {
       fresh.values = values;
       ready();
     });
   }
-  if (!kept.values) return null;
+  if (!cache.values) return null;
   const key = `${value} ${colour}`;
-  if (!kept.pictures.has(key)) {
-    if (kept.pictures.size > 8) kept.pictures.clear();
-    kept.pictures.set(key, painted(grid, kept.values, value, colour));
+  if (!cache.images.has(key)) {
+    if (cache.images.size > 8) cache.images.clear();
+    cache.images.set(key, painted(grid, cache.values, value, colour));
   }
-  return kept.pictures.get(key);
+  return cache.images.get(key);
 }
 
 function painted(grid, values, value, colour) {
@@ -41,13 +41,13 @@ function painted(grid, values, value, colour) {
 }
 
 function draw(ctx, camera, grid, value, colour, ready) {
-  const shown = picture(grid, value, colour, ready);
+  const shown = imageOf(grid, value, colour, ready);
   if (!shown) return;
-  const [x, y, yaw] = grid.origin, size = grid.resolution * camera.scale; // pixels a cell
+  const [x, y, yaw] = grid.origin, size = grid.resolution * camera.scale; // pixels per cell
   const along = Math.cos(yaw) * size, across = Math.sin(yaw) * size;
   ctx.save();
   ctx.transform(along, -across, -across, -along, ...camera.toScreen(x, y));
-  ctx.imageSmoothingEnabled = size < 1.5; // else walls of one cell would come and go
+  ctx.imageSmoothingEnabled = size < 1.5; // otherwise walls of one cell would flicker
   ctx.drawImage(shown, 0, 0);
   ctx.restore();
 }

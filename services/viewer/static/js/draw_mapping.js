@@ -1,8 +1,8 @@
-// What the mapper has done: the path along its key scans, and the loop closures between them.
+// Draws the path along the key scans of the mapper, and the loop closures between them.
 
-function lines(ctx, camera, each) {
+function drawLines(ctx, camera, lines) {
   ctx.beginPath();
-  for (const points of each) points.forEach(([x, y], i) => ctx[i ? "lineTo" : "moveTo"](...camera.toScreen(x, y)));
+  for (const points of lines) points.forEach(([x, y], i) => ctx[i ? "lineTo" : "moveTo"](...camera.toScreen(x, y)));
   ctx.stroke();
 }
 
@@ -10,9 +10,9 @@ export function drawMapping(ctx, camera, { path, closures }, colours) {
   ctx.lineJoin = "round";
   ctx.strokeStyle = colours["ink-3"];
   ctx.lineWidth = 1;
-  lines(ctx, camera, [path]);
+  drawLines(ctx, camera, [path]);
   ctx.strokeStyle = colours.hypothesis;
-  ctx.globalAlpha *= 0.25; // a long drive has hundreds
-  lines(ctx, camera, closures);
+  ctx.globalAlpha *= 0.25; // a long drive has hundreds of them
+  drawLines(ctx, camera, closures);
   ctx.globalAlpha /= 0.25;
 }

@@ -1,11 +1,11 @@
-// The measured scan and the predicted one, both from where the robot believes it is.
+// Draws the measured and the predicted scan, both from the believed pose.
 
 import { compose } from "./geometry.js";
 
-const BUCKETS = 5; // strengths of a predicted beam, by its stated precision
-const SHARP = 0.02, VAGUE = 0.6; // m, standard deviations drawn strongest and faintest
+const LEVELS = 5; // of opacity of a predicted beam, by its stated precision
+const MIN_SIGMA = 0.02, MAX_SIGMA = 0.6; // m, standard deviations drawn strongest and faintest
 
-/** Where the beams begin, as the robot believes; as it is, where nothing is believed. */
+/** Pose of the scanner at the believed pose, or at the true one if there is no belief. */
 export function scannerPose(frame) {
   const base = frame.belief ?? frame.truth;
   return base && frame.scan ? compose(base, frame.scan.mount) : null;
@@ -19,7 +19,7 @@ function rays(frame, pose) {
   };
 }
 
-/** The area the laser swept, faintly. */
+/** Tints the area that the beams crossed. */
 export function drawFan(ctx, camera, frame, pose, colours) {
   const ray = rays(frame, pose), far = frame.scan.range_max ?? 25;
   ctx.beginPath();
@@ -36,7 +36,7 @@ export function drawFan(ctx, camera, frame, pose, colours) {
   ctx.globalAlpha = 1;
 }
 
-/** Measured ranges as points. */
+/** Draws the measured ranges as points. */
 export function drawMeasured(ctx, camera, frame, pose, colours) {
   const ray = rays(frame, pose), size = camera.scale > 50 ? 2.6 : 2;
   ctx.fillStyle = colours.measured;
@@ -51,17 +51,17 @@ export function drawMeasured(ctx, camera, frame, pose, colours) {
   ctx.fill();
 }
 
-const bucket = (sigma) => {
-  const share = Math.log(sigma / SHARP) / Math.log(VAGUE / SHARP);
-  return Math.round(Math.min(1, Math.max(0, share)) * (BUCKETS - 1));
+const level = (sigma) => {
+  const share = Math.log(sigma / MIN_SIGMA) / Math.log(MAX_SIGMA / MIN_SIGMA);
+  return Math.round(Math.min(1, Math.max(0, share)) * (LEVELS - 1));
 };
 
-/** Predicted ranges: a band of two stated standard deviations along the beams, and a line the fainter the vaguer. */
+/** Draws the predicted ranges as a line, fainter where less certain, with a band of ± 2 standard deviations. */
 export function drawPredicted(ctx, camera, frame, pose, colours) {
   const ray = rays(frame, pose), { predicted, sigma } = frame;
   const stated = sigma.length === predicted.length;
-  const bands = Array.from({ length: BUCKETS }, () => new Path2D());
-  const lines = Array.from({ length: BUCKETS }, () => new Path2D());
+  const bands = Array.from({ length: LEVELS }, () => new Path2D());
+  const lines = Array.from({ length: LEVELS }, () => new Path2D());
   let last = null;
   for (let i = 0; i < predicted.length; i++) {
     const r = predicted[i];
@@ -69,7 +69,7 @@ export function drawPredicted(ctx, camera, frame, pose, colours) {
       last = null;
       continue;
     }
-    const [c, s] = ray(i), k = stated ? bucket(sigma[i]) : 0;
+    const [c, s] = ray(i), k = stated ? level(sigma[i]) : 0;
     const at = (range) => camera.toScreen(pose.x + range * c, pose.y + range * s);
     const here = at(r);
     if (stated) {
@@ -83,8 +83,8 @@ export function drawPredicted(ctx, camera, frame, pose, colours) {
   }
   ctx.strokeStyle = colours.predicted;
   ctx.lineCap = "butt";
-  for (let k = 0; k < BUCKETS; k++) {
-    const vague = k / (BUCKETS - 1);
+  for (let k = 0; k < LEVELS; k++) {
+    const vague = k / (LEVELS - 1);
     ctx.globalAlpha = 0.24 - 0.15 * vague;
     ctx.lineWidth = 2.4;
     ctx.stroke(bands[k]);

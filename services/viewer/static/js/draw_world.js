@@ -1,15 +1,15 @@
-// Walls, furniture, grid and scale: what holds still.
+// Draws what does not move: walls, furniture, grid and rulers.
 
 import { drawFreeCells, drawOccupiedCells } from "./draw_grid.js";
 import { boundsOf, middle, ring } from "./geometry.js";
 
-/** A path of world points, closed. */
+/** Adds a closed path through points of the world. */
 function trace(ctx, camera, points) {
   points.forEach(([x, y], i) => ctx[i ? "lineTo" : "moveTo"](...camera.toScreen(x, y)));
   ctx.closePath();
 }
 
-/** The free floor with a grid of metres, clipped to the walls; `ready` is called when a ROS map's cells are there. */
+/** Draws the free floor with a grid in metres, clipped to the walls; calls `ready` when the cells of a ROS map are decoded. */
 export function drawFloor(ctx, camera, world, colours, ready) {
   const step = [0.5, 1, 5, 10, 50].find((s) => s * camera.scale >= 26) ?? 100;
   ctx.save();
@@ -34,7 +34,7 @@ function line(ctx, [ax, ay], [bx, by]) {
   ctx.lineTo(Math.round(bx) + 0.5, Math.round(by) + 0.5);
 }
 
-/** Walls and obstacles; `ghost` stands in for the obstacle of its name while it is dragged. */
+/** Draws walls and obstacles; `ghost` replaces the obstacle of the same name while it is dragged. */
 export function drawWalls(ctx, camera, world, colours, { selected, hovered, ghost }, ready) {
   if (world.grid) drawOccupiedCells(ctx, camera, world.grid, colours, ready);
   for (const obstacle of world.obstacles) {
@@ -43,7 +43,7 @@ export function drawWalls(ctx, camera, world, colours, { selected, hovered, ghos
       hovered: hovered === obstacle.name && hovered !== "",
     });
   }
-  if (world.grid) return; // its edge is no wall
+  if (world.grid) return; // the edge of a ROS map is not a wall
   ctx.beginPath();
   trace(ctx, camera, world.boundary);
   ctx.strokeStyle = colours.wall;
@@ -72,7 +72,7 @@ function drawObstacle(ctx, camera, obstacle, colours, { selected, hovered }) {
   label(ctx, obstacle.name, px, py, colours, { align: "center" });
 }
 
-/** An obstacle that is not there yet. */
+/** Draws the outline of an obstacle that a click would add. */
 export function drawPlan(ctx, camera, obstacle, colours) {
   outline(ctx, camera, obstacle);
   ctx.setLineDash([4, 3]);
@@ -82,7 +82,7 @@ export function drawPlan(ctx, camera, obstacle, colours) {
   ctx.setLineDash([]);
 }
 
-/** Metres along the left and lower wall. */
+/** Draws rulers in metres along the left and the lower wall. */
 export function drawRulers(ctx, camera, world, colours) {
   const [x0, y0, x1, y1] = boundsOf(world.boundary);
   const step = [1, 2, 5, 10, 20, 50].find((s) => s * camera.scale >= 56) ?? 100;
@@ -101,7 +101,7 @@ export function drawRulers(ctx, camera, world, colours) {
   }
 }
 
-/** Small words that stay readable over anything. */
+/** Writes a small text with an outline, so that it is readable over anything. */
 export function label(ctx, text, x, y, colours, { align = "left", colour = colours.ink, size = 11 } = {}) {
   ctx.font = `550 ${size}px ${colours.sans}`;
   ctx.textAlign = align;

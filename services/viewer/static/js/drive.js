@@ -1,14 +1,14 @@
-// Driving by hand: keys, or a thumb on the joystick. Said ten times a second, as the controller wants it.
+// Manual driving by keys or joystick. Sends a command ten times per second, as the controller requires.
 
 import { $ } from "./dom.js";
 
-const EVERY = 100; // ms
+const SEND_PERIOD = 100; // ms
 const KEYS = {
   w: [1, 0, 0], arrowup: [1, 0, 0], s: [-1, 0, 0], arrowdown: [-1, 0, 0],
   a: [0, 0, 1], arrowleft: [0, 0, 1], d: [0, 0, -1], arrowright: [0, 0, -1],
   q: [0, 1, 0], e: [0, -1, 0],
 };
-const SHARE = 0.6; // of what the robot can do; all of it with shift
+const SPEED_SHARE = 0.6; // of the maximum speed, without shift
 
 export class Drive {
   constructor(store, actions, allowed) {
@@ -21,7 +21,7 @@ export class Drive {
     this.startStick();
   }
 
-  /** Whether the key drives. */
+  /** Handles a key; returns whether it is a key for driving. */
   press(event) {
     const key = event.key.toLowerCase();
     if (!(key in KEYS)) return false;
@@ -31,18 +31,18 @@ export class Drive {
     return true;
   }
 
-  lift(event) {
+  release(event) {
     this.fast = event.shiftKey;
     if (this.down.delete(event.key.toLowerCase()) && this.down.size === 0) this.stop();
   }
 
   run() {
     if (this.timer || !this.allowed()) return;
-    this.timer = setInterval(() => this.send(), EVERY);
+    this.timer = setInterval(() => this.send(), SEND_PERIOD);
     this.send();
   }
 
-  /** Let go: one last word, that it shall stand. */
+  /** Stops driving: sends one last command, to stand still. */
   stop() {
     this.down.clear();
     this.stick = null;
@@ -57,16 +57,16 @@ export class Drive {
       this.stop();
       return;
     }
-    const answer = await this.actions.drive(this.twist());
-    if (!answer.ok && this.timer) {
+    const reply = await this.actions.drive(this.twist());
+    if (!reply.ok && this.timer) {
       this.stop();
-      this.actions.toast(answer.reason, false);
+      this.actions.toast(reply.reason, false);
     }
   }
 
   twist() {
     const { max_speed: speed = 1, max_turn: turn = 2 } = this.store.robot ?? {};
-    const share = this.fast ? 1 : SHARE;
+    const share = this.fast ? 1 : SPEED_SHARE;
     const sum = [0, 0, 0];
     for (const key of this.down) KEYS[key].forEach((value, i) => { sum[i] += value; });
     if (this.stick) {
@@ -74,13 +74,13 @@ export class Drive {
       sum[2] += this.stick[1];
     }
     const [vx, vy, wz] = sum.map((value) => Math.max(-1, Math.min(1, value)) * share);
-    const backing = vx < 0 ? -1 : 1; // as a car: left stays left
+    const backing = vx < 0 ? -1 : 1; // like a car: backwards, left stays left
     return { vx: vx * speed, vy: this.store.robot?.drive === "differential" ? 0 : vy * speed, wz: (this.stick ? backing : 1) * wz * turn * 0.6 };
   }
 
   startStick() {
     const box = $("joystick"), knob = box.firstElementChild;
-    let middle = null; // px, where it was when the thumb came: the page may move under it
+    let middle = null; // px, centre when the touch began; the page may scroll during it
     const place = (dx, dy) => { knob.style.transform = `translate(${dx}px, ${dy}px)`; };
     const steer = (event) => {
       const { x, y, reach } = middle;

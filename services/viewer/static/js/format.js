@@ -1,6 +1,6 @@
-// Numbers as people read them.
+// Formats numbers for display.
 
-/** Metres with a fitting prefix. */
+/** A length in m or mm. */
 export function metres(value) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
   const size = Math.abs(value);
@@ -8,7 +8,7 @@ export function metres(value) {
   return `${value.toFixed(size < 9.995 ? 2 : 1)} m`;
 }
 
-/** rad as whole degrees. */
+/** An angle in rad as degrees. */
 export function degrees(radians, digits = 0) {
   return `${((radians * 180) / Math.PI).toFixed(digits)}°`;
 }
@@ -19,27 +19,27 @@ export function percent(probability) {
   return `${(Math.floor(probability * 100 * steps + 1e-9) / steps).toFixed(digits)} %`;
 }
 
-/** s as minutes and seconds. */
+/** Seconds as minutes:seconds. */
 export function clock(seconds) {
   const whole = Math.max(0, seconds);
   const minutes = Math.floor(whole / 60);
   return `${minutes}:${(whole - 60 * minutes).toFixed(1).padStart(4, "0")}`;
 }
 
-/** s since a start, roughly. */
+/** A duration in s, min or h, rounded down. */
 export function span(seconds) {
   if (seconds < 100) return `${Math.floor(seconds)} s`;
   if (seconds < 6000) return `${Math.floor(seconds / 60)} min`;
   return `${Math.floor(seconds / 3600)} h`;
 }
 
-/** Bytes with a fitting prefix. */
+/** A size in B, kB or MB. */
 export function bytes(count) {
   if (count < 1e3) return `${count} B`;
   return count < 1e6 ? `${(count / 1e3).toFixed(0)} kB` : `${(count / 1e6).toFixed(1)} MB`;
 }
 
-/** A fixed number of digits, or a dash. */
+/** A number with fixed digits; a dash if there is none. */
 export function number(value, digits) {
   return value === null || value === undefined || !Number.isFinite(value) ? "–" : value.toFixed(digits).replace("-", "−");
 }

@@ -1,14 +1,14 @@
-// Poses, ellipses and the shapes of obstacles. Pure.
+// Poses, ellipses and the shapes of obstacles: pure functions.
 
 export const wrap = (angle) => Math.atan2(Math.sin(angle), Math.cos(angle));
 
-/** The pose b, given in a, in a's frame: REP-105's base_link to laser, say. */
+/** The pose `b`, which is given in the frame of pose `a`, in the parent frame of `a`. */
 export function compose(a, b) {
   const c = Math.cos(a.yaw), s = Math.sin(a.yaw);
   return { x: a.x + c * b.x - s * b.y, y: a.y + s * b.x + c * b.y, yaw: wrap(a.yaw + b.yaw) };
 }
 
-/** Semi-axes (1 sigma, m) and direction of the position's covariance, out of 9 numbers of x, y, yaw. */
+/** Semi-axes (m, 1 sigma) and direction of the position's ellipse, from the 9 numbers of a covariance of x, y, yaw. */
 export function ellipse(cov) {
   const a = cov[0], b = (cov[1] + cov[3]) / 2, d = cov[4];
   const middle = (a + d) / 2, half = Math.hypot((a - d) / 2, b);
@@ -19,7 +19,7 @@ export function ellipse(cov) {
   };
 }
 
-/** The next of 1, 2, 5, 10, 20, … that is at least the value. */
+/** The smallest of 1, 2, 5, 10, 20, … that is at least the value. */
 export function niceAtLeast(value) {
   const power = 10 ** Math.floor(Math.log10(value));
   for (const step of [1, 2, 5]) if (step * power >= value * (1 - 1e-9)) return step * power;
@@ -38,7 +38,7 @@ export function ring(obstacle) {
   });
 }
 
-/** The middle an obstacle is turned about. */
+/** The point about which an obstacle is turned. */
 export function middle(obstacle) {
   if (obstacle.circle) return obstacle.circle.center;
   if (obstacle.box) return obstacle.box.center;
@@ -46,7 +46,7 @@ export function middle(obstacle) {
   return [0, 1].map((k) => points.reduce((sum, point) => sum + point[k], 0) / points.length);
 }
 
-/** m from a point to an obstacle; 0 inside. */
+/** Distance in m from a point to an obstacle; 0 inside. */
 export function distance(obstacle, x, y) {
   if (obstacle.circle) {
     const [cx, cy] = obstacle.circle.center;
@@ -75,7 +75,7 @@ function toSegment([ax, ay], [bx, by], x, y) {
 
 const round = (value) => Math.round(value * 1000) / 1000;
 
-/** The obstacle elsewhere: moved by dx, dy (m) and turned about its middle by `turn` (rad). */
+/** The obstacle, moved by dx, dy (m) and turned about its middle by `turn` (rad). */
 export function moved(obstacle, dx, dy, turn = 0) {
   const shift = ([x, y]) => [round(x + dx), round(y + dy)];
   const { name } = obstacle;
@@ -90,7 +90,7 @@ export function moved(obstacle, dx, dy, turn = 0) {
   return { name, polygon: obstacle.polygon.map((point) => shift(turned(point))) };
 }
 
-/** x0, y0, x1, y1 of points. */
+/** Bounding rectangle x0, y0, x1, y1 of points. */
 export function boundsOf(points) {
   const xs = points.map((p) => p[0]), ys = points.map((p) => p[1]);
   return [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];

@@ -1,4 +1,4 @@
-// The keyboard.
+// Keyboard shortcuts.
 
 import { $, h } from "./dom.js";
 
@@ -19,14 +19,14 @@ export function startKeys({ store, view, modes, actions, drive, player, toolbar 
     dialog.querySelector("[data-close]").addEventListener("click", () => dialog.close());
     dialog.addEventListener("click", (event) => event.target === dialog && dialog.close());
   }
-  const live = (run) => () => modes.can && run();
-  const turn = (angle) => live(() => modes.selected && !modes.selected.circle && actions.turnObstacle(modes.selected, angle));
-  const remove = live(() => modes.selected && actions.removeObstacle(modes.selected.name));
+  const ifAllowed = (run) => () => modes.canControl && run();
+  const turn = (angle) => ifAllowed(() => modes.selected && !modes.selected.circle && actions.turnObstacle(modes.selected, angle));
+  const remove = ifAllowed(() => modes.selected && actions.removeObstacle(modes.selected.name));
   const commands = {
-    " ": () => (store.player ? player.toggle() : modes.can && toolbar.togglePause()),
-    ".": () => (store.player ? player.ask("step") : modes.can && toolbar.standing && actions.step()),
+    " ": () => (store.player ? player.toggle() : modes.canControl && toolbar.togglePause()),
+    ".": () => (store.player ? player.request("step") : modes.canControl && toolbar.standing && actions.step()),
     g: () => modes.set("goal"), c: () => modes.set("carry"), o: () => modes.set("obstacle"), v: () => modes.set("look"),
-    x: live(() => actions.cancel()), l: live(() => actions.localise()), r: live(() => actions.record(actions.recording ? "stop" : "start")),
+    x: ifAllowed(() => actions.cancel()), l: ifAllowed(() => actions.localise()), r: ifAllowed(() => actions.record(actions.recording ? "stop" : "start")),
     t: () => view.show("truth", !view.shown.truth), f: () => view.follow(!view.camera.follow),
     "+": () => view.zoom(1.35), "=": () => view.zoom(1.35), "-": () => view.zoom(1 / 1.35), "0": () => view.fit(),
     delete: remove, backspace: remove, "[": turn(Math.PI / 12), "]": turn(-Math.PI / 12),
@@ -36,19 +36,19 @@ export function startKeys({ store, view, modes, actions, drive, player, toolbar 
     if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]") || typing(event)) return;
     const command = commands[event.key.toLowerCase()];
     if (command && !event.repeat) command();
-    if (command || (modes.can && drive.press(event))) event.preventDefault();
+    if (command || (modes.canControl && drive.press(event))) event.preventDefault();
   });
-  addEventListener("keyup", (event) => drive.lift(event));
+  addEventListener("keyup", (event) => drive.release(event));
   for (const id of ["toolbar", "zoom"]) for (const kind of ["click", "change"]) $(id).addEventListener(kind, backToMap);
 }
 
-/** Who used the mouse wants the next key to be the map's: space to pause, not the button once more. */
+/** Moves the focus back to the map after a mouse click, so that space pauses instead of pressing the button again. */
 function backToMap({ type, target }) {
   if (type === "click" && !target.closest("button")) return;
   if (document.activeElement !== document.body && !document.activeElement.matches(":focus-visible")) $("map").focus({ preventScroll: true });
 }
 
-/** Whether the key belongs to the element that has the focus. */
+/** Whether the focused element handles the key itself. */
 function typing({ target, key }) {
   if (!(target instanceof Element)) return false;
   if (target.matches("input:not([type=checkbox]), select, textarea")) return true;

@@ -1,9 +1,9 @@
-// Puts the page together: the socket fills the store, the store is drawn.
+// Assembles the page: messages from the web socket update the store, and the views draw it.
 
 import { Actions } from "./actions.js";
-import { eachPicture } from "./canvas.js";
+import { oncePerFrame } from "./canvas.js";
 import { Connection } from "./connection.js";
-import { $, h, remembered, setText } from "./dom.js";
+import { $, h, storedSetting, setText } from "./dom.js";
 import { Drive } from "./drive.js";
 import { boundsOf } from "./geometry.js";
 import { startKeys } from "./keys.js";
@@ -29,11 +29,11 @@ const actions = new Actions(store, connection, toast);
 const modes = new Modes(store, view, actions);
 new Pointer($("map"), view, modes);
 const toolbar = new Toolbar(store, modes, actions);
-const drive = new Drive(store, actions, () => modes.can);
+const drive = new Drive(store, actions, () => modes.canControl);
 const player = new Player(store, connection, toast);
-const draw = eachPicture(() => panels.draw());
+const draw = oncePerFrame(() => panels.draw());
 reasons.drawJournal();
-let layout = remembered("layout"); // "wide", "side", or by the world's shape
+let layout = storedSetting("layout"); // "wide" or "side"; null: by the shape of the world
 let wanted = new URLSearchParams(location.search).get("robot");
 
 startTheme(() => {
@@ -50,7 +50,7 @@ $("robot").addEventListener("change", () => {
 $("banner-retry").addEventListener("click", () => connection.retry());
 $("layout").addEventListener("click", () => {
   layout = $("main").dataset.layout === "wide" ? "side" : "wide";
-  remembered("layout", layout);
+  storedSetting("layout", layout);
   arrange();
 });
 setInterval(() => {
@@ -61,13 +61,13 @@ setInterval(() => {
   reasons.draw();
 }, 500);
 
-/** A message of the server; one that is unknown is newer than this page. */
+/** Handles a message of the server; unknown types, of a newer server, are ignored. */
 function take(message) {
-  const known = {
+  const handler = {
     hello: takeHello, world: takeWorld, services: takeServices, history: takeHistory, player: takePlayer, closed: takeClosed,
     journal: takeJournal, field: takeField, map: takeMap,
   }[message.type];
-  known?.(message);
+  handler?.(message);
 }
 
 function takeHello(hello) {
@@ -90,22 +90,22 @@ function takeHello(hello) {
   redraw();
 }
 
-function takeWorld({ world: told, scanner, robot }) {
-  const before = store.world, world = store.map?.world ?? told; // the map has another frame than the simulator's world
-  Object.assign(store, { world, told, scanner, robot });
+function takeWorld({ world: simulatorWorld, scanner, robot }) {
+  const before = store.world, world = store.map?.world ?? simulatorWorld; // the map has another frame than the simulator's world
+  Object.assign(store, { world, simulatorWorld, scanner, robot });
   if (view.gesture.selected && !modes.selected) modes.select("");
-  redraw(); // first, for the view is fitted clear of the tools
+  redraw(); // first, because the fit depends on the size of the tools
   if (!before || before.name !== world?.name || String(before.boundary) !== String(world?.boundary)) {
     arrange();
     view.fit();
   }
 }
 
-/** The mapper's map, which takes the place of the simulator's world; without a world, there is none any more. */
+/** The mapper's map, which replaces the simulator's world; a message without a world removes it. */
 function takeMap(message) {
   const map = message.world ? message : null, changed = !map !== !store.map;
   if (!map && !changed) return;
-  Object.assign(store, { map, world: map?.world ?? store.told });
+  Object.assign(store, { map, world: map?.world ?? store.simulatorWorld });
   if (changed || view.camera.fitted) view.fit();
   if (changed) redraw();
   view.invalidate();
@@ -135,7 +135,7 @@ function takeField(field) {
 function takeFrame(frame) {
   const before = store.frame;
   store.takeFrame(frame, performance.now());
-  // Frames go on well after a pause or a step: somebody else let it run.
+  // Frames that arrive long after a pause or a step: another visitor has resumed the simulation.
   if (store.paused && before && frame.t > before.t && performance.now() - store.pausedAt > 1000) store.paused = false;
   const state = frame.belief?.state ?? frame.status?.state ?? "";
   const title = `${frame.robot}${state ? ` · ${state}` : ""} · presage`;
@@ -185,5 +185,5 @@ function redraw() {
   draw();
 }
 
-// For tests and the curious: what the page knows.
+// For tests and for inspection in the browser's console.
 window.presage = { store, view, connection, modes, actions };

@@ -1,14 +1,14 @@
-// The map: draws the store through the camera, only when something changed.
+// The map view: draws the store through the camera, only when something has changed.
 
 import { Camera } from "./camera.js";
-import { eachPicture, sharp } from "./canvas.js";
-import { $, h, remembered, stillness } from "./dom.js";
+import { oncePerFrame, fitToScreen } from "./canvas.js";
+import { $, h, storedSetting, reducedMotion } from "./dom.js";
 import * as robot from "./draw_belief.js";
 import { drawMapping } from "./draw_mapping.js";
 import * as scan from "./draw_scan.js";
-import * as way from "./draw_way.js";
+import * as motion from "./draw_motion.js";
 import * as ground from "./draw_world.js";
-import { drawField } from "./field.js";
+import { drawField } from "./draw_field.js";
 import { boundsOf } from "./geometry.js";
 import { palette } from "./theme.js";
 
@@ -27,17 +27,17 @@ const LAYERS = [
   { key: "unmapped", label: "obstacles not in the map", tone: "unmapped", mark: "diamond" },
 ];
 
-const NARROW = 620, LOW = 340; // px, below which the legend would cover the map
+const NARROW = 620, LOW = 340; // px; in a smaller map the legend would cover too much
 
 export class MapView {
   constructor(store) {
     this.store = store;
     this.camera = new Camera();
-    const usual = (key) => (key === "field" && innerWidth <= 760 ? "off" : "on"); // a phone's map is small
-    this.shown = Object.fromEntries(LAYERS.map(({ key }) => [key, (remembered(`layer.${key}`) ?? usual(key)) === "on"]));
-    this.gesture = {}; // what the pointer is doing: ghost, plan, goal, carry, hovered, selected
-    this.invalidate = eachPicture(() => this.draw());
-    this.surface = sharp($("map"), ({ width, height }) => {
+    const initial = (key) => (key === "field" && innerWidth <= 760 ? "off" : "on"); // a phone's map is small
+    this.shown = Object.fromEntries(LAYERS.map(({ key }) => [key, (storedSetting(`layer.${key}`) ?? initial(key)) === "on"]));
+    this.gesture = {}; // of the pointer: ghost, plan, goal, carry, hovered, selected
+    this.invalidate = oncePerFrame(() => this.draw());
+    this.surface = fitToScreen($("map"), ({ width, height }) => {
       const roomy = width >= NARROW && height >= LOW;
       if (roomy !== this.roomy) $("legend").open = this.roomy = roomy;
       this.arrange(width);
@@ -48,7 +48,7 @@ export class MapView {
     this.buildZoom();
   }
 
-  /** Room beside the map for what floats over it; on a phone the tools are below the map. */
+  /** Sets the padding that the legend and the tools need; on a phone the tools are below the map. */
   arrange(width) {
     const stick = $("joystick").hidden ? 0 : 114;
     const dock = Math.max(0, $("map").getBoundingClientRect().bottom - $("dock").getBoundingClientRect().top);
@@ -68,7 +68,7 @@ export class MapView {
     }
   }
 
-  /** After something that floats over the map came or went. */
+  /** Call it when the legend or the tools appear, disappear or change their size. */
   rearrange() {
     const { width, height } = this.surface;
     this.arrange(width);
@@ -78,7 +78,7 @@ export class MapView {
 
   show(key, shown) {
     this.shown[key] = shown;
-    remembered(`layer.${key}`, shown ? "on" : "off");
+    storedSetting(`layer.${key}`, shown ? "on" : "off");
     const box = $("legend").querySelector(`[data-layer="${key}"] input`);
     box.checked = shown;
     this.invalidate();
@@ -120,7 +120,7 @@ export class MapView {
     const colours = palette(), { world, frame } = store;
     if ($("follow").getAttribute("aria-pressed") !== String(camera.follow)) $("follow").setAttribute("aria-pressed", camera.follow);
     const centre = frame?.belief ?? frame?.truth;
-    if (camera.follow && centre && camera.approach(centre.x, centre.y, stillness.matches)) this.invalidate();
+    if (camera.follow && centre && camera.approach(centre.x, centre.y, reducedMotion.matches)) this.invalidate();
     ctx.fillStyle = colours.outside;
     ctx.fillRect(0, 0, width, height);
     ctx.globalAlpha = store.connected ? 1 : 0.45;
@@ -148,17 +148,17 @@ export class MapView {
     if (pose && shown.predicted) scan.drawPredicted(ctx, camera, frame, pose, colours);
     if (pose && shown.measured) scan.drawMeasured(ctx, camera, frame, pose, colours);
     const goal = frame.status?.goal, planned = frame.path.length > 0;
-    if (shown.plan && planned) way.drawPath(ctx, camera, frame.path, colours);
+    if (shown.plan && planned) motion.drawPath(ctx, camera, frame.path, colours);
     if (shown.goal && goal) robot.drawGoal(ctx, camera, goal, planned ? null : frame.belief ?? frame.truth, colours);
-    if (shown.unmapped) way.drawUnmapped(ctx, camera, frame.obstacles, colours);
-    if (shown.truth) way.drawPeople(ctx, camera, frame.people, colours);
-    if (shown.motion && frame.belief) way.drawMotion(ctx, camera, frame.motion, frame.belief, colours);
+    if (shown.unmapped) motion.drawUnmapped(ctx, camera, frame.obstacles, colours);
+    if (shown.truth) motion.drawPeople(ctx, camera, frame.people, colours);
+    if (shown.motion && frame.belief) motion.drawMotion(ctx, camera, frame.motion, frame.belief, colours);
     if (frame.belief && shown.hypotheses) robot.drawHypotheses(ctx, camera, frame, radius, colours);
     if (frame.belief && shown.belief) robot.drawBelief(ctx, camera, frame, radius, colours);
     if (frame.truth && shown.truth) robot.drawTruth(ctx, camera, frame, radius, colours);
   }
 
-  /** What a drag is about to do. */
+  /** Draws what the current drag or click would do. */
   drawGesture(ctx, colours) {
     const { gesture, camera, radius } = this;
     if (gesture.goal) robot.drawGoal(ctx, camera, gesture.goal, null, colours, { planned: true });

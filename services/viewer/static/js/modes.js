@@ -1,9 +1,9 @@
-// What the pointer on the map does: set a goal, carry the robot off, move furniture, or only look.
+// Modes of the pointer on the map: set a goal, carry the robot, edit obstacles, or move the view.
 
 import { $ } from "./dom.js";
 import { distance, moved } from "./geometry.js";
 
-const GRIP = 8; // px around an obstacle that still take hold of it
+const GRAB_DISTANCE = 8; // px around an obstacle within which it can be grabbed
 const MOVE_EVERY = 180; // ms between two moves of a dragged obstacle
 
 export class Modes {
@@ -29,7 +29,7 @@ export class Modes {
     this.changed();
   }
 
-  get can() {
+  get canControl() {
     return this.store.control && !this.store.player && this.store.connected;
   }
 
@@ -51,29 +51,29 @@ export class Modes {
     return this.store.world?.obstacles ?? [];
   }
 
-  /** The obstacle under a point, where it may be taken hold of. */
-  grip(point) {
-    if (!this.can || point.shift || this.name !== "obstacle") return null;
-    const reach = GRIP / this.view.camera.scale;
+  /** The obstacle under a point that can be grabbed; null if there is none. */
+  grabbable(point) {
+    if (!this.canControl || point.shift || this.name !== "obstacle") return null;
+    const reach = GRAB_DISTANCE / this.view.camera.scale;
     return this.obstacles.findLast((one) => one.name && distance(one, point.x, point.y) <= reach) ?? null;
   }
 
   hover(point) {
-    const held = point && this.grip(point);
+    const held = point && this.grabbable(point);
     const name = held?.name ?? "";
     if (this.gesture.hovered !== name) {
       this.gesture.hovered = name;
       this.view.invalidate();
     }
-    const plan = point && !held && this.can && this.name === "obstacle" ? this.planned(point.x, point.y) : null;
+    const plan = point && !held && this.canControl && this.name === "obstacle" ? this.planned(point.x, point.y) : null;
     if (plan || this.gesture.plan) this.view.invalidate();
     this.gesture.plan = plan;
-    return held || this.name === "look" || !this.can ? "grab" : "crosshair";
+    return held || this.name === "look" || !this.canControl ? "grab" : "crosshair";
   }
 
   begin(point) {
-    if (this.name === "look" || !this.can) return "pan";
-    this.held = this.grip(point);
+    if (this.name === "look" || !this.canControl) return "pan";
+    this.held = this.grabbable(point);
     if (this.held) this.select(this.held.name);
     return "";
   }
@@ -83,16 +83,16 @@ export class Modes {
     const pose = { x: start.x, y: start.y, yaw: heading };
     if (this.held) {
       this.gesture.ghost = moved(this.held, point.x - start.x, point.y - start.y);
-      this.push(false);
+      this.sendMove(false);
     } else if (this.name === "carry" || start.shift) this.gesture.carry = pose;
     else if (this.name === "goal") this.gesture.goal = pose;
   }
 
-  /** The dragged obstacle's place to the simulator, one question at a time. */
-  push(last) {
+  /** Sends the place of the dragged obstacle to the simulator, one request at a time. */
+  sendMove(last) {
     const now = performance.now(), { ghost } = this.gesture;
     if (!ghost) return;
-    if (last) this.actions.moveObstacle(ghost, true).then(() => this.letGo(ghost));
+    if (last) this.actions.moveObstacle(ghost, true).then(() => this.drop(ghost));
     else if (!this.moving && now - (this.movedAt ?? 0) > MOVE_EVERY) {
       this.movedAt = now;
       this.moving = true;
@@ -100,7 +100,7 @@ export class Modes {
     }
   }
 
-  letGo(ghost) {
+  drop(ghost) {
     if (this.gesture.ghost === ghost) this.gesture.ghost = null;
     this.view.invalidate();
   }
@@ -109,7 +109,7 @@ export class Modes {
     const { goal, carry } = this.gesture;
     this.gesture.goal = this.gesture.carry = null;
     if (this.held) {
-      if (!clicked) this.push(true);
+      if (!clicked) this.sendMove(true);
       this.held = null;
     } else if (this.name === "carry" || start.shift) {
       this.actions.teleport(carry ?? { x: start.x, y: start.y, yaw: this.yaw() });

@@ -1,4 +1,4 @@
-// Everything beside the map: badges, vital numbers, charts.
+// The panels beside the map: badges, key numbers, charts.
 
 import { Chart, cursor, indexAt } from "./chart.js";
 import { $, h, icon, setText } from "./dom.js";
@@ -7,7 +7,7 @@ import { metres, number } from "./format.js";
 import { STATUS } from "./reasons.js";
 import { ScanPlot } from "./scan_plot.js";
 
-const WORDS_EVERY = 180; // ms; faster nobody reads
+const TEXT_PERIOD = 180; // ms between updates of texts; faster ones cannot be read
 const BELIEF = { tracking: ["s-dot", "good"], localising: ["s-half", "work"], ambiguous: ["s-diamond", "warn"], lost: ["s-triangle", "bad"] };
 
 export class Panels {
@@ -28,7 +28,7 @@ export class Panels {
     this.policy = Object.fromEntries(["risk", "ambiguity", "pose_information", "place_information"]
       .map((term) => [term, key("k-policy", "predicted", term.replace("_information", ""))]));
     this.badges = { estimator: badge("estimator-badge", "estimator"), controller: badge("controller-badge", "controller") };
-    this.wordsAt = -Infinity;
+    this.textDrawnAt = -Infinity;
     cursor.changed = () => {
       this.drawKeys();
       this.draw();
@@ -37,8 +37,8 @@ export class Panels {
 
   draw() {
     const now = performance.now();
-    if (now - this.wordsAt > WORDS_EVERY) {
-      this.wordsAt = now;
+    if (now - this.textDrawnAt > TEXT_PERIOD) {
+      this.textDrawnAt = now;
       this.drawBadges();
       this.drawVitals();
       this.drawKeys();
@@ -73,7 +73,7 @@ export class Panels {
     }
   }
 
-  /** The values now, or under the pointer. */
+  /** Shows the latest values, or those under the pointer. */
   drawKeys() {
     const { history } = this.store;
     const i = cursor.t === null ? history.t.length - 1 : indexAt(history.t, cursor.t);
@@ -87,14 +87,14 @@ export class Panels {
   }
 }
 
-/** A name with a coloured line and a value; returns what sets the value. */
+/** Adds a name with a coloured line and a value; returns a function that sets the value. */
 function key(box, tone, name) {
   const value = h("b", {}, "–");
   $(box).append(h("span", { class: `key ${tone}` }, name, value));
   return (text) => setText(value, text);
 }
 
-/** A state with its shape, colour and reason; returns what sets them, and touches the page only at a change. */
+/** Fills a badge with a state's icon, colour and reason; returns a function that sets them, only if they change. */
 function badge(id, name) {
   const box = $(id), state = h("b", { role: "status" }), why = h("span", { class: "why" });
   const shape = icon("s-ring");

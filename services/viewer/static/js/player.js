@@ -1,4 +1,4 @@
-// A recording: the list to choose from, and the bar to scrub with.
+// Plays a recording: the list of recordings, and the bar with the position.
 
 import { $, h, setIcon, setText } from "./dom.js";
 import { bytes, clock } from "./format.js";
@@ -11,9 +11,9 @@ export class Player {
     this.dragging = false;
     $("open").addEventListener("click", () => this.choose());
     $("player-play").addEventListener("click", () => this.toggle());
-    $("player-step").addEventListener("click", () => this.ask("step"));
+    $("player-step").addEventListener("click", () => this.request("step"));
     $("player-close").addEventListener("click", () => this.close());
-    $("player-rate").addEventListener("change", () => this.ask("rate", Number($("player-rate").value)));
+    $("player-rate").addEventListener("change", () => this.request("rate", Number($("player-rate").value)));
     const bar = $("player-seek");
     bar.addEventListener("input", () => {
       this.dragging = true;
@@ -27,13 +27,13 @@ export class Player {
     });
   }
 
-  async ask(action, value = 0) {
-    const answer = await this.connection.ask("player", { action, value });
-    if (!answer.ok) this.toast(answer.reason, false);
-    return answer;
+  async request(action, value = 0) {
+    const reply = await this.connection.request("player", { action, value });
+    if (!reply.ok) this.toast(reply.reason, false);
+    return reply;
   }
 
-  /** Where the bar is, one question at a time; the last one is always asked. */
+  /** Seeks to the position of the bar, one request at a time; the last position is always sent. */
   async seek() {
     this.wanted = $("player-seek").valueAsNumber;
     if (this.seeking) return;
@@ -41,19 +41,19 @@ export class Player {
     while (this.wanted !== null) {
       const value = this.wanted;
       this.wanted = null;
-      await this.ask("seek", value);
+      await this.request("seek", value);
       await new Promise((resolve) => { setTimeout(resolve, SEEK_EVERY); });
     }
     this.seeking = false;
   }
 
   toggle() {
-    return this.ask(this.store.player?.paused ? "resume" : "pause");
+    return this.request(this.store.player?.paused ? "resume" : "pause");
   }
 
   async close() {
-    const answer = await this.connection.ask("close");
-    if (!answer.ok) this.toast(answer.reason, false);
+    const reply = await this.connection.request("close");
+    if (!reply.ok) this.toast(reply.reason, false);
   }
 
   draw() {
@@ -78,9 +78,9 @@ export class Player {
     const box = $("files");
     box.replaceChildren(h("p", {}, "Looking…"));
     $("recordings-dialog").showModal();
-    const answer = await this.connection.ask("recordings");
-    const files = answer.files ?? [];
-    if (!answer.ok) box.replaceChildren(h("p", {}, answer.reason));
+    const reply = await this.connection.request("recordings");
+    const files = reply.files ?? [];
+    if (!reply.ok) box.replaceChildren(h("p", {}, reply.reason));
     else if (!files.length) box.replaceChildren(h("p", {}, "There are no recordings yet. Record makes one."));
     else box.replaceChildren(...files.map((file) => this.row(file)));
     box.querySelector("button")?.focus();
@@ -90,8 +90,8 @@ export class Player {
     const open = async () => {
       $("recordings-dialog").close();
       this.toast(`Opening ${file.name}`, true);
-      const answer = await this.connection.ask("open", { name: file.name });
-      if (!answer.ok) this.toast(answer.reason, false);
+      const reply = await this.connection.request("open", { name: file.name });
+      if (!reply.ok) this.toast(reply.reason, false);
     };
     return h("button", { type: "button", onclick: open, data: { file: file.name } }, h("span", { class: "name" }, file.name),
       h("span", { class: "quiet" }, file.duration == null ? "" : clock(file.duration)), h("span", { class: "quiet" }, bytes(file.size ?? 0)));

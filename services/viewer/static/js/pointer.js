@@ -1,14 +1,14 @@
-// Mouse, pen and fingers on the map. What a click means is the mode's affair (modes.js).
+// Mouse, pen and touch on the map. What a click does depends on the mode (modes.js).
 
-const CLICK = 6; // px a pointer may wander and still have clicked
-const HOLD_WHEEL = 0.0016;
+const MAX_CLICK_DISTANCE = 6; // px; a pointer that moves farther drags
+const ZOOM_PER_PIXEL = 0.0016; // of the wheel
 
-/** `mode` answers begin(point), drag(point, start), end(point, start, clicked), cancel(), hover(point). */
+/** `mode` has begin(point), drag(point, start), end(point, start, clicked), cancel() and hover(point). */
 export class Pointer {
   constructor(canvas, view, mode) {
     Object.assign(this, { canvas, view, mode });
     this.down = new Map(); // fingers and buttons by id
-    this.start = null; // of what the mode does
+    this.start = null; // point at which the mode's gesture began
     this.panning = false;
     canvas.addEventListener("pointerdown", (event) => this.press(event));
     canvas.addEventListener("pointermove", (event) => this.move(event));
@@ -50,17 +50,17 @@ export class Pointer {
     else if (this.panning) {
       this.canvas.style.cursor = "grabbing";
       this.view.camera.pan(point.px - before.px, point.py - before.py);
-    } else if (this.start && this.far(point)) this.mode.drag(point, this.start);
+    } else if (this.start && this.isDrag(point)) this.mode.drag(point, this.start);
     this.down.set(event.pointerId, point);
     this.view.invalidate();
   }
 
-  far(point) {
-    this.dragged ||= Math.hypot(point.px - this.start.px, point.py - this.start.py) > CLICK;
+  isDrag(point) {
+    this.dragged ||= Math.hypot(point.px - this.start.px, point.py - this.start.py) > MAX_CLICK_DISTANCE;
     return this.dragged;
   }
 
-  /** Two fingers: the world stays under them. */
+  /** Two fingers: pans and zooms so that the world stays under them. */
   pinch(id, point) {
     const [otherId] = [...this.down.keys()].filter((key) => key !== id);
     const other = this.down.get(otherId), before = this.down.get(id);
@@ -89,7 +89,7 @@ export class Pointer {
     event.preventDefault();
     const { px, py } = this.at(event);
     const lines = event.deltaMode === 1 ? 16 : 1;
-    this.view.camera.zoomAt(px, py, Math.exp(-event.deltaY * lines * HOLD_WHEEL * (event.ctrlKey ? 4 : 1)));
+    this.view.camera.zoomAt(px, py, Math.exp(-event.deltaY * lines * ZOOM_PER_PIXEL * (event.ctrlKey ? 4 : 1)));
     this.view.invalidate();
   }
 }

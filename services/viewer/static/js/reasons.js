@@ -1,4 +1,4 @@
-// Why the robot stands or wanders: in full over the map while it does, and the last reasons with their times.
+// Why the robot stops or searches: a notice over the map while it does, and the last reasons in the journal.
 
 import { $, h, icon, setText } from "./dom.js";
 
@@ -6,8 +6,8 @@ export const STATUS = {
   idle: ["s-ring", ""], navigating: ["s-play", "work"], reached: ["s-check", "good"], blocked: ["s-square", "warn"],
   lost: ["s-triangle", "bad"], manual: ["s-dot", "work"], exploring: ["i-localise", "work"], carried: ["i-carry", "warn"],
 };
-const TOLD = { blocked: "Blocked", lost: "Lost", exploring: "Exploring" };
-const HELD_BACK = 600; // ms of the obstacle stop that are worth a word
+const TITLES = { blocked: "Blocked", lost: "Lost", exploring: "Exploring" };
+const MIN_STOP_DURATION = 600; // ms; a shorter obstacle stop is not shown
 
 export class Reasons {
   constructor(store) {
@@ -18,16 +18,16 @@ export class Reasons {
     $("why").append(this.mark, h("div", {}, this.title, " ", this.text));
   }
 
-  /** What is said over the map: state, title and text; null where all is well. */
+  /** The notice over the map: state, title and text; null if there is none. */
   get now() {
     const { frame, missing, connected, stoppedAt } = this.store, status = frame?.status;
     if (!connected || missing.some((one) => one.name === "controller")) return null;
-    if (status && status.state in TOLD) {
+    if (status && status.state in TITLES) {
       const done = status.exploration ? `; ${status.exploration.area.toFixed(0)} m² mapped, ${status.exploration.path.toFixed(0)} m driven` : "";
-      return [status.state, `${TOLD[status.state]}:`, (status.reason || "no reason given") + done];
+      return [status.state, `${TITLES[status.state]}:`, (status.reason || "no reason given") + done];
     }
     if (frame?.truth?.contact) return ["lost", "Contact:", "the robot touches something"];
-    if (frame?.truth?.stopped && performance.now() - stoppedAt > HELD_BACK) {
+    if (frame?.truth?.stopped && performance.now() - stoppedAt > MIN_STOP_DURATION) {
       return ["blocked", "Obstacle stop:", "an obstacle is too close ahead; the robot's safety stop holds the wheels"];
     }
     return null;
@@ -44,7 +44,7 @@ export class Reasons {
     setText(this.text, text);
   }
 
-  /** The log, the newest first. */
+  /** Draws the journal, the newest entry first. */
   drawJournal() {
     const rows = [...this.store.journal].reverse().map(({ t, state, reason }) => {
       const [mark, tone] = STATUS[state] ?? STATUS.idle;

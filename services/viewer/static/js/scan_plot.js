@@ -1,6 +1,6 @@
-// The unrolled scan: range against angle, the prediction with its stated precision over the measurement.
+// Plot of the scan, range against angle: the measurement, and over it the prediction with its stated precision.
 
-import { beginGrid, leftMargin, sharp, tickLabel, ticks } from "./canvas.js";
+import { beginGrid, leftMargin, fitToScreen, tickLabel, ticks } from "./canvas.js";
 import { niceAtLeast } from "./geometry.js";
 import { palette } from "./theme.js";
 
@@ -10,8 +10,8 @@ const DEGREE = Math.PI / 180;
 export class ScanPlot {
   constructor(canvas, store) {
     this.store = store;
-    this.top = 0; // m, the axis' end; falls slowly so that it does not jump
-    this.surface = sharp(canvas, () => this.draw());
+    this.top = 0; // m, end of the axis; it falls slowly so that it does not jump
+    this.surface = fitToScreen(canvas, () => this.draw());
   }
 
   draw() {
@@ -78,7 +78,7 @@ export class ScanPlot {
   }
 }
 
-/** Two stated standard deviations either side, broken where nothing is predicted. */
+/** Draws the band of ± 2 standard deviations, with gaps where nothing is predicted. */
 function drawBand(ctx, { predicted, sigma }, x, y, colours) {
   const band = new Path2D();
   let from = 0;

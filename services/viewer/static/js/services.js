@@ -1,4 +1,4 @@
-// Health of every service, who is missing, and how to start it.
+// Health of all services, and how to start missing ones.
 
 import { $, h, icon, setText } from "./dom.js";
 import { span } from "./format.js";
@@ -73,7 +73,7 @@ export class Services {
     $("notices").replaceChildren(...notices);
   }
 
-  /** What a visitor sees where there is nothing to see. */
+  /** The text in place of the map before there is a world. */
   sheet(missing) {
     const all = missing.some((one) => one.name === "simulator");
     return h("div", { class: "sheet" },

@@ -1,8 +1,8 @@
-// What the page knows: the newest of everything, and the last minute.
+// The state of the page: the latest messages, and the history of the last minute.
 
 export const WINDOW = 60; // s of history
 const SERIES = ["free_energy", "accuracy", "complexity", "error", "speed"];
-const JUMP = 0.4; // m between two frames: carried off, no path between them
+const JUMP = 0.4; // m between two frames, above which no line connects them: the robot was carried
 
 const nan = (value) => (value === null || value === undefined ? NaN : value);
 
@@ -13,27 +13,27 @@ export class Store {
     this.clear();
   }
 
-  /** Forget the robot that was watched. */
+  /** Forgets everything about the current robot. */
   clear() {
-    this.world = this.told = this.scanner = this.robot = this.frame = this.field = null; // told: the simulator's world
-    this.map = null; // of the mapper: its world, the path of the key scans, loop closures
+    this.world = this.simulatorWorld = this.scanner = this.robot = this.frame = this.field = null;
+    this.map = null; // the mapper's: its world, the path of the key scans, loop closures
     this.journal = []; // {t, state, reason} of the controller, the oldest first
-    this.stoppedAt = 0; // ms, since when the obstacle stop holds the wheels back
+    this.stoppedAt = 0; // ms, when the present obstacle stop began
     this.services = [];
     this.missing = [];
     this.servicesKnown = false;
     this.player = null;
     this.paused = false;
-    this.pausedAt = 0; // ms, the last pause or step
+    this.pausedAt = 0; // ms, time of the last pause or step
     this.arrivals = [];
     this.forget();
   }
 
-  /** Forget the history alone. */
+  /** Forgets only the history. */
   forget() {
     this.history = Object.fromEntries(["t", ...SERIES].map((name) => [name, []]));
     this.trail = { t: [], belief: [], truth: [] };
-    this.events = []; // {t, state}: the estimator's changes of mind
+    this.events = []; // {t, state}, changes of the estimator's state
   }
 
   get control() {
@@ -45,14 +45,14 @@ export class Store {
     return this.services.filter((one) => one.state === "late");
   }
 
-  /** The goal prior, where it is about the goal there is. */
+  /** The distance field of the current goal; null if there is none. */
   get prior() {
     const goal = this.frame?.status?.goal, { field } = this;
     const same = goal && field?.robot === this.frame.robot && Math.hypot(field.goal.x - goal.x, field.goal.y - goal.y) < 0.01;
     return same ? field : null;
   }
 
-  /** Hz over the last arrivals, 0 where none came for two seconds. */
+  /** Rate of frames in Hz; 0 if none has come for two seconds. */
   rate(now) {
     const times = this.arrivals;
     if (times.length < 2 || now - times[times.length - 1] > 2000) return 0;
@@ -69,7 +69,7 @@ export class Store {
     const before = this.frame;
     if (before && frame.robot !== before.robot) this.forget();
     if (!before?.truth?.stopped) this.stoppedAt = now;
-    if (this.missing.some((one) => one.name === "controller")) frame.status = null; // its last word is no more
+    if (this.missing.some((one) => one.name === "controller")) frame.status = null; // the last status is outdated
     this.frame = frame;
     this.arrivals.push(now);
     while (now - this.arrivals[0] > 4000) this.arrivals.shift();
@@ -90,7 +90,7 @@ export class Store {
     this.trim(frame.t - WINDOW);
   }
 
-  /** Time went back (a reset, a seek): what was after it is gone. */
+  /** Removes everything from time `t` on, in case time went back (a reset or a seek). */
   cut(t) {
     const times = this.history.t;
     if (times.length === 0 || times[times.length - 1] < t) return;
@@ -110,7 +110,7 @@ export class Store {
   }
 }
 
-/** [x, y, begins a new line] of a pose after the path so far; null without a pose. */
+/** The next point of a path: [x, y, whether it begins a new line]; null without a pose. */
 function step(path, pose) {
   if (!pose) return null;
   const last = path[path.length - 1];

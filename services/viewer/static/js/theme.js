@@ -1,6 +1,6 @@
-// Light, dark, or as the system says; the canvases read their colours from the style sheet.
+// Light or dark colours, or those of the system. The canvases read their colours from the style sheet.
 
-import { $, remembered } from "./dom.js";
+import { $, storedSetting } from "./dom.js";
 
 const NAMES = ["bg", "surface", "line", "line-strong", "ink", "ink-2", "ink-3", "measured", "predicted", "goal", "hypothesis",
   "warn", "truth", "outside", "free", "grid", "wall", "obstacle", "obstacle-line", "accent", "unmapped", "unmapped-line"];
@@ -18,9 +18,9 @@ export function palette() {
   return current;
 }
 
-/** Obey the system and the switch; `changed` is called after each change. */
+/** Applies the setting of the system or of the button; calls `changed` after each change. */
 export function startTheme(changed) {
-  let choice = CHOICES.includes(remembered("theme")) ? remembered("theme") : "system";
+  let choice = CHOICES.includes(storedSetting("theme")) ? storedSetting("theme") : "system";
   const apply = () => {
     document.documentElement.toggleAttribute("data-dark", choice === "dark" || (choice === "system" && system.matches));
     $("theme").title = `Colours: ${choice}`;
@@ -31,7 +31,7 @@ export function startTheme(changed) {
   system.addEventListener("change", apply);
   $("theme").addEventListener("click", () => {
     choice = CHOICES[(CHOICES.indexOf(choice) + 1) % CHOICES.length];
-    remembered("theme", choice);
+    storedSetting("theme", choice);
     apply();
   });
   apply();

@@ -1,10 +1,10 @@
-// Answers: done, or why not.
+// Short messages: that a request was done, or why not.
 
 import { $, h, icon } from "./dom.js";
 
-const MOST = 4;
+const MAX_TOASTS = 4;
 
-/** Show some words for a while; longer where something was refused. */
+/** Shows a text for a while; longer if something was refused. */
 export function toast(text, ok = true) {
   const box = $("toasts");
   const same = [...box.children].find((child) => child.dataset.text === text);
@@ -12,6 +12,6 @@ export function toast(text, ok = true) {
   const item = h("div", { class: `toast ${ok ? "yes" : "no"}`, data: { text, ok: String(ok) } }, icon(ok ? "s-check" : "s-triangle"), h("span", {}, text));
   item.addEventListener("click", () => item.remove());
   box.append(item);
-  while (box.children.length > MOST) box.firstChild.remove();
+  while (box.children.length > MAX_TOASTS) box.firstChild.remove();
   setTimeout(() => item.remove(), ok ? 3500 : 8000);
 }

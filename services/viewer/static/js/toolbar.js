@@ -1,4 +1,4 @@
-// The tools under the map, and the line above them that belongs to the chosen mode.
+// The tools below the map, and the line above them with the options of the mode.
 
 import { $, h, setIcon, setText } from "./dom.js";
 
@@ -33,13 +33,13 @@ export class Toolbar {
     this.draw();
   }
 
-  /** Whether the simulation stands: told so, or no scan for longer than the slowest speed needs. */
+  /** Whether the simulation stands still: paused, or without a scan for longer than the slowest speed needs. */
   get standing() {
     const last = this.store.arrivals.at(-1);
     return this.store.paused || (last !== undefined && performance.now() - last > 1500);
   }
 
-  /** Whether the robot explores, or goes on with it after a goal. */
+  /** Whether the robot explores, or will continue to after a goal. */
   get exploring() {
     return ["exploring", "returning"].includes(this.store.frame?.status?.exploration?.phase);
   }
@@ -50,38 +50,38 @@ export class Toolbar {
 
   draw() {
     const { store, modes, actions } = this;
-    const can = modes.can;
+    const allowed = modes.canControl;
     $("watch-only").hidden = !store.hello || store.control;
     document.body.toggleAttribute("data-playing", Boolean(store.player));
-    for (const id of ["pause", "step", "reset", "speed", "localise", "record"]) $(id).disabled = !can;
-    for (const button of document.querySelectorAll("[data-mode]")) button.disabled = !can && button.dataset.mode !== "look";
+    for (const id of ["pause", "step", "reset", "speed", "localise", "record"]) $(id).disabled = !allowed;
+    for (const button of document.querySelectorAll("[data-mode]")) button.disabled = !allowed && button.dataset.mode !== "look";
     $("open").disabled = !store.connected || !store.control;
     $("explore-group").hidden = $("save-map").hidden = !store.map;
-    $("explore").disabled = $("save-button").disabled = !can;
+    $("explore").disabled = $("save-button").disabled = !allowed;
     $("explore").setAttribute("aria-pressed", String(this.exploring));
     setText($("explore-label"), this.exploring ? "Stop" : "Explore");
-    $("step").disabled = !can || !this.standing;
+    $("step").disabled = !allowed || !this.standing;
     setIcon($("pause"), this.standing ? "i-play" : "i-pause");
     setText($("pause-label"), this.standing ? "Resume" : "Pause");
     $("record").setAttribute("aria-pressed", String(actions.recording));
     setText($("record-label"), actions.recording ? "Stop" : "Record");
     $("record").title = actions.recording ? "Stop recording (R)" : "Record (R)";
-    this.drawSub(can);
+    this.drawSub(allowed);
   }
 
-  drawSub(can) {
+  drawSub(allowed) {
     const { modes } = this;
     $("sub").hidden = Boolean(this.store.player) || !this.store.world;
     const selected = modes.selected;
-    const kind = !can ? "none" : selected ? `selected ${selected.name} ${Boolean(selected.circle)}` : modes.name;
+    const kind = !allowed ? "none" : selected ? `selected ${selected.name} ${Boolean(selected.circle)}` : modes.name;
     if (this.kind === kind) return;
     this.kind = kind;
-    $("sub").replaceChildren(...this.parts(can, selected));
+    $("sub").replaceChildren(...this.parts(allowed, selected));
   }
 
-  parts(can, selected) {
+  parts(allowed, selected) {
     const { modes, actions } = this;
-    if (!can) return [h("span", { class: "hint" }, this.store.control ? "Not connected" : "View only: this page was started without --allow-control")];
+    if (!allowed) return [h("span", { class: "hint" }, this.store.control ? "Not connected" : "View only: this page was started without --allow-control")];
     const hint = (text) => h("span", { class: "hint" }, text);
     const button = (text, run, attributes = {}) => h("button", { type: "button", onclick: run, ...attributes }, text);
     if (selected) {
@@ -107,7 +107,7 @@ export class Toolbar {
     return [hint(HINTS.obstacle), shape, h("label", {}, size, "m"), ...this.place(false), h("button", { class: "primary" }, "Add")];
   }
 
-  /** Fields for those who do not point. */
+  /** Input fields for a pose, as an alternative to pointing. */
   place(heading = true) {
     const field = (name, label, unit, required) => h("label", { class: "field" }, label,
       h("input", { type: "number", step: "any", name, required, "aria-label": `${name}, ${unit}` }), unit === "degrees" ? "°" : null);

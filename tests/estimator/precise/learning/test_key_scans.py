@@ -9,7 +9,7 @@ from common.geometry import se2
 from common.geometry.world import World
 from common.robot.motion_distortion import beam_times
 from services.estimator.precise.learning import key_scans
-from services.estimator.precise.learning.key_scans import KeyScans
+from services.estimator.precise.learning.key_scans import KeyScanCollector
 from services.estimator.shared.interface import Hypothesis, Observation, Posterior
 
 ANGLES = np.linspace(-2.0, 2.0, 81)
@@ -28,7 +28,7 @@ class Drive:
     """Drives along x, and tells the key scans of it."""
 
     def __init__(self):
-        self.keys = KeyScans(ANGLES, MOUNT, 10.0)
+        self.keys = KeyScanCollector(ANGLES, MOUNT, 10.0)
         self.stamp, self.x = 0.0, 0.0
 
     def go(self, metres, **changes):
@@ -61,7 +61,7 @@ def test_untrusted_poses(changes):
     assert min(key.pose[0] for key in drive.keys.verified.values()) > 8
 
 
-def test_carried_off():
+def test_kidnapped():
     """What was seen at a pose that turns out to be wrong is dropped, and only that."""
     drive = Drive().go(8)
     before = dict(drive.keys.verified)
@@ -130,7 +130,7 @@ def test_drive_when_enough_is_new():
 def test_correction_for_motion():
     """Ranges are those at the stamp, although the robot drives on while the scanner turns."""
     world = World(name="w", boundary=[(-20, -2), (20, -2), (20, 2), (-20, 2)])
-    keys, increment, turn = KeyScans(ANGLES, MOUNT, 30.0), 0.08 / 80, 1.0
+    keys, increment, turn = KeyScanCollector(ANGLES, MOUNT, 30.0), 0.08 / 80, 1.0
     times = beam_times(81, increment)
     for k in range(100):
         pose = np.array([0.1 * k, 0.0, 0.1 * turn * k])

@@ -10,7 +10,7 @@ from common.geometry.world import World
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.global_seeds import Seeds
 from services.estimator.precise.learning import field_learning, weights
-from services.estimator.precise.learning.evaluation import evaluate
+from services.estimator.precise.learning.evaluation import evaluate_model
 from services.estimator.precise.learning.field_learning import Recipe, learn_field, learn_scales
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.digest import sha256
@@ -69,10 +69,10 @@ def test_beams_in_parts(model, monkeypatch):
 
 def test_position_error(model):
     poses, clean = scans(60, 4, 0.0)
-    quality = evaluate(model, poses, NONE, ANGLES, clean, 25.0, 0.02)
-    assert quality.position_error_rms < 0.003
-    assert 1 <= quality.inflation < 1.5
-    assert quality.range_error_median < 0.003
+    errors = evaluate_model(model, poses, NONE, ANGLES, clean, 25.0, 0.02)
+    assert errors.position_error_rms < 0.003
+    assert 1 <= errors.inflation < 1.5
+    assert errors.range_error_median < 0.003
 
 
 def test_beams_without_return():

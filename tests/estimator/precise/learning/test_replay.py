@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from common.geometry.world import World
-from services.estimator.precise.learning.drive_learning import still_valid
+from services.estimator.precise.learning.drive_learning import remove_contradicted
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.generative_models import RayCaster
 
@@ -32,7 +32,7 @@ def test_replay_of_what_is_not_contradicted():
     # The drive stays in the west room.
     driven, seen = scans(AFTER, (0.3, 0.3), (3.7, 3.7), 60, 0.02)
     measured = Beams.of(driven, np.zeros(3), ANGLES, seen)
-    kept = still_valid(measured, replayed, 0.05)
+    kept = remove_contradicted(measured, replayed, 0.05)
     is_kept = np.isin(replayed.directions + 10 * replayed.starts[:, 0], kept.directions + 10 * kept.starts[:, 0])
     west = replayed.starts[:, 0] < 3.8
     gone = now.ranges > replayed.ranges + 0.2
@@ -49,7 +49,7 @@ def test_nothing_is_replayed_through_a_new_surface():
     poses = np.array([[1.3, 3.2, 0.0], [1.6, 3.4, 0.0], [0.95, 2.5, 0.0]])
     replayed = Beams.of(poses, np.zeros(3), ANGLES, ranges.expect(poses, ANGLES).ranges)
     driven, seen = scans(AFTER, (0.2, 1.5), (0.6, 3.7), 60, 0.02)
-    kept = still_valid(Beams.of(driven, np.zeros(3), ANGLES, seen), replayed, 0.05)
+    kept = remove_contradicted(Beams.of(driven, np.zeros(3), ANGLES, seen), replayed, 0.05)
     x, y = kept.starts.T
     # Where they cross the cupboard's western side
     forward = (0.7 - x) / kept.unit()[:, 0]

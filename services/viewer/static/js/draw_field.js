@@ -1,12 +1,12 @@
-// The goal prior over free space: a quiet tint, darkest at the goal, and lines of equal way to go.
+// Draws the distance to the goal: a tint, darkest at the goal, and lines of equal distance.
 
-const TINT = 0.3; // strength at the goal
-const LINES = 24; // lines at most
+const TINT = 0.3; // opacity at the goal
+const MAX_LINES = 24;
 const STEPS = [0.5, 1, 2, 5, 10, 20, 50]; // m between two lines
 
-const pictures = new WeakMap(); // by field: made once for each change
+const pictures = new WeakMap(); // by field, so that each is computed once
 
-/** {tint, minor, major}: a canvas a pixel a cell, and lines in m; the first row and line are the world's lowest. */
+/** {tint, minor, major}: a canvas with one pixel per cell, lowest row first, and lines in m. */
 function pictureOf(field, colour) {
   let picture = pictures.get(field);
   if (picture?.colour !== colour) {
@@ -17,7 +17,7 @@ function pictureOf(field, colour) {
   return picture;
 }
 
-/** Under everything that moves. */
+/** Draws the field, under everything that moves. */
 export function drawField(ctx, camera, field, colours) {
   const { tint, minor, major } = pictureOf(field, colours.goal);
   const { origin, resolution, width, height } = field;
@@ -57,9 +57,9 @@ function tintOf(field, colour) {
   return canvas;
 }
 
-/** Marching squares between the cells' middles; every fifth line apart from the others. */
+/** Lines of equal distance by marching squares between the centres of cells; every fifth line is major. */
 function linesOf(field) {
-  const far = farthest(field), step = STEPS.find((s) => far / s <= LINES) ?? far / LINES;
+  const far = farthest(field), step = STEPS.find((s) => far / s <= MAX_LINES) ?? far / MAX_LINES;
   const minor = new Path2D(), major = new Path2D();
   const { width, height, distance, origin, resolution } = field;
   const at = (column, row) => [origin.x + (column + 0.5) * resolution, origin.y + (row + 0.5) * resolution];
@@ -79,7 +79,7 @@ function linesOf(field) {
 
 const EDGES = [[0, 0, 1, 0], [1, 0, 1, 1], [1, 1, 0, 1], [0, 1, 0, 0]]; // of a square, corner to corner
 
-/** The pieces of one line in one square. */
+/** Adds the segments of one line within one square. */
 function cross(path, corners, level, column, row, at) {
   let open = false;
   EDGES.forEach(([ax, ay, bx, by], k) => {

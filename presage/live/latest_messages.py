@@ -17,7 +17,7 @@ from common.messages.wire import DecodeError
 M = TypeVar("M", bound=Stamped)
 
 
-class Watch:
+class LatestMessages:
     """Subscribes to topics and keeps the newest message of each."""
 
     def __init__(self, bus: Bus, *topics: Topic) -> None:
@@ -39,7 +39,7 @@ class Watch:
                     return message
         return None
 
-    def until(self, kind: type[M], condition: Callable[[M], bool], timeout: float) -> M | None:
+    def wait_for(self, kind: type[M], condition: Callable[[M], bool], timeout: float) -> M | None:
         """Returns the next message of type ``kind`` that meets the condition, or None after ``timeout`` s."""
         deadline = time.monotonic() + timeout
         while (left := deadline - time.monotonic()) > 0:
@@ -50,7 +50,7 @@ class Watch:
 
 
 @contextmanager
-def session(link: Link, timeout: float = 3.0) -> Iterator[Bus]:
+def session_bus(link: Link, timeout: float = 3.0) -> Iterator[Bus]:
     """Opens the bus of a running session; raises UserError if no router answers within ``timeout`` s."""
     with open_bus(link, connect_timeout=timeout) as bus:
         if link.connect and not wait_until(bus.linked, timeout):

@@ -1,7 +1,7 @@
-// Where the robot means to go, and what it met that its map does not know.
+// Draws the planned path and motion, obstacles outside the map, and people.
 
 const PERSON = 0.25; // m, a person's radius
-const MARK = 3.4; // px, half a diamond
+const MARK = 3.4; // px, half the diagonal of a diamond
 
 /** Calls `each(x, y)` for points x, y, x, y, … in m. */
 function eachPoint(points, each) {
@@ -18,7 +18,7 @@ function trace(ctx, camera, points, from) {
   });
 }
 
-/** The planned path, clear of whatever lies under it. */
+/** Draws the planned path, with an outline that separates it from what lies under it. */
 export function drawPath(ctx, camera, path, colours) {
   trace(ctx, camera, path, null);
   ctx.lineJoin = ctx.lineCap = "round";
@@ -30,7 +30,7 @@ export function drawPath(ctx, camera, path, colours) {
   ctx.stroke();
 }
 
-/** Where the command leads until the robot would stand; nothing where it stands. */
+/** Draws the predicted motion until the robot would stop; nothing if it stands. */
 export function drawMotion(ctx, camera, motion, from, colours) {
   let far = 0;
   eachPoint(motion, (x, y) => { far = Math.max(far, Math.hypot(x - from.x, y - from.y)); });
@@ -44,7 +44,7 @@ export function drawMotion(ctx, camera, motion, from, colours) {
   ctx.globalAlpha /= 0.6;
 }
 
-/** Seen by the scan and not in the map: diamonds. */
+/** Draws obstacles that are not in the map as diamonds. */
 export function drawUnmapped(ctx, camera, points, colours) {
   ctx.beginPath();
   eachPoint(points, (x, y) => {
@@ -60,10 +60,10 @@ export function drawUnmapped(ctx, camera, points, colours) {
   ctx.lineWidth = 1.6;
   ctx.lineJoin = "miter";
   ctx.stroke();
-  ctx.fill(); // over the lines: those that touch become one patch with a rim
+  ctx.fill(); // after the lines, so that diamonds that touch become one patch with a rim
 }
 
-/** People as they stand; only a simulator knows. */
+/** Draws people at their true positions, which only a simulator knows. */
 export function drawPeople(ctx, camera, people, colours) {
   const alpha = ctx.globalAlpha, r = PERSON * camera.scale;
   ctx.fillStyle = ctx.strokeStyle = colours.truth;

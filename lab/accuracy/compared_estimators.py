@@ -15,11 +15,11 @@ from lab.accuracy.correlative import CorrelativeMatcher
 from services.estimator.factory import EstimatorOptions, Geometry, Name, load_model, prepare
 from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.particle_filter.sensor import Sensor
-from services.estimator.particle_filter.settings import Settings as ParticleSettings
+from services.estimator.particle_filter.settings import ParticleFilterSettings
 from services.estimator.precise.field import DistanceField, FieldModel
 from services.estimator.precise.motion_model import MotionNoise
 from services.estimator.shared.generative_models import GenerativeModel
-from services.estimator.shared.interface import Estimator, Observation, Posterior, Predicted
+from services.estimator.shared.interface import Observation, PoseEstimator, Posterior, Predicted
 from services.mapper.slam.drive import Laser
 from services.mapper.slam.front_end import FrontEnd
 
@@ -29,8 +29,8 @@ NOMINAL_PERIOD_S = 1 / 15  # of scans without stamps
 
 
 @dataclass(frozen=True)
-class Place:
-    """A world, and what presage has learned of it."""
+class EstimatorSetup:
+    """What an estimator is made from: a world, the scanner, a seed, and what presage has learned of the world."""
 
     world: World
     geometry: Geometry
@@ -42,18 +42,18 @@ class Place:
         own = self.learned if model == "learned" and estimator == "precise" else None
         return EstimatorOptions(self.world, estimator, model, seed=self.seed, generative_model=own)
 
-    def particle_filter(self, settings: ParticleSettings, sensor: Sensor | None = None) -> ParticleFilter:
+    def particle_filter(self, settings: ParticleFilterSettings, sensor: Sensor | None = None) -> ParticleFilter:
         """A particle filter without a start pose."""
         x, y, yaw = map(float, self.geometry.mount)
         return ParticleFilter(self.world, settings, (x, y, yaw), self.seed, sensor=sensor)
 
 
 @dataclass(frozen=True)
-class Contender:
+class ComparedEstimator:
     """An estimator that takes part in the comparison."""
 
-    make: Callable[[Place], Estimator]
-    learns: bool = False  # whether it uses what presage has learned of a place
+    make: Callable[[EstimatorSetup], PoseEstimator]
+    learns: bool = False  # whether it uses what presage has learned of the world
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class ScanMatchedOdometry:
 
     name = "scan-matched"
 
-    def __init__(self, estimator: Estimator, geometry: Geometry) -> None:
+    def __init__(self, estimator: PoseEstimator, geometry: Geometry) -> None:
         self._estimator, self._geometry = estimator, geometry
         self.restart()
 
@@ -96,7 +96,7 @@ class ScanMatchedOdometry:
         return self._estimator.update(replace(observation, odom=matched.pose))
 
     def predict(self, poses: Array, angles: Array) -> Predicted:
-        """Predicts scans; see Estimator."""
+        """Predicts scans; see PoseEstimator."""
         return self._estimator.predict(poses, angles)
 
 
@@ -116,10 +116,10 @@ def amcl_noise(motion: MotionNoise) -> dict[str, float]:
     }
 
 
-def _best_settings(**changed: object) -> ParticleSettings:
+def _best_settings(**changed: object) -> ParticleFilterSettings:
     """The tuned particle filter with all beams, and `NOISE_FACTOR` times the odometry noise that presage assumes."""
     noise = {name: NOISE_FACTOR * value for name, value in amcl_noise(MotionNoise()).items()}
-    return replace(ParticleSettings.tuned(), **{**ALL_BEAMS, **noise, **changed})  # type: ignore[arg-type]
+    return replace(ParticleFilterSettings.tuned(), **{**ALL_BEAMS, **noise, **changed})  # type: ignore[arg-type]
 
 
 # Chosen with world office and seed 5001, which no evaluation uses. With the noise as it is, so few of the particles
@@ -138,41 +138,41 @@ BEAM_MODEL: dict[str, object] = {
 }
 
 
-def _on_learned_field(place: Place) -> Estimator:
+def _on_learned_field(setup: EstimatorSetup) -> PoseEstimator:
     settings = _best_settings()
-    model = place.learned or load_model(place.options("precise"), place.world)[0]
+    model = setup.learned or load_model(setup.options("precise"), setup.world)[0]
     assert isinstance(model, FieldModel)  # noqa: S101 - for the type checker
-    surfaces = LearnedSurfaces(model.field, place.world.bounds, place.world.name)
+    surfaces = LearnedSurfaces(model.field, setup.world.bounds, setup.world.name)
     sensor = Sensor(cast("World", surfaces), settings)
-    return place.particle_filter(settings, sensor)
+    return setup.particle_filter(settings, sensor)
 
 
-def _by_service(estimator: Name, model: str = "learned") -> Callable[[Place], Estimator]:
-    return lambda place: prepare(place.options(estimator, model))(place.geometry)
+def _by_service(estimator: Name, model: str = "learned") -> Callable[[EstimatorSetup], PoseEstimator]:
+    return lambda setup: prepare(setup.options(estimator, model))(setup.geometry)
 
 
-def _with_particles(**changed: object) -> Callable[[Place], Estimator]:
-    return lambda place: place.particle_filter(_best_settings(**changed))
+def _with_particles(**changed: object) -> Callable[[EstimatorSetup], PoseEstimator]:
+    return lambda setup: setup.particle_filter(_best_settings(**changed))
 
 
-def _scan_matched(place: Place) -> Estimator:
-    return ScanMatchedOdometry(place.particle_filter(_best_settings()), place.geometry)
+def _scan_matched(setup: EstimatorSetup) -> PoseEstimator:
+    return ScanMatchedOdometry(setup.particle_filter(_best_settings()), setup.geometry)
 
 
-def _correlative(place: Place) -> Estimator:
-    x, y, yaw = map(float, place.geometry.mount)
-    return CorrelativeMatcher(place.world, (x, y, yaw))
+def _correlative(setup: EstimatorSetup) -> PoseEstimator:
+    x, y, yaw = map(float, setup.geometry.mount)
+    return CorrelativeMatcher(setup.world, (x, y, yaw))
 
 
-CONTENDERS = {
-    "precise": Contender(_by_service("precise"), learns=True),
-    "precise-exact": Contender(_by_service("precise", "exact")),
-    "particle-filter": Contender(_by_service("particle-filter")),
-    "amcl-defaults": Contender(_by_service("amcl-defaults")),
-    "particle-filter-all-beams": Contender(_with_particles()),
-    "particle-filter-no-recovery": Contender(_with_particles(**NO_RECOVERY)),
-    "particle-filter-learned-field": Contender(_on_learned_field, learns=True),
-    "particle-filter-beam-model": Contender(_with_particles(**BEAM_MODEL)),
-    "particle-filter-scan-matching": Contender(_scan_matched),
-    "correlative": Contender(_correlative),
+COMPARED_ESTIMATORS = {
+    "precise": ComparedEstimator(_by_service("precise"), learns=True),
+    "precise-exact": ComparedEstimator(_by_service("precise", "exact")),
+    "particle-filter": ComparedEstimator(_by_service("particle-filter")),
+    "amcl-defaults": ComparedEstimator(_by_service("amcl-defaults")),
+    "particle-filter-all-beams": ComparedEstimator(_with_particles()),
+    "particle-filter-no-recovery": ComparedEstimator(_with_particles(**NO_RECOVERY)),
+    "particle-filter-learned-field": ComparedEstimator(_on_learned_field, learns=True),
+    "particle-filter-beam-model": ComparedEstimator(_with_particles(**BEAM_MODEL)),
+    "particle-filter-scan-matching": ComparedEstimator(_scan_matched),
+    "correlative": ComparedEstimator(_correlative),
 }

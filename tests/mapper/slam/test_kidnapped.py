@@ -1,4 +1,4 @@
-"""A robot that is carried off while it maps."""
+"""A robot that is kidnapped while it maps."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lab.accuracy.scenes import TWIN_OFFSET, TWINS, Scene
 from lab.benchmarks.mapping_faults import false_walls
 from services.mapper.slam.back_end import BackEnd
 from services.mapper.slam.front_end import MAX_SUSPECT_SCANS, NO_PIECE, track_drive
-from services.mapper.slam.loop_closure import Closure
+from services.mapper.slam.loop_closure import LoopClosure
 from services.mapper.slam.pose_graph import PoseLink
 from services.mapper.slam.trajectory import build_trajectory
 from tests.mapper.drives import driven
@@ -75,7 +75,7 @@ def test_wrong_closures_are_refused():
     before = back_end.poses.copy()
     last = len(before) - 1
     wrong = PoseLink(2, last, np.array([1.0, 0.5, 1.0]), np.diag([1e4, 1e4, 1e5]), robust=True)
-    back_end.closures = [Closure(0, 3, wrong, wide=False)]
+    back_end.closures = [LoopClosure(0, 3, wrong, wide=False)]
     back_end.close_loops(scans, 1.0)
     assert all(each.link is not wrong for each in back_end.closures)
     assert np.abs(back_end.poses - before)[:, :2].max() < 0.1
