@@ -116,7 +116,7 @@ class Belief(Stamped):
     """
 
     state: Literal["localising", "tracking", "ambiguous", "lost"]  # precise: tracking if probability is at least 0.999,
-    # else ambiguous if a second hypothesis has over 5 %, else lost if it has been tracking, else localising
+    # else ambiguous if other hypotheses prevent that or one has over 5 %, else lost if it was tracking, else localising
     pose: Pose  # base_link in map
     covariance: Matrix3 | None = None  # (3, 3) of x, y, yaw in map; nil if the estimator computes none
     xi: Floats | None = None  # (3,) prediction error in pose space, xi = dg' Pi (o - g),

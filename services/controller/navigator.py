@@ -128,7 +128,10 @@ class Navigator:
 
     def _refusal(self, goal: Goal) -> str | None:
         if self._docking is None:
-            return self.policy.refusal(goal.pose.array()[:2])
+            place = goal.pose.array()[:2]
+            # Where the robot stands already, it has room, whatever the map says about the walls.
+            at_goal = self._pose is not None and np.hypot(*(self._pose[:2] - place)) <= goal.tolerance
+            return None if at_goal else self.policy.refusal(place)
         if (reason := self._docking.refusal()) is not None:
             return reason
         reasons = [self.policy.refusal(point) for point in self._docking.line()]

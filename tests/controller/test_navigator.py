@@ -48,6 +48,28 @@ def test_goal_in_a_wall_is_refused(x, y, reason):
     assert navigator.stop_without_belief(0, "no belief")[1].reason == status.reason
 
 
+def test_goal_where_the_robot_stands():
+    """It is accepted, although it is so near to a wall that others are refused there."""
+    navigator = Navigator(preset=GeodesicPolicy(Robot(), ROOM), world=ROOM)
+    session(navigator, [5, 0.275, 0], [None], ROOM)
+    navigator.on_goal(goal(5, 0.265))
+    ((command, status, _),) = session(navigator, [5, 0.275, 0], [None], ROOM, first=1)
+    assert (status.state, command.twist.array().any()) == ("reached", False)
+    navigator.on_goal(goal(6, 0.265))
+    assert "m from a wall" in navigator.status(0).reason
+
+
+def test_back_near_the_goal_after_being_lost():
+    """The time without a pose is no time without progress."""
+    navigator = Navigator(preset=GeodesicPolicy(Robot(), ROOM), world=ROOM)
+    navigator.on_goal(goal(8.5, 2))
+    session(navigator, [8.4, 2, 0], [None], ROOM)
+    session(navigator, [8.4, 2, 0], [None] * 60, ROOM, first=1, state="lost")
+    log = session(navigator, [8.3, 2, 0], [None] * 30, ROOM, first=61)
+    assert not any(status.refused for _, status, _ in log)
+    assert log[-1][1].state == "reached"
+
+
 @pytest.mark.parametrize("state", ["localising", "lost", "ambiguous"])
 def test_stands_until_localised(navigator, state):
     ((command, status, _),) = session(navigator, [1.5, 2, 0], [None], ROOM, state=state)

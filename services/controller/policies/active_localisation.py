@@ -32,7 +32,10 @@ if TYPE_CHECKING:
     from common.robot.scan_geometry import Sector
     from services.controller.policies.geodesic_field import CostField, FreeSpaceGraph
 
-MIN_WEIGHT = 0.02  # hypotheses with less weight are ignored
+MIN_WEIGHT = 1e-3  # hypotheses with less weight are ignored: without them, the belief would be tracked
+# A hypothesis counts as at least this probable. The goal is only reached once all others are excluded, however
+# improbable they are, and the information of a scan about an improbable one would be worth hardly a metre.
+MIN_COUNTED_WEIGHT = 0.05
 MAX_HYPOTHESES = 6
 PLACE_SPACING_M = 1.0
 MIN_PATH_M, MAX_PATH_M = 0.8, 12.0  # length of the path to a place
@@ -281,10 +284,10 @@ def drive_energy(
 
 
 def _likely_hypotheses(belief: Belief) -> tuple[Array, Array]:
-    """Poses (K, 3) and weights (K,) of the likely hypotheses of an ambiguous belief, best first."""
+    """Poses (K, 3) and counted weights (K,) of the likely hypotheses of an ambiguous belief, best first."""
     likely = [h for h in belief.hypotheses if h.weight >= MIN_WEIGHT and belief.state == "ambiguous"][:MAX_HYPOTHESES]
     poses = np.array([h.pose.array() for h in likely]).reshape(-1, 3)
-    return poses, np.array([h.weight for h in likely])
+    return poses, np.array([max(h.weight, MIN_COUNTED_WEIGHT) for h in likely])
 
 
 def _open_ranges(scan: Scan) -> tuple[Array, Array]:

@@ -214,6 +214,7 @@ class GeodesicPolicy:
         if self._scan is None:
             return Decision(reason=f"standing until localised: the belief is {belief.state}")
         if self.epistemic or belief.state != "ambiguous":
+            self.interrupt()
             points = safety.scan_points(self._scan)
             points = points[np.hypot(*points.T) < OBSTACLE_RANGE_M]
             return self.localiser.decide(belief, self._scan, points, velocity, self._field_of_view)

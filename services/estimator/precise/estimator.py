@@ -589,8 +589,10 @@ class PreciseEstimator:
             self._was_tracking = True
             return "tracking"
         known = 1 - self._unknown_place.weight
-        if len(self.modes) > 1 and self.modes[1].weight * known > self.settings.ambiguous_weight:
-            return "ambiguous"
+        if len(self.modes) > 1:
+            tracked_alone = known * self._probability_of_being_near(self.modes[0]) >= self.settings.tracking_probability
+            if tracked_alone or self.modes[1].weight * known > self.settings.ambiguous_weight:
+                return "ambiguous"
         return "lost" if self._was_tracking else "localising"
 
 

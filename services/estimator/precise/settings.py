@@ -30,7 +30,9 @@ class PreciseSettings:
     all_changed_probability: float = 1e-2  # that nothing around the start is as the map shows it
     change_rate: float = 0.015  # 1/s, at which a surface in view is taken away or put there
     tracking_probability: float = 0.999  # of the pose being within 0.2 m and 5 degrees of the truth
-    ambiguous_weight: float = 0.05  # weight of the second hypothesis above which the belief is ambiguous
+    # Weight of the second hypothesis above which the belief is ambiguous. It is at any weight if only other hypotheses
+    # keep it from being tracked.
+    ambiguous_weight: float = 0.05
 
     # Covariance
     inflation: float = 1.0  # factor on the covariance, because errors of the model are correlated between beams

@@ -77,3 +77,33 @@ def mark_seen_cells(starts: Array, unit: Array, ranges: Array, h: float, seen: n
             j, i = int((starts[b, 0] + t * unit[b, 0]) / h), int((starts[b, 1] + t * unit[b, 1]) / h)
             if 0 <= i < rows and 0 <= j < columns:
                 seen[i, j] = True
+
+
+@jit
+def count_at_nodes(
+    starts: Array, unit: Array, ranges: Array, h: float, radius: float, margin: float, ended: Array, passed: Array
+) -> None:
+    """Counts in ended and passed (ny, nx) the beams that ended at each node of a grid of ``h`` m, and that passed it.
+
+    Beams have starts (R, 2), unit directions (R, 2) and ranges (R,), in m from node (0, 0). One belongs to a node if
+    its line is within ``radius`` m, at most ``h`` / 2, of it. It passed if it ends more than ``margin`` m behind the
+    node, and ended there if it ends less than that before or behind it.
+    """
+    rows, columns = ended.shape
+    for b in range(ranges.shape[0]):
+        x, y, ux, uy = starts[b, 0], starts[b, 1], unit[b, 0], unit[b, 1]
+        last = -1
+        for k in range(int((ranges[b] + margin) / (0.5 * h)) + 1):
+            t = 0.5 * h * k
+            j, i = int(np.round((x + t * ux) / h)), int(np.round((y + t * uy) / h))
+            if not (0 <= i < rows and 0 <= j < columns) or i * columns + j == last:
+                continue
+            last = i * columns + j
+            dx, dy = j * h - x, i * h - y
+            behind = ranges[b] - (dx * ux + dy * uy)
+            if abs(dx * uy - dy * ux) > radius or behind < -margin:
+                continue
+            if behind > margin:
+                passed[i, j] += 1.0
+            else:
+                ended[i, j] += 1.0

@@ -20,7 +20,7 @@ from common.geometry.se2 import Array, compose, wrap
 from common.robot.stray_beams import has_neighbours
 from services.estimator.precise.field import CLASSES, SEEN_CELL_M, DistanceField, Floats, SeenCells
 from services.estimator.precise.global_seeds import SEED_SPACING_M, thin_places
-from services.estimator.precise.learning.beam_cells import mark_seen_cells
+from services.estimator.precise.learning.beam_cells import count_at_nodes, mark_seen_cells
 from services.estimator.precise.learning.surfaces import (
     MIN_POINTS_PER_CELL,
     MIN_PRESENT_SHARE,
@@ -31,6 +31,7 @@ from services.estimator.precise.learning.surfaces import (
 from services.estimator.shared.generative_models import CORNER_ANGLE_RAD
 
 CARVED_DISTANCE_CELLS = 0.5  # minimum of phi at a node through which beams pass
+PASSING_CELLS = 0.25  # a beam passes a node within this distance
 EM_STEPS = 15
 OUTLIER_SHARE, OUTLIER_RANGE_M = 0.1, 25.0  # weight and width of the uniform part of the density
 BEAMS_AT_ONCE = 2_000_000  # in a sweep, which limits memory
@@ -62,7 +63,7 @@ def learn_field(
     beams = beams.part(has_neighbours(beams.ends()))
     field = field_of_surfaces(beams, recipe.resolution)
     rng = np.random.default_rng(recipe.seed)
-    phi = field.phi.copy()
+    phi = _clear_passed_nodes(field, beams)
     for sweep in range(recipe.sweeps):
         report("prediction errors", sweep / recipe.sweeps)
         sample = rng.integers(0, len(beams.ranges), min(recipe.beams_per_sweep, len(beams.ranges)))
@@ -115,6 +116,18 @@ def measure_ripple(field: DistanceField, lasers: Array, angles: Array) -> float:
     flat = (np.abs(left) < CORNER_ANGLE_RAD) & (np.abs(right) < CORNER_ANGLE_RAD)
     # A mean of two errors minus a third error has 1.5 times the variance of one error.
     return float(np.sqrt(np.mean(((left + right)[flat] / 2) ** 2) / 1.5)) if flat.any() else 0.0
+
+
+def _clear_passed_nodes(field: DistanceField, beams: Beams) -> Floats:
+    """Phi, positive at the nodes that most of the beams pass that come near.
+
+    Beside an outer corner, noise along the beams resembles a surface, and its plane may reach into free space.
+    """
+    ended, passed = np.zeros((2, *field.phi.shape))
+    starts, h = beams.starts - field.origin, field.resolution
+    count_at_nodes(starts, beams.unit(), beams.ranges, h, PASSING_CELLS * h, PASSED_DEPTH_M, ended, passed)
+    free = (passed >= MIN_POINTS_PER_CELL) & (ended < MIN_PRESENT_SHARE * (ended + passed))
+    return np.where(free, np.maximum(field.phi, np.float32(PASSING_CELLS * h)), field.phi)
 
 
 def _descend(field: DistanceField, beams: Beams, sample: npt.NDArray[np.intp], rate: float) -> Floats:

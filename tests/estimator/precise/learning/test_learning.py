@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -12,7 +14,7 @@ from services.estimator.precise.global_seeds import Seeds
 from services.estimator.precise.learning import field_learning, weights
 from services.estimator.precise.learning.evaluation import evaluate_model
 from services.estimator.precise.learning.field_learning import Recipe, learn_field, learn_scales
-from services.estimator.precise.learning.surfaces import Beams
+from services.estimator.precise.learning.surfaces import Beams, field_of_surfaces
 from services.estimator.shared.digest import sha256
 from tests.estimator.models import ROOM, SCANNER
 
@@ -73,6 +75,20 @@ def test_position_error(model):
     assert errors.position_error_rms < 0.003
     assert 1 <= errors.inflation < 1.5
     assert errors.range_error_median < 0.003
+
+
+def test_spike_in_free_space():
+    """A node that beams pass becomes free before the sweeps; those on and behind surfaces keep their values."""
+    poses, ranges = scans(400, 0, 0.02)
+    beams = Beams.of(poses, NONE, ANGLES, ranges)
+    field = field_of_surfaces(beams, RECIPE.resolution)
+    rows, columns = np.indices(field.phi.shape)
+    clearance = ROOM.clearance(np.array(field.origin) + 0.05 * np.stack([columns.ravel(), rows.ravel()], axis=-1))
+    beside = (clearance > 0.04) & (clearance < 0.1)
+    spiky = np.where(beside.reshape(rows.shape), np.float32(-0.03), field.phi)
+    cleared = field_learning._clear_passed_nodes(replace(field, phi=spiky), beams).ravel()
+    assert (cleared[beside] > 0).mean() > 0.95
+    assert np.array_equal(cleared[clearance < 0], field.phi.ravel()[clearance < 0])
 
 
 def test_beams_without_return():

@@ -1,0 +1,29 @@
+"""Hypotheses between which a robot decides by driving."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from common.messages.definitions import Hypothesis, Pose
+from common.robot.base import Robot
+from services.controller.policies.active_localisation import ActiveLocaliser
+from services.controller.policies.free_space import FreeSpace
+from services.controller.policies.geodesic_field import FreeSpaceGraph
+from tests.controller.driving import belief, room
+
+ROBOT = Robot()
+
+
+@pytest.mark.parametrize(("weight", "counted"), [(0.3, 0.3), (0.01, 0.05), (1e-4, None)])
+def test_weight_of_the_second_hypothesis(weight, counted):
+    """An improbable one counts as 5 %, one that would not keep the belief from being tracked not at all."""
+    poses = np.array([[3.0, 2.0, 0.0], [7.0, 2.0, 0.0]])
+    hypotheses = [Hypothesis(pose=Pose.of(p), weight=w) for p, w in zip(poses, (1 - weight, weight), strict=True)]
+    ambiguous = belief(0, poses[0], "ambiguous").model_copy(update={"hypotheses": hypotheses})
+    graph = FreeSpaceGraph(FreeSpace.of(room(10, 4)), ROBOT.radius)
+    motions = ActiveLocaliser(ROBOT, graph, 0.33).prediction_request(ambiguous)
+    if counted is None:
+        assert motions is None
+    else:
+        assert motions.weights.tolist() == pytest.approx([1 - weight, counted])
