@@ -317,15 +317,15 @@ def test_preselection(monkeypatch):
 
 def test_ranking_costs():
     rng = np.random.default_rng(4)
-    panoramas = rng.integers(0, 256, (5, 2, 3, 120)).astype(np.uint8)
-    bins, measured, most = np.arange(0, 360, 5), rng.integers(1, 256, 72).astype(np.uint8), 200
+    panoramas = rng.integers(0, 256, (5, 2, 120)).astype(np.uint8)
+    bins, measured, most = np.arange(0, 120, 2), rng.integers(1, 256, 60).astype(np.uint8), 200
     least, costs = np.empty(5, np.uint16), np.empty((5, 120), np.uint16)
     beam_sums.rank_places(panoramas.view(np.uint64), bins, measured, most, least, costs)
     assert np.array_equal(least, costs.min(axis=1))
-    around = np.minimum(panoramas, most).transpose(1, 0, 3, 2).reshape(2, 5, 360).astype(int)
+    around = np.minimum(panoramas, most).transpose(1, 0, 2).astype(int)
     o = np.minimum(measured, most).astype(int)
     for heading in range(120):
-        surface, behind = around[:, :, (bins + 3 * heading) % 360]
+        surface, behind = around[:, :, (bins + heading) % 120]
         late = np.minimum(np.minimum(o - surface, 10), 2 + np.minimum(np.abs(o - behind), 8))
         misfit = np.where(o > surface, late, np.minimum(surface - o, 6))
         assert np.array_equal(costs[:, heading], np.where(surface > 0, misfit, 4).sum(axis=1))
