@@ -1,7 +1,8 @@
 """Exact ray casting against segments, circles and the cells of an occupancy grid, compiled by numba.
 
-Cells are traversed as by Amanatides and Woo (A Fast Voxel Traversal Algorithm, 1987), in steps over squares of empty
-cells instead of single cells.
+Cells are traversed as by Amanatides and Woo (A Fast Voxel Traversal Algorithm, 1987); those of an occupancy grid in
+steps over squares of empty cells instead of single cells. Segments and circles are found in a grid, too, so that the
+time of a ray hardly depends on the size of the world.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from common.geometry.occupancy_grid import CACHED_MAPS, OCCUPIED, OccupancyGrid
 if TYPE_CHECKING:
     import numpy.typing as npt
 
+    from common.geometry.outline_index import IndexArrays
     from common.geometry.se2 import Array
     from common.geometry.world import World
 
@@ -33,8 +35,7 @@ def cast_rays(world: World, poses: npt.ArrayLike, angles: npt.ArrayLike, people:
 
     Rays also end at ``people`` (P, 3), circles of x, y and radius in m.
     """
-    circles = world.circles if people is None else np.concatenate([world.circles, people])
-    return _cast_rays(world, circles, poses, angles, derivatives=False)[0]
+    return _cast_rays(world, np.zeros((0, 3)) if people is None else people, poses, angles, derivatives=False)[0]
 
 
 def cast_rays_with_jacobian(world: World, poses: npt.ArrayLike, angles: npt.ArrayLike) -> tuple[Array, Array]:
@@ -43,17 +44,17 @@ def cast_rays_with_jacobian(world: World, poses: npt.ArrayLike, angles: npt.Arra
     The derivative of a distance is dr = -(n . dp + r n . u' dyaw) / (n . u), with the surface's normal n and the ray's
     direction u. It is 0 if nothing is hit.
     """
-    return _cast_rays(world, world.circles, poses, angles, derivatives=True)
+    return _cast_rays(world, np.zeros((0, 3)), poses, angles, derivatives=True)
 
 
 def _cast_rays(
-    world: World, circles: Array, poses: npt.ArrayLike, angles: npt.ArrayLike, *, derivatives: bool
+    world: World, people: Array, poses: npt.ArrayLike, angles: npt.ArrayLike, *, derivatives: bool
 ) -> tuple[Array, Array]:
     # Copied, because numba compiles again for arrays that are read-only or not contiguous.
     poses, angles = np.array(poses, float).reshape(-1, 3), np.array(angles, float).ravel()
     shape = (len(poses), len(angles))
     ranges, jacobian = np.empty(shape), np.zeros((*(shape if derivatives else (0, 0)), 3))
-    _cast(world.outlines, circles, *_cells_of(world.grid), poses, angles, ranges, jacobian)
+    _cast(world.outline_index.arrays, np.array(people, float), *_cells_of(world.grid), poses, angles, ranges, jacobian)
     return ranges, jacobian
 
 
@@ -81,8 +82,8 @@ def clear_radius(occupied: npt.NDArray[np.bool_]) -> npt.NDArray[np.uint8]:
 
 @jit
 def _cast(
-    segments: Array,
-    circles: Array,
+    outlines: IndexArrays,
+    people: Array,
     occupied: npt.NDArray[np.bool_],
     clear: npt.NDArray[np.uint8],
     frame: Array,
@@ -100,7 +101,11 @@ def _cast(
         for b in range(angles.shape[0]):
             heading = yaw + angles[b]
             ux, uy = math.cos(heading), math.sin(heading)
-            r, nx, ny = _nearest_outline(segments, circles, x, y, ux, uy)
+            r, nx, ny = _nearest_outline(outlines, x, y, ux, uy)
+            for s in range(people.shape[0]):
+                person = _distance_to_circle(people[s], x, y, ux, uy)
+                if person < r:
+                    r, nx, ny = person, *_circle_normal(people[s], x, y, ux, uy, person)
             if occupied.size:
                 heading -= frame[2]
                 hit, hx, hy = _nearest_cell(
@@ -119,33 +124,69 @@ def _cast(
 
 
 @jit
-def _nearest_outline(
-    segments: Array, circles: Array, x: float, y: float, ux: float, uy: float
-) -> tuple[float, float, float]:
+def _nearest_outline(outlines: IndexArrays, x: float, y: float, ux: float, uy: float) -> tuple[float, float, float]:
     """Distance in m along the unit vector (ux, uy) to the nearest segment or circle, and its normal; +inf if none."""
-    nearest, nx, ny = np.inf, 0.0, 0.0
-    for s in range(segments.shape[0]):
-        ax, ay = segments[s, 0] - x, segments[s, 1] - y
-        ex, ey = segments[s, 2] - segments[s, 0], segments[s, 3] - segments[s, 1]
-        det = ux * ey - uy * ex
-        if det == 0.0:
-            continue
-        r, share = (ax * ey - ay * ex) / det, (ax * uy - ay * ux) / det
-        if 0.0 <= r < nearest and 0.0 <= share <= 1.0:
-            nearest, nx, ny = r, -ey, ex
-    if nearest < np.inf:
-        length = math.hypot(nx, ny)
-        nx, ny = nx / length, ny / length
-    for s in range(circles.shape[0]):
-        cx, cy, radius = circles[s, 0] - x, circles[s, 1] - y, circles[s, 2]
-        middle = cx * ux + cy * uy
-        discriminant = middle * middle - (cx * cx + cy * cy - radius * radius)
-        if discriminant < 0.0:
-            continue
-        r = middle - math.sqrt(discriminant)
-        if 0.0 <= r < nearest:
-            nearest, nx, ny = r, (r * ux - cx) / radius, (r * uy - cy) / radius
-    return nearest, nx, ny
+    segments, circles, starts, members, (rows, columns), (left, low, size) = outlines
+    px, py = (x - left) / size, (y - low) / size
+    t, leaves = _cross_grid(px, py, ux, uy, columns, rows)
+    nearest, which = np.inf, -1
+    column = min(max(math.floor(px + t * ux), 0), columns - 1)
+    row = min(max(math.floor(py + t * uy), 0), rows - 1)
+    while t < leaves and 0 <= column < columns and 0 <= row < rows:
+        cell = row * columns + column
+        for m in range(starts[cell], starts[cell + 1]):
+            s = members[m]
+            if s < segments.shape[0]:
+                r = _distance_to_segment(segments[s], x, y, ux, uy)
+            else:
+                r = _distance_to_circle(circles[s - segments.shape[0]], x, y, ux, uy)
+            if r < nearest:
+                nearest, which = r, s
+        to_x, to_y = _distance_to_edge(px, ux, column, 0), _distance_to_edge(py, uy, row, 0)
+        t = min(to_x, to_y)
+        if nearest <= t * size:  # farther ones may be hidden by an outline of the next cell
+            break
+        if to_x <= to_y:
+            column += 1 if ux > 0 else -1
+        else:
+            row += 1 if uy > 0 else -1
+    if which < 0:
+        return np.inf, 0.0, 0.0
+    if which >= segments.shape[0]:
+        return nearest, *_circle_normal(circles[which - segments.shape[0]], x, y, ux, uy, nearest)
+    ex, ey = segments[which, 2] - segments[which, 0], segments[which, 3] - segments[which, 1]
+    length = math.hypot(ex, ey)
+    return nearest, -ey / length, ex / length
+
+
+@jit
+def _distance_to_segment(segment: Array, x: float, y: float, ux: float, uy: float) -> float:
+    """Distance in m from (x, y) along (ux, uy) to a segment (4,); +inf if the ray misses it."""
+    ax, ay = segment[0] - x, segment[1] - y
+    ex, ey = segment[2] - segment[0], segment[3] - segment[1]
+    det = ux * ey - uy * ex
+    if det == 0.0:
+        return np.inf
+    r, share = (ax * ey - ay * ex) / det, (ax * uy - ay * ux) / det
+    return r if r >= 0.0 and 0.0 <= share <= 1.0 else np.inf
+
+
+@jit
+def _distance_to_circle(circle: Array, x: float, y: float, ux: float, uy: float) -> float:
+    """Distance in m from (x, y) along (ux, uy) to a circle (3,); +inf if the ray misses it or begins in it."""
+    cx, cy, radius = circle[0] - x, circle[1] - y, circle[2]
+    middle = cx * ux + cy * uy
+    discriminant = middle * middle - (cx * cx + cy * cy - radius * radius)
+    if discriminant < 0.0:
+        return np.inf
+    r = middle - math.sqrt(discriminant)
+    return r if r >= 0.0 else np.inf
+
+
+@jit
+def _circle_normal(circle: Array, x: float, y: float, ux: float, uy: float, r: float) -> tuple[float, float]:
+    """The normal of a circle (3,) where a ray ends after ``r`` m."""
+    return (x + r * ux - circle[0]) / circle[2], (y + r * uy - circle[1]) / circle[2]
 
 
 @jit

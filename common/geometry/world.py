@@ -20,6 +20,7 @@ from common.geometry.yaml_text import TooLargeError, parse_yaml
 from common.limits import Coordinate
 
 if TYPE_CHECKING:
+    from common.geometry.outline_index import OutlineIndex
     from common.geometry.se2 import Array
 
 __all__ = ["NOT_YAML", "Box", "Circle", "Obstacle", "Start", "World", "known_worlds", "load_world", "save_world"]
@@ -91,6 +92,13 @@ class World(WorldPart):
     def circles(self) -> Array:
         """(C, 3) x, y, radius in m of the round obstacles."""
         return np.array([[*o.circle.center, o.circle.radius] for o in self.obstacles if o.circle]).reshape(-1, 3)
+
+    @functools.cached_property
+    def outline_index(self) -> OutlineIndex:
+        """The outlines and circles, by the cells of a grid."""
+        from common.geometry.outline_index import OutlineIndex  # numba, which most services do not need
+
+        return OutlineIndex.of(self.outlines, self.circles)
 
     @functools.cached_property
     def furniture(self) -> shapely.Geometry:

@@ -94,21 +94,27 @@ def accumulate(
 
 @jit
 def rank_places(
-    panoramas: npt.NDArray[np.uint8],
+    panoramas: npt.NDArray[np.uint64],
     bins: npt.NDArray[np.int64],
     measured: npt.NDArray[np.uint8],
     most: int,
+    least: npt.NDArray[np.uint16],
     costs: npt.NDArray[np.uint16],
 ) -> None:
     """Fills costs (S, H) of every place and heading with the sum of capped absolute errors over beams.
 
-    ``panoramas`` (S, 2, P, H) are ranges in the directions P h + p, to the first surface (0 if unknown) and to the next
-    one behind it, where a beam ends if the first was removed. ``bins`` (B,) is the direction of each beam, and
-    ``measured`` (B,) the scan. All ranges are in the same steps, limited to ``most``.
+    ``least`` (S,) gets the smallest cost of each place; costs may be empty (0, H) if no others are needed.
+    ``panoramas`` (S, 2, H / 8), 8 directions in a word, are ranges to the first surface (0 if unknown) and to the next
+    one behind it, where a beam ends if the first was removed. ``bins`` (B,) is the direction of each beam in the scan
+    ``measured`` (B,). All ranges are in the same steps, limited to ``most``.
     """
-    phases, headings = panoramas.shape[2:]
+    words = panoramas.shape[2]
+    headings = panoramas.itemsize * words
     lanes = (headings + LANES - 1) // LANES * LANES
-    around = np.zeros((2, phases, headings + lanes), np.uint8)  # a byte for each direction, more than once around
+    # All directions, more than once around, so that the headings of a beam are one slice. Copied in words, because a
+    # loop over bytes takes as long as the sums.
+    around_words = np.zeros((2, 2 * words + lanes // panoramas.itemsize), np.uint64)
+    around = around_words.view(np.uint8)
     sums = np.empty(lanes, np.uint16)
     long, short, removed, beyond, unknown, limit = (
         np.uint8(LONG_MISFIT_STEPS),
@@ -120,19 +126,19 @@ def rank_places(
     )
     for s in range(panoramas.shape[0]):
         for layer in range(2):
-            for p in range(phases):
-                for h in range(headings):
-                    around[layer, p, h] = min(panoramas[s, layer, p, h], limit)
-                around[layer, p, headings : 2 * headings] = around[layer, p, :headings]
+            for w in range(words):
+                around_words[layer, w] = around_words[layer, w + words] = panoramas[s, layer, w]
         sums[:] = 0
         for b in range(bins.shape[0]):
-            o, first, p = min(measured[b], limit), bins[b] // phases, bins[b] % phases
+            o, first = min(measured[b], limit), bins[b]
             # Slices, so that the loop is vectorised.
-            surface, behind = around[0, p, first : first + lanes], around[1, p, first : first + lanes]
+            surface, behind = around[0, first : first + lanes], around[1, first : first + lanes]
             for h in range(lanes):
-                g, next_g = surface[h], behind[h]
+                g, next_g = min(surface[h], limit), min(behind[h], limit)
                 past = min(np.uint8(max(o, next_g) - min(o, next_g)), beyond)
                 late = min(np.uint8(max(o, g) - g), long, np.uint8(removed + past))
                 misfit = late if o > g else min(np.uint8(g - min(o, g)), short)
                 sums[h] = np.uint16(sums[h] + (misfit if g > 0 else unknown))
-        costs[s] = sums[:headings]
+        least[s] = sums[:headings].min()
+        if costs.size:
+            costs[s] = sums[:headings]

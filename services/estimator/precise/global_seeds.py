@@ -19,8 +19,7 @@ if TYPE_CHECKING:
 
 SEED_SPACING_M = 0.3  # between the places at which a search begins
 RANKED_HEADINGS, RANKED_BEAMS = 120, 72  # that are compared with the panorama of each place
-PANORAMA_PHASES = 3  # directions of a panorama for each of these headings
-PANORAMA_BINS = PANORAMA_PHASES * RANKED_HEADINGS
+FULLY_RANKED_PLACES, PRESELECTION_BEAMS = 4000, 24  # of more places, those that fit fewer beams best
 RANGE_STEP_M = 0.1  # of a stored range; 0 is unknown
 MAX_RANGE_STEPS = 255  # largest stored range, so that it fits a byte
 
@@ -30,22 +29,22 @@ class Seeds:
     """Places in free space, with the panorama of ranges that the model expects at each."""
 
     places: Array  # (S, 2) m in map, of the laser
-    # (S, 2, PANORAMA_PHASES, RANKED_HEADINGS) in steps of `RANGE_STEP_M`, in the directions
-    # 2 pi (PANORAMA_PHASES k + phase) / PANORAMA_BINS: ranges to the first surface, and to the next behind it
+    # (S, 2, RANKED_HEADINGS) in steps of `RANGE_STEP_M`, in the direction of each ranked heading: ranges to the first
+    # surface, and to the next behind it
     panoramas: npt.NDArray[np.uint8]
 
     @classmethod
     def at(cls, model: GenerativeModel, places: Array) -> Seeds:
         """Predicts the panorama at every place (S, 2)."""
         lasers = np.column_stack([places, np.zeros(len(places))])
-        directions = np.linspace(0.0, 2 * np.pi, PANORAMA_BINS, endpoint=False)
-        panoramas = np.empty((len(lasers), 2, PANORAMA_PHASES, RANKED_HEADINGS), np.uint8)
+        directions = np.linspace(0.0, 2 * np.pi, RANKED_HEADINGS, endpoint=False)
+        panoramas = np.empty((len(lasers), 2, RANKED_HEADINGS), np.uint8)
         for begin in range(0, len(lasers), 500):
             part = slice(begin, begin + 500)
             expected = model.expect(lasers[part], directions)
             behind = model.expect_behind(lasers[part], directions, expected.ranges)
-            steps = np.stack([np.where(np.isinf(expected.scale), 0, _steps(expected.ranges)), _steps(behind)], axis=1)
-            panoramas[part] = steps.reshape(-1, 2, RANKED_HEADINGS, PANORAMA_PHASES).transpose(0, 1, 3, 2)
+            panoramas[part, 0] = np.where(np.isinf(expected.scale), 0, _steps(expected.ranges))
+            panoramas[part, 1] = _steps(behind)
         return cls(np.asarray(places, float), panoramas)
 
     @property
@@ -61,17 +60,31 @@ class Seeds:
 
     def rank(self, view: View, count: int) -> Array:
         """The ``count`` base_link poses (count, 3) that fit the scan best, best first; at most two per place."""
-        thin = view.thinned(RANKED_BEAMS)
-        used = ~(np.isnan(thin.ranges) | np.isneginf(thin.ranges))
-        bins = np.round(thin.angles[used] / (2 * np.pi / PANORAMA_BINS)).astype(np.int64) % PANORAMA_BINS
-        costs = np.empty((len(self.places), RANKED_HEADINGS), np.uint16)
-        most = int(_steps(np.array(view.range_max)))
-        beam_sums.rank_places(self.panoramas, bins, _steps(thin.ranges[used]), most, costs)
-        best = np.sort(np.argsort(costs.min(axis=1), kind="stable")[:count])
+        places, panoramas = self.places, self.panoramas
+        if len(places) > FULLY_RANKED_PLACES:
+            least, _ = _costs(panoramas, view.thinned(PRESELECTION_BEAMS), all_headings=False)
+            chosen = np.sort(np.argsort(least, kind="stable")[:FULLY_RANKED_PLACES])
+            places, panoramas = places[chosen], panoramas[chosen]
+        least, costs = _costs(panoramas, view.thinned(RANKED_BEAMS))
+        best = np.sort(np.argsort(least, kind="stable")[:count])
         place, heading = _least_costs(costs[best], count)
         headings = se2.wrap(heading * (2 * np.pi / RANKED_HEADINGS))
-        lasers = np.column_stack([self.places[best[place]], headings])
+        lasers = np.column_stack([places[best[place]], headings])
         return se2.compose(lasers, se2.inverse(view.mount))
+
+
+def _costs(
+    panoramas: npt.NDArray[np.uint8], view: View, *, all_headings: bool = True
+) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint16]]:
+    """Misfit of a scan with each panorama: the least one (S,), and that of all headings (S, H), if wanted."""
+    used = ~(np.isnan(view.ranges) | np.isneginf(view.ranges))
+    bins = np.round(view.angles[used] / (2 * np.pi / RANKED_HEADINGS)).astype(np.int64) % RANKED_HEADINGS
+    least = np.empty(len(panoramas), np.uint16)
+    costs = np.empty((len(panoramas) if all_headings else 0, RANKED_HEADINGS), np.uint16)
+    words = panoramas.view(np.uint64)
+    words.flags.writeable = False  # as those of a file are: numba compiles again for others
+    beam_sums.rank_places(words, bins, _steps(view.ranges[used]), int(_steps(np.array(view.range_max))), least, costs)
+    return least, costs
 
 
 def _steps(ranges: Array) -> npt.NDArray[np.uint8]:

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.geometry.occupancy_grid import OccupancyGrid
+from common.geometry.outline_index import OutlineIndex
 from common.geometry.ray_casting import cast_rays, cast_rays_with_jacobian, clear_radius
 from common.geometry.world import World
 from tests.common.geometry.maps import HUT, ROOM, rooms, speckled
@@ -60,6 +61,42 @@ def test_brute_force(seed, kind):
     poses = np.column_stack([rng.uniform(-4, 14, (4, 2)), rng.uniform(-np.pi, np.pi, 4)])
     expected = [[brute_force(world, pose, angle) for angle in ANGLES] for pose in poses]
     np.testing.assert_allclose(cast_rays(world, poses, ANGLES), expected, atol=1e-9, rtol=1e-9)
+
+
+def clutter(seed):
+    """A hall with boxes and circles, half of them on whole metres, and the same world with all outlines in one cell."""
+    rng = np.random.default_rng(seed)
+    width, height = rng.integers(3, 40, 2).tolist()
+    obstacles = []
+    for k in range(rng.integers(0, 60)):
+        x, y = np.where(k % 2, rng.integers(0, [width, height]), rng.uniform(0, [width, height])).tolist()
+        yaw, size = rng.choice([0.0, 45.0, rng.uniform(0, 90)]), rng.uniform(0.05, 3)
+        box = {"box": {"center": (x, y), "size": (size, 1.0), "yaw_deg": yaw}}
+        obstacles.append(box if k % 3 else {"circle": {"center": (x, y), "radius": size / 2}})
+    world = World(name="x", boundary=[(0, 0), (width, 0), (width, height), (0, height)], obstacles=obstacles)
+    listed = world.model_copy()
+    count, far = len(world.outlines) + len(world.circles), 1e3
+    one_cell = OutlineIndex(
+        world.outlines, world.circles, np.array([0, count]), np.arange(count), (1, 1), (-far, -far, 2 * far)
+    )
+    listed.__dict__["outline_index"] = one_cell  # the cached property
+    return world, listed
+
+
+@settings(max_examples=50)
+@given(st.integers(0, 2**32 - 1))
+def test_outline_index(seed):
+    world, listed = clutter(seed)
+    x0, y0, x1, y1 = world.bounds
+    rng = np.random.default_rng(seed)
+    poses = np.column_stack([rng.uniform([x0 - 2, y0 - 2], [x1 + 2, y1 + 2], (12, 2)), np.zeros(12)])
+    poses[:4] = np.round(poses[:4])  # with rays along the edges of cells, and along outlines
+    angles = np.linspace(-np.pi, np.pi, 41)
+    people = np.array([[*poses[5, :2], 0.3], [*poses[6, :2], 1.5]])
+    for crowd in (None, people):
+        np.testing.assert_array_equal(cast_rays(world, poses, angles, crowd), cast_rays(listed, poses, angles, crowd))
+    jacobians = [cast_rays_with_jacobian(each, poses, angles)[1] for each in (world, listed)]
+    np.testing.assert_allclose(*jacobians, atol=1e-9)
 
 
 @settings(max_examples=20)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from common.geometry import se2
 from common.geometry.ray_casting import MIN_COSINE
 from common.geometry.world import World
-from services.estimator.precise import beam_sums
+from services.estimator.precise import beam_sums, global_seeds
 from services.estimator.precise.gauss_newton import MAX_STEP, Prior, View, descend, difference
 from services.estimator.precise.global_seeds import Seeds, thin_places
 from services.estimator.precise.hypotheses import Mode, constraining_beams, select_distinct, weigh
@@ -300,16 +300,32 @@ def test_seed_ranking():
         assert (near & (np.abs(se2.wrap(ranked[:, 2] - pose[2])) < 0.2)).any()
 
 
+def test_preselection(monkeypatch):
+    rng = np.random.default_rng(5)
+    seeds = Seeds.at(RayCaster(ROOM), thin_places(ROOM.sample_free(4000, rng, 0.05), 0.2))
+    shared = []
+    for _ in range(20):
+        pose = np.array([*ROOM.sample_free(1, rng, 0.27)[0], rng.uniform(-np.pi, np.pi)])
+        ranges = scan(pose, rng)
+        ranges[: len(ranges) // 4] *= 0.5  # blocked
+        exhaustive = seeds.rank(view(ranges), 30)
+        with monkeypatch.context() as patch:
+            patch.setattr(global_seeds, "FULLY_RANKED_PLACES", len(seeds.places) // 3)
+            shared.append(len({*map(tuple, seeds.rank(view(ranges), 30))} & {*map(tuple, exhaustive)}) / 30)
+    assert np.mean(shared) > 0.95
+
+
 def test_ranking_costs():
     rng = np.random.default_rng(4)
-    panoramas = rng.integers(0, 256, (5, 2, 3, 120)).astype(np.uint8)
-    bins, measured, most = np.arange(0, 360, 5), rng.integers(1, 256, 72).astype(np.uint8), 200
-    costs = np.empty((5, 120), np.uint16)
-    beam_sums.rank_places(panoramas, bins, measured, most, costs)
-    around = np.minimum(panoramas, most).transpose(1, 0, 3, 2).reshape(2, 5, 360).astype(int)
+    panoramas = rng.integers(0, 256, (5, 2, 120)).astype(np.uint8)
+    bins, measured, most = np.arange(0, 120, 2), rng.integers(1, 256, 60).astype(np.uint8), 200
+    least, costs = np.empty(5, np.uint16), np.empty((5, 120), np.uint16)
+    beam_sums.rank_places(panoramas.view(np.uint64), bins, measured, most, least, costs)
+    assert np.array_equal(least, costs.min(axis=1))
+    around = np.minimum(panoramas, most).transpose(1, 0, 2).astype(int)
     o = np.minimum(measured, most).astype(int)
     for heading in range(120):
-        surface, behind = around[:, :, (bins + 3 * heading) % 360]
+        surface, behind = around[:, :, (bins + heading) % 120]
         late = np.minimum(np.minimum(o - surface, 10), 2 + np.minimum(np.abs(o - behind), 8))
         misfit = np.where(o > surface, late, np.minimum(surface - o, 6))
         assert np.array_equal(costs[:, heading], np.where(surface > 0, misfit, 4).sum(axis=1))

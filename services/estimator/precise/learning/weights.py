@@ -15,7 +15,7 @@ from common.errors import UserError, first_fault
 from common.geometry.world import World
 from common.robot.scanner import Scanner
 from services.estimator.precise.field import CLASSES, DistanceField, FieldModel, SeenCells
-from services.estimator.precise.global_seeds import PANORAMA_PHASES, RANKED_HEADINGS, Seeds
+from services.estimator.precise.global_seeds import RANKED_HEADINGS, Seeds
 from services.estimator.precise.learning.calibration import Calibration
 from services.estimator.shared.digest import check_digest, sha256
 from services.estimator.shared.model_folder import SHIPPED, training_folder
@@ -129,7 +129,7 @@ def _check_arrays(tensors: Tensors) -> None:
         or min(phi.shape) < 2
         or scales.shape != (int(np.prod(CLASSES)),)
         or places.shape[1:] != (2,)
-        or (panoramas is not None and panoramas.shape != (len(places), 2, PANORAMA_PHASES, RANKED_HEADINGS))
+        or (panoramas is not None and panoramas.shape != (len(places), 2, RANKED_HEADINGS))
     ):
         raise ValueError("an array does not have the shape that a field needs")
     if not all(np.isfinite(a).all() for a in (phi, scales, places)):
@@ -151,9 +151,12 @@ def load(path: Path) -> tuple[FieldModel, Seeds, FieldCard]:
         check_digest(path, data, card.weights_sha256, card.command)
         tensors = safetensors.numpy.load(data)
         phi, scales, places = tensors["phi"], tensors["scales"], tensors["places"]
+        panoramas = tensors.get("panoramas_in_bytes")  # files written by older versions have none
+        if panoramas is not None and panoramas.ndim == 4:  # written by older versions, with three times the directions
+            panoramas = tensors["panoramas_in_bytes"] = np.ascontiguousarray(panoramas[:, :, 0])
     except OSError as error:
         raise UserError(f"weights {path}: cannot be read ({error})") from None
-    except (safetensors.SafetensorError, KeyError, ValueError) as error:
+    except (safetensors.SafetensorError, KeyError, IndexError, ValueError) as error:
         raise UserError(
             f"weights {path}: this is not a file of field weights ({' '.join(str(error).split())[:200]})"
         ) from None
@@ -161,7 +164,6 @@ def load(path: Path) -> tuple[FieldModel, Seeds, FieldCard]:
         _check_arrays(tensors)
     except ValueError as error:
         raise UserError(f"weights {path}: {error}") from None
-    panoramas = tensors.get("panoramas_in_bytes")  # files written by older versions have none
     field, places = DistanceField(phi.astype(np.float32), card.origin, card.resolution), places.astype(np.float64)
     if panoramas is None:
         field = field.with_solids(places)
