@@ -70,6 +70,17 @@ def test_back_near_the_goal_after_being_lost():
     assert log[-1][1].state == "reached"
 
 
+def test_stands_at_the_goal_of_the_best_guess():
+    """Without the terms of information, a robot waits there until the belief is no longer ambiguous."""
+    navigator = Navigator(preset=GeodesicPolicy(Robot(), ROOM, epistemic=False), world=ROOM)
+    navigator.on_goal(goal(8.5, 2))
+    log = session(navigator, [8.495, 2, 0], [None] * 90, ROOM, state="ambiguous")
+    assert not any("refused" in status.reason for _, status, _ in log)
+    assert np.hypot(*(log[-1][2][:2] - [8.5, 2])) < 0.02
+    ((_, status, _),) = session(navigator, log[-1][2], [None], ROOM, first=90)
+    assert status.state == "reached"
+
+
 @pytest.mark.parametrize("state", ["localising", "lost", "ambiguous"])
 def test_stands_until_localised(navigator, state):
     ((command, status, _),) = session(navigator, [1.5, 2, 0], [None], ROOM, state=state)

@@ -218,6 +218,7 @@ class GeodesicPolicy:
             points = safety.scan_points(self._scan)
             points = points[np.hypot(*points.T) < OBSTACLE_RANGE_M]
             return self.localiser.decide(belief, self._scan, points, velocity, self._field_of_view)
+        self._nearest = None  # a robot that stands at its goal by the best guess is not stuck
         decision = self.decide(belief, velocity)
         decision.reason = decision.reason or f"the belief is {belief.state}: going by its best guess"
         return decision

@@ -62,27 +62,17 @@ class ScanSurfaces:
 
 @jit
 def _mark_edges(ranges: Array, starts: npt.NDArray[np.bool_], increment: float, edges: npt.NDArray[np.int64]) -> None:
-    """Fills ``edges`` of `ScanSurfaces`. There may also be an edge just beside the first and the last beam."""
+    """Fills ``edges`` of `ScanSurfaces`."""
     last = -1
     for b in range(ranges.shape[0]):
         if np.isnan(ranges[b]) or ranges[b] == -np.inf:
             continue
-        if last < 0:
-            _mark_edge(b, b, ranges[b], increment, edges)
-        elif starts[b]:
+        if starts[b] and last >= 0:
             near = min(ranges[b], ranges[last])  # the edge belongs to the nearer of the two surfaces
-            _mark_edge(last + 1, b, near, increment, edges)
+            reach = 1 + int(EDGE_M / (near * increment))
+            for at in range(max(0, last + 1 - reach), min(ranges.shape[0], b + reach)):
+                edges[at] = max(edges[at], reach)
         last = b
-    if last >= 0:
-        _mark_edge(last + 1, last + 1, ranges[last], increment, edges)
-
-
-@jit
-def _mark_edge(first: int, last: int, near: float, increment: float, edges: npt.NDArray[np.int64]) -> None:
-    """Marks the beams near an edge at a surface ``near`` m away, before one of the beams ``first`` to ``last``."""
-    reach = 1 + int(min(EDGE_M / (near * max(increment, 1e-9)), edges.shape[0]))
-    for at in range(max(0, first - reach), min(edges.shape[0], last + reach)):
-        edges[at] = max(edges[at], reach)
 
 
 @jit
