@@ -118,8 +118,9 @@ class Robot:
 
 
 def searching(loop):
-    """Whether each robot waits for its search."""
-    return all(robot.search for robot in loop._robots.values())
+    """Whether each robot is known, and waits for its search."""
+    known = list(loop._robots.values())
+    return len(known) == len(loop.settings.robots.split(",")) and all(robot.search for robot in known)
 
 
 @pytest.fixture

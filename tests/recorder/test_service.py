@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import random
 import re
@@ -188,9 +189,16 @@ def test_removed_file(recorder, logs):
 def test_invented_keys(recorder, recorder_health, bus, logs):
     running = recorder()
     assert bus.wait_matching(HEALTH, 10, service="me")
-    for number in range(MAX_KEYS + 400):  # some may be lost on a busy machine
-        bus.put(HEALTH, b"", service=f"x{number}")
-    recorder_health(lambda health, _: health.counters.get("turned_away", 0) >= 200)
+    numbers = itertools.count()
+
+    def turned_away(health, _):
+        for _ in range(200):  # again after each report, because some are lost on a busy machine
+            bus.put(HEALTH, b"", service=f"x{next(numbers)}")
+        return health.counters.get("turned_away", 0) >= 200
+
+    for number in range(MAX_KEYS):
+        bus.put(HEALTH, b"", service=f"y{number}")
+    recorder_health(turned_away)
     assert running.stop() == 0
     recording = read_recording(only_file(logs))
     assert len(recording.counts()) <= MAX_KEYS
