@@ -50,9 +50,8 @@ def place_drive(world: World, keys: ReferenceDrive, model: Path | None = None) -
     if model is None:
         searched = np.unique(np.linspace(0, len(keys.poses) - 1, MAX_KEYS).round().astype(int))
     found, covariances = _localise(world, keys.part(searched), model)
-    middle = np.array(
-        [*keys.poses[:, :2].mean(axis=0), 0.0]
-    )  # about which the drive is turned, so that it hardly moves
+    # The drive is turned about its middle, so that it hardly moves.
+    middle = np.array([*keys.poses[:, :2].mean(axis=0), 0.0])
     local = se2.between(middle, keys.poses[searched])
     origins = se2.compose(found, se2.inverse(local))  # pose of the middle in map, according to each key scan
     agreeing = [_distance(se2.compose(origin, local), found) < SAME_M for origin in origins]

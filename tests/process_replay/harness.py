@@ -52,7 +52,7 @@ class FakeBus:
         self, query: Query, request: Request, number: int, inbox: Inbox, timeout: float = 5.0, service: str = "*"
     ) -> None:
         reply = self.replies.get((query.server, query.name))
-        inbox.put(RequestResult(query, number, reply.encode() if reply else b"", "" if reply else "nobody answers"))
+        inbox.put(RequestResult(query, number, reply.encode() if reply else b"", "" if reply else "no reply"))
 
     def query_all(self, *args: Any, **rest: Any) -> threading.Event:
         """Completes at once, without answers."""

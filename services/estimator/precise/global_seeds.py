@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 SEED_SPACING_M = 0.3  # between the places at which a search begins
 RANKED_HEADINGS, RANKED_BEAMS = 120, 72  # that are compared with the panorama of each place
-FULLY_RANKED_PLACES, PRESELECTION_BEAMS = 4000, 24  # of more places, those that fit fewer beams best
+# If there are more places than this, a comparison with few beams selects that many of them first.
+FULLY_RANKED_PLACES, PRESELECTION_BEAMS = 4000, 24
 RANGE_STEP_M = 0.1  # of a stored range; 0 is unknown
 MAX_RANGE_STEPS = 255  # largest stored range, so that it fits a byte
 

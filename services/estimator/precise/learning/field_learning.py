@@ -22,10 +22,9 @@ from services.estimator.precise.field import CLASSES, SEEN_CELL_M, DistanceField
 from services.estimator.precise.global_seeds import SEED_SPACING_M, thin_places
 from services.estimator.precise.learning.beam_cells import count_at_nodes, mark_seen_cells
 from services.estimator.precise.learning.surfaces import (
-    MIN_POINTS_PER_CELL,
-    MIN_PRESENT_SHARE,
     PASSED_DEPTH_M,
     Beams,
+    are_mostly_passed,
     field_of_surfaces,
 )
 from services.estimator.shared.generative_models import CORNER_ANGLE_RAD
@@ -120,15 +119,14 @@ def measure_ripple(field: DistanceField, lasers: Array, angles: Array) -> float:
 
 
 def _clear_passed_nodes(field: DistanceField, beams: Beams) -> Floats:
-    """Phi, positive at the nodes that most of the beams pass that come near.
+    """Phi, made positive at the nodes that most beams near them pass.
 
     Beside an outer corner, noise along the beams resembles a surface, and its plane may reach into free space.
     """
     ended, passed = np.zeros((2, *field.phi.shape))
     starts, h = beams.starts - field.origin, field.resolution
     count_at_nodes(starts, beams.unit(), beams.ranges, h, PASSING_CELLS * h, PASSED_DEPTH_M, ended, passed)
-    free = (passed >= MIN_POINTS_PER_CELL) & (ended < MIN_PRESENT_SHARE * (ended + passed))
-    return np.where(free, np.maximum(field.phi, np.float32(PASSING_CELLS * h)), field.phi)
+    return np.where(are_mostly_passed(ended, passed), np.maximum(field.phi, np.float32(PASSING_CELLS * h)), field.phi)
 
 
 def _descend(field: DistanceField, beams: Beams, sample: npt.NDArray[np.intp], rate: float) -> Floats:
@@ -141,7 +139,7 @@ def _descend(field: DistanceField, beams: Beams, sample: npt.NDArray[np.intp], r
     for begin in range(0, len(sample), BEAMS_AT_ONCE):
         part = beams.part(sample[begin : begin + BEAMS_AT_ONCE])
         _add_errors(field, part, ended, passed, up, norm)
-    absent = (passed >= MIN_POINTS_PER_CELL) & (ended < MIN_PRESENT_SHARE * (ended + passed))
+    absent = are_mostly_passed(ended, passed)
     phi = np.where(absent, np.maximum(field.phi.ravel(), CARVED_DISTANCE_CELLS * field.resolution), field.phi.ravel())
     step = np.divide(up, norm + 1.0, out=np.zeros_like(up))
     return np.asarray(phi.astype(np.float32) + rate * step, np.float32).reshape(field.phi.shape)

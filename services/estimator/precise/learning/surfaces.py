@@ -109,7 +109,7 @@ class SurfaceCells:
         ended = np.zeros(self.own.shape)
         np.add.at(ended, tuple(cell[inside].T), 1.0)
         ended = _pooled(ended)
-        return np.asarray((crossed >= MIN_POINTS_PER_CELL) & (ended < MIN_PRESENT_SHARE * (ended + crossed)))
+        return are_mostly_passed(ended, crossed)
 
     def at(self, mask: npt.NDArray[np.bool_], points: Array) -> npt.NDArray[np.bool_]:
         """The values (N,) of a mask (ny, nx) at points (N, 2) m in map; False beyond the grid."""
@@ -122,6 +122,11 @@ class SurfaceCells:
         """Rows and columns (N, 2) of points (N, 2) m in map, and whether they are inside the grid."""
         cell = np.floor((points - self.low) / self.h).astype(int)[:, ::-1]
         return cell, np.asarray(((cell >= 0) & (cell < self.own.shape)).all(axis=1))
+
+
+def are_mostly_passed(ended: Array, passed: Array) -> npt.NDArray[np.bool_]:
+    """Where enough beams passed through, and too small a share ended, for a surface to be there."""
+    return np.asarray((passed >= MIN_POINTS_PER_CELL) & (ended < MIN_PRESENT_SHARE * (ended + passed)))
 
 
 def field_of_surfaces(beams: Beams, h: float) -> DistanceField:
