@@ -11,13 +11,14 @@ from typing import Any
 
 from playwright.sync_api import Browser, Page, sync_playwright
 
+from tests.conftest import WAIT_TIMEOUT_S
+
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 ARGUMENTS = [
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
     "--disable-component-update", "--disable-sync", "--force-color-profile=srgb",
 ]  # fmt: skip
 
-PATIENCE = 60.0  # s, deadline of a wait for an answer that takes well under a second on an idle machine
 # An answer is on the screen for some seconds only, and a busy machine may look too late: keep them all.
 KEEP_TOASTS = """window.toasts = [];
 new MutationObserver((changes) => {
@@ -63,7 +64,7 @@ class Visit:
             f"(arg) => {{ const {{ store, view, modes }} = presage; return {expression}; }}", argument
         )
 
-    def wait(self, condition: str, seconds: float = 30.0, argument: Any = None) -> None:
+    def wait(self, condition: str, seconds: float = WAIT_TIMEOUT_S, argument: Any = None) -> None:
         """Until an expression is true; raises playwright's TimeoutError."""
         body = f"(arg) => {{ const {{ store, view, modes }} = presage; return Boolean({condition}); }}"
         self.page.wait_for_function(body, arg=argument, timeout=1000 * seconds)
@@ -89,7 +90,7 @@ class Visit:
     def toast(self, text: str = "", *, ok: bool = True) -> str:
         """The first answer with some text in it since the last one returned here, once it was shown."""
         found = "window.toasts.findIndex((toast) => toast.ok === arg[0] && toast.text.includes(arg[1]))"
-        self.wait(f"{found} >= 0", PATIENCE, [ok, text])
+        self.wait(f"{found} >= 0", WAIT_TIMEOUT_S, [ok, text])
         return str(self.see(f"window.toasts.splice(0, 1 + {found}).at(-1).text", [ok, text]))
 
 
@@ -99,5 +100,5 @@ def visit(browser: Browser, address: str, *, width: int = 1100, height: int = 76
     context.add_init_script(KEEP_TOASTS)
     seen = Visit(context.new_page())
     seen.page.goto(address)
-    seen.page.wait_for_function("() => window.presage && presage.store.connected")
+    seen.page.wait_for_function("() => window.presage && presage.store.connected", timeout=1000 * WAIT_TIMEOUT_S)
     return seen

@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 import numpy as np
 from websockets.sync.client import connect
 
-PATIENCE = 30.0  # s
+from tests.conftest import WAIT_TIMEOUT_S
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ def no_json(name):
     raise AssertionError(f"{name} is no JSON")
 
 
-def page_of(running, timeout=PATIENCE):
+def page_of(running, timeout=WAIT_TIMEOUT_S):
     """The link that a viewer printed."""
     running.wait_for("page: ", timeout)
     return next(line for line in running.output.splitlines() if line.startswith("page: ")).removeprefix("page: ")
@@ -61,7 +61,7 @@ class Page:
     def __init__(self, link, origin=None, **options):
         parts = urlsplit(link)
         query = f"?{parts.query}" if parts.query else ""
-        options = {"open_timeout": PATIENCE, "compression": None, "max_size": None, "close_timeout": 2, **options}
+        options = {"open_timeout": WAIT_TIMEOUT_S, "compression": None, "max_size": None, "close_timeout": 2, **options}
         origin = origin or f"http://{parts.netloc}"
         self.socket = connect(f"ws://{parts.netloc}/ws{query}", origin=origin, **options).__enter__()
         self.numbers = itertools.count(1)
@@ -73,14 +73,14 @@ class Page:
     def __exit__(self, *_):
         self.socket.close()
 
-    def next(self, timeout=PATIENCE):
+    def next(self, timeout=WAIT_TIMEOUT_S):
         """The next message: a Frame, or a dict."""
         data = self.socket.recv(timeout)
         message = read_frame(data) if isinstance(data, bytes) else json.loads(data)
         self.last[kind_of(message)] = message
         return message
 
-    def until(self, wanted, timeout=PATIENCE):
+    def until(self, wanted, timeout=WAIT_TIMEOUT_S):
         """The first message that meets a condition."""
         deadline = time.monotonic() + timeout
         while (left := deadline - time.monotonic()) > 0:
@@ -93,22 +93,22 @@ class Page:
         last = "\n".join(f"{kind}: {str(message)[:600]}" for kind, message in self.last.items())
         raise AssertionError(f"nothing as wanted within {timeout:g} s; the last were\n{last}")
 
-    def wait_for(self, kind, wanted=lambda _: True, timeout=PATIENCE):
+    def wait_for(self, kind, wanted=lambda _: True, timeout=WAIT_TIMEOUT_S):
         """The next message of a type that meets a condition."""
         return self.until(lambda m: kind_of(m) == kind and wanted(m), timeout)
 
-    def by_now(self, kind, wanted, timeout=PATIENCE):
+    def by_now(self, kind, wanted, timeout=WAIT_TIMEOUT_S):
         """Like `wait_for`, but also accepts the last message that was already received."""
         last = self.last.get(kind)
         if last is not None and wanted(last):
             return last
         return self.wait_for(kind, wanted, timeout)
 
-    def frame(self, wanted=lambda _: True, timeout=PATIENCE):
+    def frame(self, wanted=lambda _: True, timeout=WAIT_TIMEOUT_S):
         """The next frame whose header meets a condition."""
         return self.wait_for("frame", lambda m: wanted(m.header), timeout)
 
-    def request(self, do, timeout=PATIENCE, **fields):
+    def request(self, do, timeout=WAIT_TIMEOUT_S, **fields):
         """Requests an action and returns the answer."""
         number = next(self.numbers)
         self.socket.send(json.dumps({"id": number, "do": do, **fields}))

@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from tests.conftest import ROOT
+from tests.conftest import ROOT, WAIT_TIMEOUT_S
 from tests.viewer.client import Page, is_complete, page_of
 
 STATIC = ROOT / "services" / "viewer" / "static"
@@ -116,7 +116,7 @@ def test_kidnapping(page):
     page.click(*there)
     page.page.keyboard.up("Shift")
     page.toast("carried")
-    page.page.locator("#journal b", has_text="carried").first.wait_for(timeout=20_000)
+    page.page.locator("#journal b", has_text="carried").first.wait_for(timeout=1000 * WAIT_TIMEOUT_S)
     found = f"store.frame.belief?.state === 'tracking' && {AWAY.format('store.frame.belief')} < 0.6"
     page.wait(f"{found} && store.frame.error < 0.1", 60, there)
     off = [error for _, _, error in page.see("window.seen") if error >= 0]

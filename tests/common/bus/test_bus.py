@@ -18,15 +18,14 @@ from common.errors import UserError
 from common.messages.definitions import Pose, Scan
 from common.messages.requests import PoseRequest, Reply, Request
 from common.messages.topics import CONFIG, HEALTH, MAX_BYTES, SCAN, TELEPORT
-
-PATIENCE = 30.0
+from tests.conftest import WAIT_TIMEOUT_S
 
 
 @pytest.fixture
 def other(link):
     """A second session of the same robot."""
     with open_bus(link) as session:
-        assert wait_until(session.linked, PATIENCE)
+        assert wait_until(session.linked, WAIT_TIMEOUT_S)
         yield session
 
 
@@ -57,12 +56,12 @@ def answering(bus, query, answer):
 def test_payloads_arrive_unchanged_in_order(bus, other):
     inbox = Inbox()
     other.subscribe(SCAN, inbox, keep_all=True)
-    assert bus.wait_matching(SCAN, PATIENCE)
+    assert bus.wait_matching(SCAN, WAIT_TIMEOUT_S)
     large = np.random.default_rng(0).bytes(MAX_BYTES)
     sent = [*(scan(i).encode() for i in range(200)), large]
     for payload in (*sent, large + b"x"):
         bus.put(SCAN, payload)
-    assert wait_until(lambda: inbox.received.total() == 202, PATIENCE)
+    assert wait_until(lambda: inbox.received.total() == 202, WAIT_TIMEOUT_S)
     samples = [inbox.get(0) for _ in range(len(inbox))]
     assert [sample.payload for sample in samples] == sent
     assert (samples[0].topic, samples[0].key) == (SCAN, SCAN.key(bus.robot))
@@ -73,10 +72,10 @@ def test_payloads_arrive_unchanged_in_order(bus, other):
 def test_slow_receivers_get_the_newest(bus, other):
     inbox = Inbox()
     other.subscribe(SCAN, inbox)
-    assert bus.wait_matching(SCAN, PATIENCE)
+    assert bus.wait_matching(SCAN, WAIT_TIMEOUT_S)
     for i in range(500):
         bus.put(SCAN, scan(i).encode())
-    assert wait_until(lambda: inbox.received.total() == 500, PATIENCE)
+    assert wait_until(lambda: inbox.received.total() == 500, WAIT_TIMEOUT_S)
     assert (len(inbox), inbox.dropped[SCAN.key(bus.robot)]) == (1, 499)
     assert Scan.decode(inbox.get(0).payload).stamp_ns == 499
 
@@ -88,9 +87,9 @@ def test_robots_are_separate(bus, other, link):
         neighbour.subscribe(SCAN, theirs)
         neighbour.subscribe(SCAN, theirs, robot=link.robot + "y")
         for key, inbox in ((SCAN.key(bus.robot), mine), (SCAN.key(neighbour.robot), theirs)):
-            assert bus.wait_matching(SCAN, PATIENCE, key=key)
+            assert bus.wait_matching(SCAN, WAIT_TIMEOUT_S, key=key)
             bus.put(SCAN, key.encode(), key=key)
-            assert wait_until(lambda i=inbox: len(i) == 1, PATIENCE)
+            assert wait_until(lambda i=inbox: len(i) == 1, WAIT_TIMEOUT_S)
         assert theirs.get(0).payload == SCAN.key(neighbour.robot).encode()
 
 
@@ -98,9 +97,9 @@ def test_subscription_to_all_services(bus, other):
     inbox = Inbox()
     other.subscribe(HEALTH, inbox)
     for service in ("estimator", "controller"):
-        assert bus.wait_matching(HEALTH, PATIENCE, service)
+        assert bus.wait_matching(HEALTH, WAIT_TIMEOUT_S, service)
         bus.put(HEALTH, b"x", service)
-    assert wait_until(lambda: len(inbox) == 2, PATIENCE)
+    assert wait_until(lambda: len(inbox) == 2, WAIT_TIMEOUT_S)
     assert {inbox.get(0).key.rsplit("/", 1)[-1] for _ in range(2)} == {"estimator", "controller"}
 
 
@@ -116,7 +115,7 @@ def result_without_waiting(bus, number, timeout, x=1.0) -> str:
     """The reason in the reply to a request that does not block; checks that there is exactly one reply."""
     inbox = Inbox()
     bus.send_request(TELEPORT, PoseRequest(pose=Pose(x=x, y=2.0)), number, inbox, timeout)
-    assert wait_until(lambda: len(inbox) > 0, PATIENCE)
+    assert wait_until(lambda: len(inbox) > 0, WAIT_TIMEOUT_S)
     answer = inbox.get(0)
     assert (answer.query, answer.number, len(inbox)) == (TELEPORT, number, 0)
     return answer.reply().reason
@@ -143,8 +142,8 @@ def test_results_of_requests(bus, other):
         for text, way in ways.items():
             answer.append(way)
             # Until the queryable is known, the error is that no service answers.
-            assert wait_until(lambda t=text: t in result(bus, 0.5), PATIENCE)
-            assert wait_until(lambda t=text: t in result_without_waiting(bus, 4, 0.5), PATIENCE)
+            assert wait_until(lambda t=text: t in result(bus, 0.5), WAIT_TIMEOUT_S)
+            assert wait_until(lambda t=text: t in result_without_waiting(bus, 4, 0.5), WAIT_TIMEOUT_S)
     assert set(received) == {PoseRequest(pose=Pose(x=1.0, y=2.0))}
     assert kept
 
@@ -154,16 +153,16 @@ def test_requests_do_not_block(bus, other):
 
     def answer(call):
         x = PoseRequest.decode(call.payload).pose.x
-        assert x == -1 or may_answer.wait(PATIENCE)
+        assert x == -1 or may_answer.wait(WAIT_TIMEOUT_S)
         call.reply(Reply(reason=f"at {x:g}").encode())
 
     with answering(other, TELEPORT, answer):
-        assert wait_until(lambda: result_without_waiting(bus, 1, PATIENCE, x=-1.0) == "at -1", PATIENCE)
+        assert wait_until(lambda: result_without_waiting(bus, 1, WAIT_TIMEOUT_S, x=-1.0) == "at -1", WAIT_TIMEOUT_S)
         for number in range(20):
-            bus.send_request(TELEPORT, PoseRequest(pose=Pose(x=float(number), y=0.0)), number, inbox, PATIENCE)
+            bus.send_request(TELEPORT, PoseRequest(pose=Pose(x=float(number), y=0.0)), number, inbox, WAIT_TIMEOUT_S)
         assert len(inbox) == 0  # all requests are sent and none is answered yet
         may_answer.set()
-        assert wait_until(lambda: len(inbox) >= 20, PATIENCE)
+        assert wait_until(lambda: len(inbox) >= 20, WAIT_TIMEOUT_S)
     answers = [inbox.get(0) for _ in range(len(inbox))]
     assert sorted((a.number, a.reply().reason) for a in answers) == [(n, f"at {n}") for n in range(20)]
 
@@ -177,7 +176,7 @@ def test_a_requester_may_disappear(bus, other):
             bus.query(TELEPORT, Request(), Reply, timeout=0.2)
         return len(calls) > 0
 
-    assert wait_until(asked, PATIENCE)
+    assert wait_until(asked, WAIT_TIMEOUT_S)
     call = calls.get(0)
     call.reply(Reply().encode())
     assert other.alive() == set()
@@ -188,14 +187,14 @@ def test_liveliness(bus, link):
     bus.watch_alive(lambda *change: changes.append(change))
     with open_bus(link) as session:
         session.declare_alive("estimator")
-        assert wait_until(lambda: changes == [("estimator", True)], PATIENCE)
-        assert wait_until(lambda: bus.alive() == {"estimator"}, PATIENCE)
+        assert wait_until(lambda: changes == [("estimator", True)], WAIT_TIMEOUT_S)
+        assert wait_until(lambda: bus.alive() == {"estimator"}, WAIT_TIMEOUT_S)
         late = []
         bus.watch_alive(lambda *change: late.append(change))  # a late watcher is notified too
         # Existing and new services may be reported once or twice, but no others.
-        assert wait_until(lambda: set(late) == {("estimator", True)}, PATIENCE)
-    assert wait_until(lambda: changes[-1] == ("estimator", False), PATIENCE)
-    assert wait_until(lambda: bus.alive() == set(), PATIENCE)
+        assert wait_until(lambda: set(late) == {("estimator", True)}, WAIT_TIMEOUT_S)
+    assert wait_until(lambda: changes[-1] == ("estimator", False), WAIT_TIMEOUT_S)
+    assert wait_until(lambda: bus.alive() == set(), WAIT_TIMEOUT_S)
 
 
 def test_closing_a_session_in_use(link):
@@ -212,7 +211,7 @@ def test_closing_a_session_in_use(link):
         ended.clear()
         with open_bus(link) as bus:
             threading.Thread(target=ask, args=(bus,), daemon=True).start()
-        assert ended.wait(PATIENCE)
+        assert ended.wait(WAIT_TIMEOUT_S)
 
 
 def test_restart_of_the_router(processes, free_port):
@@ -224,20 +223,20 @@ def test_restart_of_the_router(processes, free_port):
         assert not one.linked()
         listen = ("common.router", "--listen", link.connect[0])
         router = processes.start(*listen)
-        assert one.wait_matching(SCAN, PATIENCE), router.output
+        assert one.wait_matching(SCAN, WAIT_TIMEOUT_S), router.output
         one.put(SCAN, b"with")
-        assert wait_until(lambda: len(inbox) == 1, PATIENCE)
+        assert wait_until(lambda: len(inbox) == 1, WAIT_TIMEOUT_S)
 
         router.send(signal.SIGKILL)
         router.wait()
         one.put(SCAN, b"without")
-        assert wait_until(lambda: len(inbox) == 2, PATIENCE)
+        assert wait_until(lambda: len(inbox) == 2, WAIT_TIMEOUT_S)
 
         processes.start(*listen)
         with open_bus(replace(link, listen=())) as three:  # it can be reached through the router alone
-            assert three.wait_matching(SCAN, PATIENCE)
+            assert three.wait_matching(SCAN, WAIT_TIMEOUT_S)
             three.put(SCAN, b"again")
-            assert wait_until(lambda: len(inbox) == 3, PATIENCE)
+            assert wait_until(lambda: len(inbox) == 3, WAIT_TIMEOUT_S)
     assert [inbox.get(0).payload for _ in range(3)] == [b"with", b"without", b"again"]
 
 

@@ -11,8 +11,8 @@ import pytest
 
 from common.bus.bus import wait_until
 from common.containers.run_per_robot import main, robot_names
+from tests.conftest import WAIT_TIMEOUT_S
 
-PATIENCE = 30.0
 CHILD = """
 import os, signal, sys, time
 from pathlib import Path
@@ -68,10 +68,10 @@ def test_invalid_arguments_are_refused(argv, capsys):
 def test_restarted_process(fleet, tmp_path):
     running = fleet("each", "3")
     robots = ["robot-1", "robot-2", "robot-3"]
-    assert wait_until(lambda: all(started(tmp_path, robot) for robot in robots), PATIENCE), running.output
+    assert wait_until(lambda: all(started(tmp_path, robot) for robot in robots), WAIT_TIMEOUT_S), running.output
     running.wait_for("robot-3 | here None")
     os.kill(started(tmp_path, "robot-2")[0], signal.SIGKILL)
-    assert wait_until(lambda: len(started(tmp_path, "robot-2")) == 2, PATIENCE), running.output
+    assert wait_until(lambda: len(started(tmp_path, "robot-2")) == 2, WAIT_TIMEOUT_S), running.output
     assert "robot-2 | ended with status -9; started again in 1 s" in running.output
     assert len(started(tmp_path, "robot-1")) == len(started(tmp_path, "robot-3")) == 1
     assert running.stop() == 0
@@ -85,7 +85,7 @@ def test_killed_launcher(fleet, tmp_path):
     running.wait_for("robot-2 | here")
     children = started(tmp_path, "robot-1") + started(tmp_path, "robot-2")
     running.kill()
-    assert wait_until(lambda: not any(psutil.pid_exists(pid) for pid in children), PATIENCE)
+    assert wait_until(lambda: not any(psutil.pid_exists(pid) for pid in children), WAIT_TIMEOUT_S)
 
 
 def test_once_ends_with_the_worst_status(fleet, tmp_path):

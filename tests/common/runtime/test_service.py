@@ -16,8 +16,8 @@ from common.errors import UserError
 from common.messages.definitions import CmdVel, Goal, Health, Pose, Scan
 from common.messages.requests import ConfigReply, PoseRequest, Reply, Request
 from common.messages.topics import CMD_VEL, CONFIG, GOAL, HEALTH, MAX_BYTES, SCAN, TELEPORT
+from tests.conftest import WAIT_TIMEOUT_S
 
-PATIENCE = 30.0
 SMALL = Path(__file__).parents[1] / "small_service.py"
 
 
@@ -30,9 +30,9 @@ class Beside:
         self.latest: Health | None = None
         bus.subscribe(HEALTH, self.health)
         bus.subscribe(CMD_VEL, self.commands, keep_all=True)
-        assert wait_until(lambda: "small" in bus.alive(), PATIENCE), running.output
-        assert bus.wait_matching(SCAN, PATIENCE)
-        assert bus.wait_matching(GOAL, PATIENCE)
+        assert wait_until(lambda: "small" in bus.alive(), WAIT_TIMEOUT_S), running.output
+        assert bus.wait_matching(SCAN, WAIT_TIMEOUT_S)
+        assert bus.wait_matching(GOAL, WAIT_TIMEOUT_S)
         assert self.until(lambda h: True)
 
     def until(self, fits) -> bool:
@@ -46,7 +46,7 @@ class Beside:
                         return True
             return False
 
-        return wait_until(look, PATIENCE)
+        return wait_until(look, WAIT_TIMEOUT_S)
 
     def row(self, health: Health, topic):
         return next((row for row in health.topics if row.key == topic.key(self.bus.robot)), None)
@@ -69,7 +69,7 @@ def scan(stamp: int) -> bytes:
 def test_messages_are_numbered_and_counted(small):
     for i in range(20):
         small.bus.put(SCAN, scan(i))
-        assert wait_until(lambda i=i: small.commands.received.total() == i + 1, PATIENCE)
+        assert wait_until(lambda i=i: small.commands.received.total() == i + 1, WAIT_TIMEOUT_S)
     commands = [CmdVel.decode(small.commands.get(0).payload) for _ in range(20)]
     assert [(c.stamp_ns, c.seq) for c in commands] == [(i, i) for i in range(20)]
     rates = []
@@ -102,7 +102,7 @@ def test_health_is_published_once_a_second(small):
 def test_undecodable_payloads(small):
     # On health, where every payload is kept: on a newest-only key one may take the place of another before it is read.
     key = HEALTH.key(small.bus.robot, "intruder")
-    assert small.bus.wait_matching(HEALTH, PATIENCE, key=key)
+    assert small.bus.wait_matching(HEALTH, WAIT_TIMEOUT_S, key=key)
     began = time.monotonic()
     for payload in [b"", b"\xc1", b"x" * 100, scan(1)[:-3], bytes(MAX_BYTES + 1)] * 10:
         small.bus.put(HEALTH, payload, key=key)
@@ -163,7 +163,7 @@ def test_results_of_requests(small):
 def test_failing_timer(bus, process):
     beside = Beside(bus, process(SMALL, "--fail", "timer"))
     beside.bus.put(SCAN, scan(5))
-    assert wait_until(lambda: len(beside.commands) == 1, PATIENCE)
+    assert wait_until(lambda: len(beside.commands) == 1, WAIT_TIMEOUT_S)
 
 
 @pytest.mark.parametrize(("number", "step_s"), [(signal.SIGTERM, 0), (signal.SIGINT, 0), (signal.SIGTERM, 1.0)])
@@ -174,7 +174,7 @@ def test_signals(small, number, step_s):
     assert "closed" in small.running.output
     assert small.running.output.rstrip().endswith("ended")
     assert "Traceback" not in small.running.output
-    assert wait_until(lambda: small.bus.alive() == set(), PATIENCE)
+    assert wait_until(lambda: small.bus.alive() == set(), WAIT_TIMEOUT_S)
 
 
 @pytest.mark.parametrize(("when", "text"), [("making", "in the making"), ("opening", "opening")])
@@ -208,8 +208,8 @@ def test_two_robots_share_a_network(bus, process, link):
     beside = Beside(bus, process(SMALL))
     other = process(SMALL, env={"PRESAGE_ROBOT": link.robot + "b"})
     other.wait_for("ready")
-    assert beside.bus.wait_matching(SCAN, PATIENCE, key=SCAN.key(link.robot + "b"))
+    assert beside.bus.wait_matching(SCAN, WAIT_TIMEOUT_S, key=SCAN.key(link.robot + "b"))
     beside.bus.put(SCAN, scan(1))
-    assert wait_until(lambda: len(beside.commands) == 1, PATIENCE)
+    assert wait_until(lambda: len(beside.commands) == 1, WAIT_TIMEOUT_S)
     assert beside.until(lambda h: h.counters.get("scans") == 1)
-    assert wait_until(lambda: beside.bus.alive() == {"small"}, PATIENCE)  # one look may come too early
+    assert wait_until(lambda: beside.bus.alive() == {"small"}, WAIT_TIMEOUT_S)  # one look may come too early
