@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests import file_list
+from tests import folder_list
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("common", "services", "presage", "lab")
@@ -229,8 +229,8 @@ def test_no_pickle():
 
 
 def test_architecture_page():
-    page = file_list.PAGE.read_text(encoding="utf-8")
-    assert file_list.fill(page) == page, "run: python -m tests.file_list"
+    page = folder_list.PAGE.read_text(encoding="utf-8")
+    assert folder_list.fill(page) == page, "run: python -m tests.folder_list"
 
 
 def test_imports(tmp_path):

@@ -177,7 +177,7 @@ def test_page_from_results(tmp_path):
         page.fill_tables(text.replace("e2", "e1"), tmp_path)
 
 
-DOCS = ("experiments", "real_logs", "navigation", "results", "integrity", "mapping")
+DOCS = ("experiments", "real_logs", "navigation", "results", "integrity", "mapping", "refinement", "exploration")
 PAGES = ["README.md", *(f"docs/{name}.md" for name in DOCS)]
 
 
