@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from common.geometry import se2
+from common.geometry.world import load_world
 from lab.accuracy.motion_distortion import observations
 from lab.accuracy.scenes import Scene
 from services.estimator.particle_filter import ParticleFilter
 from services.estimator.precise.estimator import PreciseEstimator
-from services.estimator.precise.global_seeds import Seeds
+from services.estimator.precise.global_seeds import Seeds, thin_places
 from services.estimator.shared.generative_models import RayCaster
 from services.estimator.shared.interface import Observation
 from services.estimator.shared.motion_correction import correct_motion, pose_at_stamp
@@ -46,6 +47,21 @@ def test_error_over_that_without_distortion(make, prior):
         partial(rms, make, prior=prior), ("instantaneous", "corrected", "uncorrected")
     )
     assert corrected < 1.3 * instantaneous < uncorrected
+
+
+def test_jump_is_no_motion():
+    """The first scan after a robot that stood is carried along a wall is not corrected for the jump."""
+    world = load_world("corridor")
+    scene, model = Scene.of(world, 811, 5), RayCaster(world)
+    mount = np.array(scene.scanner.mount)
+    places = thin_places(world.sample_free(4000, np.random.default_rng(0), 0.05), 0.3)
+    made = PreciseEstimator(model, Seeds.at(model, places), mount)
+    here, there = np.array([4.62, 1.51, 0.92]), np.array([13.0, 1.2, 0.92])
+    made.restart(here, CERTAIN)
+    for k, clean in enumerate(scene.clean(np.array([here] * 3 + [there]))):
+        posterior = made.update(scene.observe(clean, k / 15, time_increment=0.05 / 811))
+    assert posterior.state == "tracking"
+    np.testing.assert_allclose(posterior.pose, there, atol=0.01)
 
 
 def test_pose_at_the_stamp():

@@ -27,7 +27,6 @@ from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.local_map import LocalMap, LocalMapScan, LocalScan
 from services.estimator.precise.motion_model import (
     Candidate,
-    clip_to_plausible_velocity,
     fuse,
     limit_to_map,
     predict_motion,
@@ -237,11 +236,10 @@ class PreciseEstimator:
         period, odom = self._period(observation.stamp), self._odometry_since_last_scan(observation)
         motions = [self._predict(mode, period, odom, observation.command) for mode in self.modes]
         match = self._match(view, motions, period, with_odometry=odom is not None)
-        if observation.time_increment:
-            # Once more, corrected for the motion that the match has shown.
-            velocity = clip_to_plausible_velocity(
-                self.settings.motion, -se2.between(match.poses[0], self.modes[0].pose) / period
-            )
+        if observation.time_increment and any(each.excess(match.poses[0]) == 0 for each in motions[0][:-1]):
+            # Once more, corrected for the motion that the match has shown. If it is none of those predicted, the robot
+            # may have been carried off, and not have moved during the scan.
+            velocity = -se2.between(match.poses[0], self.modes[0].pose) / period
             view = self._correct_motion(view, observation, velocity)
             poses, evidence = view.descend(match.poses, _prior_of([each[-1] for each in match.motions]))
             match = replace(match, poses=poses, evidence=evidence)
