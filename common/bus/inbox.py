@@ -66,7 +66,7 @@ class Inbox:
     def __init__(
         self, capacity: int = 10_000, max_bytes: int = 1 << 28, changed: threading.Condition | None = None
     ) -> None:
-        """Hold at most ``capacity`` entries and ``max_bytes`` bytes of payload.
+        """Holds at most ``capacity`` entries and ``max_bytes`` bytes of payload.
 
         ``changed`` is notified of each new entry; several inboxes may share it, so that one loop can wait for all.
         """
@@ -85,7 +85,7 @@ class Inbox:
         self._lock = changed or lock
 
     def put(self, entry: Sample | IncomingRequest | RequestResult, *, newest_only: bool = False) -> None:
-        """Add an entry. With ``newest_only``, it replaces a waiting sample of the same key and source.
+        """Adds an entry. With ``newest_only``, it replaces a waiting sample of the same key and source.
 
         Entries that are too large or do not fit are dropped and counted; dropped requests are refused.
         """
@@ -138,7 +138,7 @@ class Inbox:
             return self.received.copy(), self.dropped.copy(), self.oversized.copy()
 
     def get(self, timeout: float) -> Sample | IncomingRequest | RequestResult | None:
-        """Take the oldest entry, waiting at most ``timeout`` s for one; returns None if there is none."""
+        """Takes the oldest entry, waiting at most ``timeout`` s for one; returns None if there is none."""
         with self._lock:
             if not self._entries and timeout > 0:
                 self._changed.wait(timeout)
@@ -149,7 +149,7 @@ class Inbox:
             return entry
 
     def wake(self) -> None:
-        """Make a waiting `get` return."""
+        """Makes a waiting `get` return."""
         with self._lock:
             self._changed.notify_all()
 

@@ -17,7 +17,7 @@ class TooLargeError(ValueError):
 
 
 def parse_yaml(text: str | bytes) -> Any:
-    """Parse ``text`` safely.
+    """Parses ``text`` safely.
 
     Raises yaml.YAMLError or ValueError (for a date such as 2020-13-45) if it is not valid YAML, and TooLargeError if it
     exceeds the limits. The limits are checked before loading, because 100 000 nested brackets crash the process in the

@@ -70,7 +70,7 @@ def read_rotation(q: Any) -> Array:
 
 
 def read_pose(position: Any, orientation: Any) -> Transform:
-    """Read a geometry_msgs/Pose or Transform; raises ValueError if it is not finite or not a rotation."""
+    """Reads a geometry_msgs/Pose or Transform; raises ValueError if it is not finite or not a rotation."""
     translation = np.array([position.x, position.y, position.z], float)
     if not np.isfinite(translation).all():
         raise ValueError(f"position {translation.tolist()} m is not finite")

@@ -119,7 +119,7 @@ class CountTimes:
         self._counts: dict[tuple[str, str], int] = {}
 
     def update(self, counts: Mapping[str, Mapping[str, int]], now: float) -> None:
-        """Store the totals so far, by key and kind."""
+        """Stores the totals so far, by key and kind."""
         for key, row in counts.items():
             for kind in COUNT_KINDS:
                 count = row.get(kind, 0)
@@ -158,7 +158,7 @@ class RobotLiveness:
         self._scan_at = -math.inf
 
     def set_alive(self, names: Collection[str], now: float) -> None:
-        """Store the names of all services that have a liveliness token. Call it about once a second."""
+        """Stores the names of all services that have a liveliness token. Call it about once a second."""
         for name in names:
             if (service := self._service(name, now)) is not None:
                 service.has_token, service.token_at = True, now
@@ -168,7 +168,7 @@ class RobotLiveness:
                 del self._services[name]
 
     def add_health(self, health: Health, now: float) -> None:
-        """Store a health message."""
+        """Stores a health message."""
         service = self._service(health.service, now)
         if service is not None and service.health is not None and health.uptime < service.health.uptime:
             self._services.pop(health.service)  # the service was restarted
@@ -180,7 +180,7 @@ class RobotLiveness:
         service.report = Report(now, note=health.note, idle=health.idle, last=service.times.last)
 
     def add_scan(self, now: float) -> None:
-        """Store the arrival of a scan. While scans arrive, as from a robot's own driver, no simulator is needed."""
+        """Stores the arrival of a scan. While scans arrive, as from a robot's own driver, no simulator is needed."""
         self._scan_at = now
 
     def services(self, now: float) -> list[ServiceLiveness]:

@@ -28,7 +28,7 @@ def split_address(setting: str) -> tuple[str, int]:
 
 @contextmanager
 def serve(registry: CollectorRegistry, setting: str) -> Iterator[str]:
-    """Serve the registry over HTTP, with a thread for each request; yields the URL.
+    """Serves the registry over HTTP, with a thread for each request; yields the URL.
 
     Raises UserError if the address cannot be listened on.
     """
@@ -50,7 +50,7 @@ def serve(registry: CollectorRegistry, setting: str) -> Iterator[str]:
 
 @contextmanager
 def measure(loop: Loop, setting: str) -> Iterator[ServiceMetrics]:
-    """Serve the metrics of a loop until the block ends."""
+    """Serves the metrics of a loop until the block ends."""
     service = loop.service
 
     def counts() -> dict[str, Any]:

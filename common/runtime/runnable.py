@@ -9,9 +9,9 @@ class Runnable(Protocol):
     """A loop that runs until it is stopped."""
 
     def run(self) -> None:
-        """Run; returns after `stop` was called."""
+        """Runs; returns after `stop` was called."""
         ...
 
     def stop(self) -> None:
-        """Make `run` return after its current step; safe to call from a signal handler."""
+        """Makes `run` return after its current step; safe to call from a signal handler."""
         ...

@@ -26,7 +26,7 @@ def scan_points(scan: Scan) -> Array:
 
 
 def clip_twist(twist: Array, robot: Robot) -> Array:
-    """Limit a twist (3,) vx, vy m/s, wz rad/s to the robot's maximum velocities, keeping its direction.
+    """Limits a twist (3,) vx, vy m/s, wz rad/s to the robot's maximum velocities, keeping its direction.
 
     Returns zeros if the twist is not finite.
     """
@@ -57,7 +57,7 @@ def ramp(current: Array, target: Array, robot: Robot, dt: float, *, hard: bool =
 def limit_velocity(
     twist: Array, points: Array, robot: Robot, current: Array | None = None, hold: float = REACTION_TIME_S
 ) -> tuple[Array, bool]:
-    """Slow a twist (3,) so that the robot can stop before any of the obstacle ``points`` (K, 2) m in base_link.
+    """Slows a twist (3,) so that the robot can stop before any of the obstacle ``points`` (K, 2) m in base_link.
 
     Returns the limited twist and whether it was changed. This is an admissible velocity in the sense of the dynamic
     window approach (Fox, Burgard, Thrun 1997). The footprint is round, so turning on the spot is always allowed, and so

@@ -112,7 +112,7 @@ class RobotWithMapper:
 def explore(
     world: World, robot: Robot, choose: ChooseViewpoint, start: Array, seed: int, limit_s: float, *, beams: int = 622
 ) -> ExplorationRun:
-    """Explore a world from ``start`` (3,) until the explorer has finished or failed, or for ``limit_s`` s."""
+    """Explores a world from ``start`` (3,) until the explorer has finished or failed, or for ``limit_s`` s."""
     explorer, scanner = RobotWithMapper(robot, choose), SCANNERS["tim571"].with_beams(beams)
     x, y, yaw = start.tolist()
     run, last_scans = explorer.run, 0

@@ -82,7 +82,7 @@ class LocalisedRobot:
         )
 
     def _predict(self, belief: Belief, estimator: PoseEstimator, geometry: Geometry) -> int:
-        """Give the policy the scans that it needs predicted. Returns the microseconds that the controller spent."""
+        """Gives the policy the scans that it needs predicted. Returns the microseconds that the controller spent."""
         if not self.navigator.goal_state.active:
             return 0
         began = time.thread_time_ns()
@@ -95,7 +95,7 @@ class LocalisedRobot:
 
 
 def run(params: NavigationRun) -> RunTrace:
-    """Drive until the controller reports that the goal is reached or refused, and the robot stands."""
+    """Drives until the controller reports that the goal is reached or refused, and the robot stands."""
     setup = params.simulation
     policy = GeodesicPolicy(setup.robot, setup.world, epistemic=params.epistemic)
     navigator = Navigator(setup.robot, world=setup.world, preset=policy)

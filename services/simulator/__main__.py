@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def make(settings: SimulatorSettings) -> Service:
-    """Create the service. Imports pybullet only now, so that --help is fast."""
+    """Creates the service. Imports pybullet only now, so that --help is fast."""
     from services.simulator.service import SimulatorService
 
     return SimulatorService(settings)

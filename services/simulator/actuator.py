@@ -29,7 +29,7 @@ class Actuator:
         self.velocity, self._target, self._waiting = np.zeros(3), np.zeros(3), []
 
     def set_target(self, target: Array, *, at_once: bool) -> None:
-        """Set the target velocity (3,), which takes effect after the latency or ``at_once``. Draws new slip."""
+        """Sets the target velocity (3,), which takes effect after the latency or ``at_once``. Draws new slip."""
         self._waiting = [] if at_once else self._waiting
         self._waiting.append((0.0 if at_once else self.robot.latency, target))
         if self.slip:

@@ -81,7 +81,7 @@ class People:
         robot_radius: float,
         radius: float = PERSON_RADIUS_M,
     ) -> None:
-        """Put ``count`` people at random free places.
+        """Puts ``count`` people at random free places.
 
         ``speed`` is in m/s, ``robot`` (2,) m its position. Raises UserError if the world has no room for them.
         """
@@ -92,7 +92,7 @@ class People:
         self._walks = [self._standing_at(place) for place in self.places]
 
     def step(self, seconds: float, robot: Array, velocity: Array) -> None:
-        """Move all people, one after another; ``robot`` (2,) m and its ``velocity`` (2,) m/s are in map."""
+        """Moves all people, one after another; ``robot`` (2,) m and its ``velocity`` (2,) m/s are in map."""
         robot_segment = robot, robot + velocity * ROBOT_FORESIGHT_S
         for number in range(len(self.places)):
             self._step(number, seconds, robot_segment)
@@ -141,7 +141,7 @@ class People:
         return _Walk(np.stack([place, place]), max_wait=float(self._rng.uniform(*WAIT_RANGE_S)))
 
     def _start_walk(self, number: int, robot: Array | None) -> _Walk:
-        """Start a new walk if there is a path; returns the walk in effect.
+        """Starts a new walk if there is a path; returns the walk in effect.
 
         With ``robot`` (2,) the path leads around all people and the robot.
         """
@@ -159,7 +159,7 @@ class People:
         return walk
 
     def make_room(self, robot: Array, world: World | None = None) -> None:
-        """Move people who are in the way after the robot was put at ``robot`` (2,) m, or after furniture changed.
+        """Moves people who are in the way after the robot was put at ``robot`` (2,) m, or after furniture changed.
 
         ``world`` is the world with the changed furniture. Raises UserError if there is no room; nothing has changed
         then.

@@ -37,7 +37,7 @@ class RecentMotion:
         self._states.extend([np.concatenate([pose, pose, np.zeros(3)])] * len(self._ages))
 
     def add(self, pose: Array, wheels: Array, twist: Array) -> None:
-        """Add the state (3,), (3,), (3,) after one more substep."""
+        """Adds the state (3,), (3,), (3,) after one more substep."""
         self._states.append(np.concatenate([pose, wheels, twist]))
 
     @property

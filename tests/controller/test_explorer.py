@@ -109,7 +109,7 @@ def test_kidnapped():
     path, place = statuses[-1].exploration.path, drive.pose
     drive.pose = place - [3.0, 0.0, 0.0]
     status = drive.step()
-    assert (status.goal.x, status.reason) == (8.0, "going where a scan tells most")
+    assert (status.goal.x, status.reason) == (8.0, "driving to a viewpoint")
     assert status.exploration.path == path > driven + 0.5
     assert len(drive.navigator.take_exploration_state().unreachable) == 0
 

@@ -122,5 +122,5 @@ class FreeSpace:
         return np.asarray(slope / np.maximum(np.hypot(slope[..., 0], slope[..., 1]), 1e-9)[..., None])
 
 
-# Nowhere is free.
+# Stands for the map before the first one arrives: no cell is free.
 NO_MAP = FreeSpace(Grid((0.0, 0.0), RESOLUTION_M, (1, 1)), np.full((1, 1), -1.0), np.zeros((1, 1), bool))

@@ -132,7 +132,7 @@ def turn_rate(angle: float, robot: Robot, hold: float = STEP_S) -> float:
 
 
 def turn_to_attractor(action: Array, attractor: Array, robot: Robot, *, may_turn: bool, forward: float = 0.0) -> Array:
-    """Add a turn to the action (3,) of a holonomic base, so that the scanner looks where the robot goes.
+    """Adds a turn to the action (3,) of a holonomic base, so that the scanner looks where the robot goes.
 
     The side at bearing ``forward`` rad in base_link is turned towards the attractor (2,) m. The heading is kept near
     the attractor if that lies ahead. Returns the action unchanged for a differential base, and if ``may_turn`` is
