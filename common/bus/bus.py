@@ -1,7 +1,4 @@
-"""Publish, subscribe, query and answer messages over zenoh.
-
-Only this module, session.py and liveliness.py import zenoh.
-"""
+"""Publishes and subscribes to messages, and sends and answers requests, over zenoh."""
 
 from __future__ import annotations
 
@@ -27,11 +24,11 @@ from common.messages.topics import Query, Topic, topic_of
 from common.messages.wire import ENCODING, DecodeError, Message
 
 R = TypeVar("R", bound=Reply)
-JOIN_PAUSE_S = 0.2  # between two attempts to join a router that refuses
+JOIN_PAUSE_S = 0.2  # between two attempts to connect to a router that refuses the credentials
 
 
 class Bus(Liveliness):
-    """A zenoh session with which to publish, subscribe and query on the keys of one robot."""
+    """A zenoh session that publishes, subscribes and queries on the keys of one robot."""
 
     def __init__(
         self, session: zenoh.Session, robot: str, security: Credentials | None = None, *, lossless: bool = True
@@ -255,14 +252,14 @@ def open_bus(
     if link.security is None and not link.insecure:
         refuse_exposure(link.listen)
     zenoh.init_log_from_env_or(log_filter)
-    began, waiting = time.monotonic(), False
+    start_s, waiting = time.monotonic(), False
     join_timeout = JOIN_TIMEOUT_S if connect_timeout is None else min(connect_timeout, JOIN_TIMEOUT_S)
     while (session := open_session(link, join_timeout)) is None:
         assert link.security is not None  # noqa: S101 - open_session returns None only with credentials
         rejection = explain_rejection(link.security.member.name, link.connect)
         if give_up():
             raise SystemExit(0)
-        if connect_timeout is not None and time.monotonic() - began > connect_timeout:
+        if connect_timeout is not None and time.monotonic() - start_s > connect_timeout:
             raise UserError(rejection)
         if connect_timeout is None and not waiting:
             logging.getLogger(__name__).warning("%s; waiting", rejection)

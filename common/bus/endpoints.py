@@ -40,7 +40,7 @@ def on_loopback(endpoint: str) -> bool:
 def explain_rejection(name: str, connect: Sequence[str]) -> str:
     """Error message for when no router accepts the credentials ``name``."""
     return (
-        f"no router at {', '.join(map(with_tls, connect)) or 'no endpoint'} lets {name!r} in: "
+        f"no router at {', '.join(map(with_tls, connect)) or 'no endpoint'} accepts {name!r}: "
         "is a router running there, with --security and credentials of the same authority? "
         "Its log lists the connections it refuses"
     )

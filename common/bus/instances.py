@@ -1,8 +1,8 @@
 """Names and ordering of several instances of one service.
 
-The instance that was started first is active (it leads); the others stand by and publish nothing until it is gone.
-Names begin with the time of the start, so sorted names are instances by age. Where the clocks of hosts differ, all
-instances still agree on the order.
+The instance that was started first is active (it leads); the others stand by and publish nothing until it has ended.
+Names begin with the time of the start, so that sorting the names sorts the instances by age. Even if the clocks of the
+hosts differ, all instances agree on the order.
 """
 
 from __future__ import annotations

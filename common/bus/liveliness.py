@@ -15,7 +15,7 @@ from common.bus.session import wait_until
 from common.messages.topics import Topic, alive_key, standby_key
 from common.messages.wire import ENCODING
 
-HISTORY_TIMEOUT_S = 0.3  # for a new liveliness subscriber to receive the tokens that existed before it
+HISTORY_TIMEOUT_S = 0.3  # within which a new liveliness subscriber receives the tokens that existed before it
 
 
 class Liveliness:

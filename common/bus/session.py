@@ -37,7 +37,7 @@ class Link:
     multicast: bool = False
     lossless: bool = True  # publishers wait for slow subscribers instead of dropping messages
     security: Credentials | None = None  # with credentials, only a router listens
-    insecure: bool = False  # may listen on other addresses than loopback without credentials
+    insecure: bool = False  # allows listening on other addresses than loopback without credentials
 
     @property
     def connect_option(self) -> str:

@@ -31,7 +31,7 @@ class Transform:
         """(3,) projection to the plane: x and y in m, yaw of the x axis in rad."""
         return np.array([*self.translation[:2], np.arctan2(self.rotation[1, 0], self.rotation[0, 0])])
 
-    def apart(self, other: Transform) -> float:
+    def difference(self, other: Transform) -> float:
         """Largest difference between the translations (m) or elements of the rotation matrices (about rad)."""
         moved, turned = np.abs(self.translation - other.translation), np.abs(self.rotation - other.rotation)
         return float(max(moved.max(), turned.max()))

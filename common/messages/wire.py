@@ -33,7 +33,7 @@ class Binary:
     """Schema of an array field of shape (N, *row) with elements of type ``dtype``.
 
     ``values`` are the allowed numbers: ``finite``, or ``ranges`` (REP-117: +inf is no return, -inf is too close, NaN is
-    not allowed). ``largest`` limits the magnitude of the finite ones, ``max_rows`` the number of rows.
+    not allowed). ``largest`` limits the magnitude of finite numbers, ``max_rows`` the number of rows.
     """
 
     dtype: Literal["<f4", "<f8", "u1"]
@@ -91,7 +91,9 @@ Text = Annotated[str, Field(max_length=1_000_000)]
 Name = Annotated[str, Field(max_length=200)]
 
 Ranges = Annotated[npt.NDArray[np.float32], Binary("<f4", values="ranges", largest=MAX_DISTANCE_M)]
-Beams = Annotated[npt.NDArray[np.float32], Binary("<f4", values="ranges", largest=MAX_DISTANCE_M, max_rows=MAX_BEAMS)]
+ScanRanges = Annotated[
+    npt.NDArray[np.float32], Binary("<f4", values="ranges", largest=MAX_DISTANCE_M, max_rows=MAX_BEAMS)
+]
 Costs = Annotated[npt.NDArray[np.float32], Binary("<f4", values="ranges")]
 Floats = Annotated[npt.NDArray[np.float32], Binary("<f4")]
 Bytes = Annotated[npt.NDArray[np.uint8], Binary("u1")]

@@ -98,9 +98,9 @@ def route(link: Link, log: Logger, received: list[int], metrics: str = "") -> No
             facts["lets_in"] = [member.name for member in link.security.members]
         if metrics:
             from common.router.metrics import router_metrics
-            from common.runtime.metrics_server import serve
+            from common.runtime.metrics_server import serve_registry
 
-            log.info("metrics", address=stack.enter_context(serve(router_metrics(bus), metrics)))
+            log.info("metrics", address=stack.enter_context(serve_registry(router_metrics(bus), metrics)))
         log.info("router listens", endpoints=", ".join(link.listen), **facts)
         while not received:  # Windows has no sigwait
             time.sleep(STOP_PERIOD_S)

@@ -1,4 +1,4 @@
-"""A status file written once a second, for health checks on the same machine.
+"""Writes a status file once a second, for health checks on the same machine.
 
 A health check over the bus would need a zenoh session, which costs half a second of CPU time for each check. This
 module imports only the standard library, so that a health check starts in 20 ms.

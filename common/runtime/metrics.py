@@ -211,7 +211,7 @@ class ServiceMetrics(Collector):
     @contextmanager
     def step(self, sample: Sample) -> Iterator[None]:
         """Measures latency and duration while the block handles ``sample``."""
-        key = self._inbox.counted_as(sample.key)
+        key = self._inbox.counter_name(sample.key)
         if key not in self._children:
             robot, topic = topic_labels(key)
             labels = (robot, self.service, topic)
@@ -240,7 +240,7 @@ class ServiceMetrics(Collector):
     def collect(self) -> Iterator[Metric]:
         """Yields the counters."""
         counts = self._counts()
-        received, dropped, oversized = self._inbox.arrivals()
+        received, dropped, oversized = self._inbox.received_counts()
         undecodable = counts["undecodable"]
         counters = {
             "received": received,

@@ -1,7 +1,7 @@
-"""Refuses to start beside services that speak another protocol version.
+"""Prevents services with different protocol versions from running together.
 
-A service that starts later than one with another protocol version does not start. The service that was running before
-logs an error and continues.
+A service does not start if another one with a different protocol version is running. The running service logs an error
+and continues.
 """
 
 from __future__ import annotations

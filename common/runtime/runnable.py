@@ -1,4 +1,4 @@
-"""Protocol of anything with run() and stop()."""
+"""Interface of a loop that can be run and stopped."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ class Runnable(Protocol):
     """A loop that runs until it is stopped."""
 
     def run(self) -> None:
-        """Runs; returns after `stop` was called."""
+        """Runs until `stop` is called."""
         ...
 
     def stop(self) -> None:

@@ -1,4 +1,4 @@
-"""Base class of a service: open, receive, step, publish, report health, end."""
+"""Base class of a service, and the main function of its process."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ S = TypeVar("S", bound=ServiceSettings)
 
 
 class Service(ABC):
-    """Base class of a service: declares its inputs and handles what arrives. Override the methods that are needed.
+    """Base class of a service, which declares its inputs and handles their messages. Override the methods you need.
 
     All ``on_...`` methods are called from one thread, that of the loop.
     """
@@ -40,7 +40,7 @@ class Service(ABC):
     all_robots: ClassVar[bool] = False  # subscribes to topics of other robots too
     single: ClassVar[bool] = False  # only one instance is active; others stand by until it is gone
     serves_latched: ClassVar[tuple[Topic, ...]] = ()  # latched topics whose last message it stores for late joiners
-    restores_latched: ClassVar[tuple[Topic, ...]] = ()  # latched topics whose last message it needs when it starts
+    restores_latched: ClassVar[tuple[Topic, ...]] = ()  # latched topics whose last message it needs at its start
 
     def __init__(self, settings: ServiceSettings) -> None:
         """Stores the settings. Anything that may fail belongs in `open`."""
@@ -85,7 +85,7 @@ class Service(ABC):
         return Reply(ok=False, reason=f"{self.name} does not answer {query.name} ({type(request).__name__})")
 
     def on_reply(self, query: Query, number: int, reply: Reply) -> None:
-        """Handles the reply to `request`: called exactly once for each request, with ok=False if it failed."""
+        """Handles the reply to a request: called once for each `send_request`, with ok=False if the request failed."""
 
     def due(self) -> float | None:
         """Seconds until `on_timer` is to be called, or None if no timer is set."""

@@ -36,7 +36,7 @@ class Loop:
     """Runs one service on one session."""
 
     def __init__(self, service: Service, bus: Bus, inbox: Inbox) -> None:
-        """Connects a service with a session; ``inbox`` queues what arrives for it."""
+        """Connects a service with a session; ``inbox`` queues the messages and requests that arrive for it."""
         self.service, self.bus, self.inbox = service, bus, inbox
         self.published: Counter[str] = Counter()  # by key
         self.undecodable: Counter[str] = Counter()  # by key
@@ -60,9 +60,9 @@ class Loop:
             self._run()
             return
         # Imported here because the Prometheus client is slow to import and rarely used.
-        from common.runtime.metrics_server import measure
+        from common.runtime.metrics_server import serve_loop_metrics
 
-        with measure(self, address) as self._metrics:
+        with serve_loop_metrics(self, address) as self._metrics:
             self._run()
 
     def _run(self) -> None:
@@ -114,7 +114,7 @@ class Loop:
             and (found := self._query_latched())
         ):
             self._restore_until = 0.0
-            self.guard(lambda: self.service.on_restored(found))
+            self.run_guarded(lambda: self.service.on_restored(found))
 
     def _query_latched(self) -> dict[Topic, Stamped]:
         found: dict[Topic, Stamped] = {}
@@ -148,7 +148,7 @@ class Loop:
 
     def reject(self, key: str, reason: str) -> None:
         """Counts a payload that could not be used, and logs it at most once a second."""
-        name = self.inbox.counted_as(key)
+        name = self.inbox.counter_name(key)
         self.undecodable[name] += 1
         if self._may_log(name):
             self.service.log.warning("payload dropped", key=key, reason=reason, so_far=self.undecodable[name])
@@ -159,8 +159,8 @@ class Loop:
         self.handle(self.inbox.get(max(0.0, min(until_health, 0.5 if due is None else due))))
         due = self.service.due()
         if due is not None and due <= 0:
-            self.guard(self.service.on_timer)
-        self.pulse()
+            self.run_guarded(self.service.on_timer)
+        self.publish_health_if_due()
 
     def handle(self, event: Sample | IncomingRequest | RequestResult | None) -> None:
         """Handles one entry of the inbox; raises UserError if an older instance has become active."""
@@ -169,14 +169,14 @@ class Loop:
         if isinstance(event, Sample):
             if self._accepts(event):
                 with nullcontext() if self._metrics is None else self._metrics.step(event):
-                    self.guard(lambda: self.service.on_sample(event))
+                    self.run_guarded(lambda: self.service.on_sample(event))
         elif isinstance(event, IncomingRequest):
             self._answer(event)
         elif isinstance(event, RequestResult):
-            self.guard(lambda: self.service.on_reply(event.query, event.number, event.reply()))
+            self.run_guarded(lambda: self.service.on_reply(event.query, event.number, event.reply()))
 
-    def pulse(self) -> None:
-        """Publishes health and repeats the periodic checks, once a second."""
+    def publish_health_if_due(self) -> None:
+        """Publishes health and repeats the periodic checks if a second has passed since the last time."""
         if (now := time.monotonic()) >= self._next_health:
             late = now - self._next_health > HEALTH_PERIOD_S  # after a long step, skip the health messages missed
             self._next_health = (now if late else self._next_health) + HEALTH_PERIOD_S
@@ -203,7 +203,7 @@ class Loop:
             )
         return False
 
-    def guard(self, step: Callable[[], None]) -> None:
+    def run_guarded(self, step: Callable[[], None]) -> None:
         """Runs a step; an exception other than UserError is counted and logged, so that no input stops the service."""
         try:
             step()

@@ -24,7 +24,7 @@ from lab.integrity.buildings import make_building
 from lab.integrity.cases import BEAMS, START_DEVIATION
 from lab.integrity.maps import noisy_grid
 from presage.terminal.output import check_file, write_json
-from services.estimator.factory import EstimatorOptions, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.key_scans import KeyScanCollector
@@ -37,7 +37,7 @@ ROUGH_SEED, DRIVE_SEED, TEST_SEED = 5, 6, 7
 
 def start_estimator(rough: World, scene: Scene, start: Array) -> PreciseEstimator:
     """An estimator in the rough map, near a pose."""
-    made = prepare(EstimatorOptions(rough, model="exact"))(Geometry.of(scene.scanner))
+    made = prepare_factory(EstimatorOptions(rough, model="exact"))(ScannerGeometry.of(scene.scanner))
     assert isinstance(made, PreciseEstimator)  # noqa: S101 - for the type checker
     made.restart(start + START_DEVIATION * scene.rng.standard_normal(3), np.diag(START_DEVIATION**2))
     return made

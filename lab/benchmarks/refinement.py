@@ -29,7 +29,7 @@ from presage.learning.map_of_log import MapOptions, map_command
 from presage.learning.train_drive import TrainDriveOptions, train_from_drive
 from presage.logs.log import Reading
 from presage.terminal.output import check_file, make_folder, write_json
-from services.estimator.factory import EstimatorOptions, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.precise.learning import weights
 from services.estimator.shared.generative_models import GenerativeModel, RayCaster
 
@@ -146,7 +146,7 @@ class ModelTest:
         """Poses (M, 3) of the other drive's scans in the map, and whether they are reported as `tracking`."""
         rng = np.random.default_rng(0)  # all models get the same scans
         scene = Scene(self.test.world, self.test.scanner, rng)
-        estimator = prepare(options)(Geometry.of(scene.scanner))
+        estimator = prepare_factory(options)(ScannerGeometry.of(scene.scanner))
         start = self.path[0] + START_DEVIATION * rng.standard_normal(3)
         estimator.restart(se2.compose(se2.inverse(frame), start), np.diag(START_DEVIATION**2))
         scans = (scene.observe(ranges, k * PERIOD_S) for k, ranges in enumerate(self.clean))

@@ -35,7 +35,7 @@ from lab.navigation.shortest_path import ShortestPaths
 from presage.learning.map_of_log import MapOptions, map_command
 from presage.logs.log import Reading
 from presage.terminal.output import check_file, make_folder, write_json
-from services.estimator.factory import EstimatorOptions, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.field_learning import Recipe, learn_field
@@ -222,7 +222,7 @@ def _localise(
     options: EstimatorOptions, scanner: Scanner, scans: list[Observation], poses: Array
 ) -> list[float | None]:
     """Errors in m of single scans from unknown poses; None if not found."""
-    estimator = prepare(options)(Geometry.of(scanner))
+    estimator = prepare_factory(options)(ScannerGeometry.of(scanner))
     errors: list[float | None] = []
     for scan, pose in zip(scans, poses, strict=True):
         estimator.restart()

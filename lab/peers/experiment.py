@@ -26,7 +26,7 @@ from lab.integrity.models import field_file
 from lab.peers.scans import BUILDING, DRIVES, PLACES, TrialScans, map_file, read_trial_scans
 from lab.statistics import bootstrap_interval, median, root_mean_square, wilson_interval
 from presage.learning.train_drive import TrainDriveOptions, card_of, rectangle
-from services.estimator.factory import EstimatorOptions, Factory, Geometry, prepare
+from services.estimator.factory import EstimatorFactory, EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.drive_learning import learn_drive
 from services.estimator.shared.interface import Observation
@@ -141,13 +141,13 @@ def learn(job: PeersJob) -> dict[str, Any]:
 
 
 @functools.lru_cache(maxsize=4)
-def _factory(folder: str, estimator: str, model: str, seed: int) -> Factory:
+def _factory(folder: str, estimator: str, model: str, seed: int) -> EstimatorFactory:
     """Makes estimators of one kind, compiled by a first update; cached per process."""
     chosen = ESTIMATORS[estimator]
     world = str(Path(folder) / BUILDING if chosen.map in (POLYGONS, POSED) else map_file(Path(folder)))
-    factory = prepare(EstimatorOptions(world, chosen.estimator, model or "exact", seed=seed))  # type: ignore[arg-type]
+    factory = prepare_factory(EstimatorOptions(world, chosen.estimator, model or "exact", seed=seed))  # type: ignore[arg-type]
     scans = read_trial_scans(Path(folder) / PLACES)
-    factory(Geometry.of(scans.scanner)).update(_observation(scans, 0, 0, None))
+    factory(ScannerGeometry.of(scans.scanner)).update(_observation(scans, 0, 0, None))
     return factory
 
 
@@ -159,7 +159,7 @@ def _observation(scans: TrialScans, number: int, k: int, odom: Array | None) -> 
 def trial(job: PeersJob) -> dict[str, Any]:
     """Errors, states and processor times of all scans of one trial."""
     scans, number = job.scans, job.number
-    estimator = _factory(job.folder, job.estimator, _model_file(job), job.seed)(Geometry.of(scans.scanner))
+    estimator = _factory(job.folder, job.estimator, _model_file(job), job.seed)(ScannerGeometry.of(scans.scanner))
     truth = scans.truth[number]
     if job.task != STANDING:
         rng = np.random.default_rng([job.seed, number])

@@ -1,4 +1,4 @@
-"""The latest message of each topic."""
+"""Receives topics and keeps the latest message of each."""
 
 from __future__ import annotations
 

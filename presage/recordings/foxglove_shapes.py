@@ -34,7 +34,7 @@ from common.geometry import occupancy_grid
 from common.geometry import rasterize as raster
 from common.geometry.se2 import Array
 from common.geometry.world import World
-from common.messages.definitions import Belief, Hypothesis, Map, Plan, Prediction, Preference, Scan
+from common.messages.definitions import Belief, BeliefHypothesis, Map, Plan, Prediction, Preference, Scan
 from common.robot.ranges import is_surface
 
 TRUTH, BELIEF, GOAL = (0.0, 0.0, 0.0), (0.84, 0.37, 0.0), (0.0, 0.62, 0.45)  # RGB, as in `presage plot`
@@ -125,9 +125,9 @@ def ellipse(mean: Array, covariance: Array, sides: int = 48) -> Array:
     return np.asarray((axes * np.sqrt(np.maximum(values, 0.0)) @ circle).T * ELLIPSE_SCALE_95 + mean[:2], float)
 
 
-def hypotheses(belief: Belief) -> list[Hypothesis]:
+def hypotheses(belief: Belief) -> list[BeliefHypothesis]:
     """The hypotheses of a belief; if it has none, its pose with weight 1."""
-    return belief.hypotheses or [Hypothesis(pose=belief.pose, covariance=belief.covariance, weight=1.0)]
+    return belief.hypotheses or [BeliefHypothesis(pose=belief.pose, covariance=belief.covariance, weight=1.0)]
 
 
 def belief_entity(belief: Belief, ns: int) -> SceneEntity:

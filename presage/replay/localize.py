@@ -29,7 +29,7 @@ from presage.logs.opening import kind_of
 from presage.logs.scan_files import Prior, Scans, read_scans
 from presage.terminal.output import check_file
 from presage.terminal.progress import progress, working
-from services.estimator.factory import EstimatorOptions, Name, check_start
+from services.estimator.factory import EstimatorOptions, EstimatorPreset, check_start
 from services.estimator.shared.interface import Posterior
 from services.recorder.reader import read_recording
 from services.recorder.replaying.player import span
@@ -111,8 +111,8 @@ def build_estimator_options(
 
     Raises UserError if the estimator is unknown or there is no world.
     """
-    if estimator not in get_args(Name):
-        raise UserError(f"no estimator {estimator!r}: choose one of {', '.join(get_args(Name))}")
+    if estimator not in get_args(EstimatorPreset):
+        raise UserError(f"no estimator {estimator!r}: choose one of {', '.join(get_args(EstimatorPreset))}")
     pose = start_of_text(initial_pose, "--initial-pose") if initial_pose else None
     if not world:
         if kind_of(file) != "recording":

@@ -1,6 +1,6 @@
 """Walking people as moving discs.
 
-The model. A person is a disc that walks at a given speed along a shortest path over free space (`WalkableGrid`) to a
+Model. A person is a disc that walks at a given speed along a shortest path over free space (`WalkableGrid`) to a
 random place, then to the next one. A person always knows the positions of all others, also behind walls. The rules:
 
 - A person takes no step that brings them closer to another person than ``PERSON_GAP_M`` between the two bodies.
@@ -15,9 +15,8 @@ each other for ever: each waits for a random time, and a jam ends with the first
 
 Limits. People start and stop within one step, do not talk, sit or form groups, and do not swerve around a person who
 comes towards them: they stop first. The robot's motion is predicted as straight, so a robot in a curve may come closer.
-A robot that drives backwards without seeing is trusted as much as one that sees. A passage narrower than the body,
-margins and the spacing of `WalkableGrid` together is closed to people, and no person starts in an area of less than one
-square metre.
+People do not take into account which way the robot's scanner looks. A passage narrower than the body, margins and the
+spacing of `WalkableGrid` together is closed to people, and no person starts in an area of less than one square metre.
 """
 
 from __future__ import annotations
@@ -34,8 +33,8 @@ from services.simulator.walkable_grid import WalkableGrid, distance_to_segment
 PERSON_RADIUS_M = 0.25
 PERSON_GAP_M = 0.1  # between two people
 ROBOT_GAP_M = 0.1  # between a person who passes and the robot
-LOOK_AHEAD_M = 0.4  # of the path; with ROBOT_GAP_M, people stop half a metre before a robot that stands in their way
-ROBOT_FORESIGHT_S = 1.0  # the robot brakes from 1 m/s within 0.65 m
+LOOK_AHEAD_M = 0.4  # length of the path that must be clear; with ROBOT_GAP_M, people stop 0.5 m before a robot
+ROBOT_FORESIGHT_S = 1.0  # people expect the robot to keep its velocity this long; it brakes from 1 m/s within 0.65 m
 WAIT_RANGE_S = (1.5, 4.0)  # waiting times are drawn from this interval
 MIN_START_DISTANCE_M = 1.5  # between the robot and a place where a person is put
 _LOOK_AHEAD_STEPS = np.linspace(0.0, LOOK_AHEAD_M, 5)

@@ -1,4 +1,4 @@
-"""What the simulation needs from a physics engine, and the choice of one."""
+"""Interface of a physics engine, and the choice of one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.geometry.world import Obstacle
 
-SUBSTEP_S = 1 / 240
+SUBSTEP_S = 1 / 240  # time step of the physics: pybullet's default
 
 Engine = Literal["pybullet", "kinematic"]
 

@@ -32,7 +32,7 @@ WORLD_GROUP, ROBOT_GROUP, PEOPLE_GROUP = 1, 2, 4
 
 
 class PybulletPhysics:
-    """See Physics. The world's walls, furniture and people are pybullet bodies."""
+    """Physics by pybullet. The world's walls, furniture and people are pybullet bodies."""
 
     def __init__(self, world: World, robot: Robot, pose: Array) -> None:
         """Builds the world and puts the robot at ``pose`` (3,). Call `close` at the end."""

@@ -47,7 +47,7 @@ from services.simulator.settings import SimulatorSettings
 from services.simulator.simulation import Simulation, SimulationSetup
 
 MAX_SAMPLE_RANGES = 4_000_000  # in one reply, 16 MB
-MAX_LAG_S = 1.0  # a simulation farther behind real time does not catch up
+MAX_LAG_S = 1.0  # a simulation that is farther behind real time goes on from there, without catching up
 
 
 class SimulatorService(Service):
@@ -243,7 +243,7 @@ class SimulatorService(Service):
         self.idle = self.paused or bool(waits)
 
     def _step(self) -> Reply:
-        """Advances by one scan while paused. In lockstep the present scan must have its command first."""
+        """Advances by one scan while paused. In lockstep, the present scan must have been answered by a command."""
         if not self.paused:
             return Reply(ok=False, reason="time runs: pause first, then step")
         if self._required_services:

@@ -31,7 +31,7 @@ SAMPLE_BLOCK_POSES = 200  # poses whose scans are simulated together
 
 @dataclass(frozen=True)
 class SimulationSetup:
-    """Everything that a run depends on, besides the commands."""
+    """Parameters of a simulation. Together with the commands they determine a run."""
 
     world: World
     scanner: Scanner
@@ -48,7 +48,7 @@ class SimulationSetup:
 
 
 class Simulation:
-    """The simulated robot. The same setup and commands give the same bytes.
+    """The simulated robot. The same setup and commands give exactly the same measurements.
 
     With `SimulationSetup.sweep`, a scan is published when its last beam has been measured, with the stamp of its first
     beam: the physics is ahead of the stamp by the time of a sweep, and a command takes effect as much later.

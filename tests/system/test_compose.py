@@ -127,7 +127,7 @@ def test_secure_mode_and_health(compose, tmp_path):
         project.becomes(service, "healthy")
     send_signal(project, "STOP")
     project.becomes("estimator", "unhealthy")
-    assert "no sign of life for" in project.state("estimator")["Health"]["Log"][-1]["Output"]
+    assert "no report for" in project.state("estimator")["Health"]["Log"][-1]["Output"]
     assert project.health("simulator") == "healthy"
     send_signal(project, "CONT")
     project.becomes("estimator", "healthy")

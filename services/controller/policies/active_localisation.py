@@ -110,7 +110,7 @@ class ActiveLocaliser:
     def __init__(
         self, robot: Robot, graph: FreeSpaceGraph, min_point_distance: float, *, may_turn: bool = True
     ) -> None:
-        """``min_point_distance`` m from the robot's centre to scan points is kept; ``may_turn``: the heading is free."""
+        """Keeps ``min_point_distance`` m from the robot's centre to scan points. ``may_turn``: any heading will do."""
         self.may_turn = may_turn
         self.robot = robot.model_copy(update={"max_speed": min(robot.max_speed, MAX_SPEED)})
         self.min_point_distance = min_point_distance

@@ -1,7 +1,7 @@
 """Loop closures: links between segments that saw the same place at different times.
 
-The graph's own uncertainty limits where to look. A match counts only if neither side saw through what the other saw
-there, and, if the search was wide, only together with another match that agrees (Mangelson et al. 2018).
+The uncertainty of the pose graph limits the search. A match counts only if neither segment saw through the surfaces of
+the other, and, if the search was wide, only together with another match that agrees (Mangelson et al. 2018).
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from services.mapper.slam.search import search
 from services.mapper.slam.segments import Agreement, Segment, compare_segments, submap
 
 MAX_DISTANCE_M = 6.0  # between the references of segments that are matched
-MIN_APART = 3  # segments between two that are matched
-MAX_TARGETS = 2  # for each segment in one round
-SEARCH_SIGMAS = 3.0  # standard deviations of the graph, half the width of the search window
+MIN_APART = 3  # segments that are closer than this in the sequence are not matched
+MAX_TARGETS = 2  # segments with which one segment is matched in one round
+SEARCH_SIGMAS = 3.0  # half the width of the search window, in standard deviations of the graph
 NO_SEARCH_WINDOW = np.array([0.3, 0.3, 0.1])  # m, m, rad: a smaller window needs no search
 MIN_MATCHED, MIN_SHARE = 60, 0.85  # elements, and their share among those that match or contradict
 RIVAL_SHARE = 0.8  # of the best score: a better match at another place means that the place is not unique

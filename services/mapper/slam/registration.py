@@ -15,14 +15,14 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from services.mapper.slam.elements import Elements
 
-NORMAL_DIFFERENCE_M = 0.3  # distance as which a difference of 1 between two unit normals counts
+NORMAL_DIFFERENCE_M = 0.3  # a difference of 1 between two unit normals counts as this distance
 PARTNER_RADII_M = (0.6, 0.6, 0.5, 0.4, 0.3, 0.2, 0.2, 0.2)  # largest distance of partners, iteration by iteration
 RESIDUAL_M = 0.03  # standard deviation of the distance between partners, and scale of the Cauchy weights
 PRIOR_SCALE = 2.0  # standard deviations, scale of the prior's Cauchy weight: wheels slip
 PRIOR_INFLATION = 2.0  # factor on the deviations of the prior, because those of the elements are too large as well
 MATCHED_M = 0.15  # an element whose partner is nearer than this is matched
 MIN_PARTNERS = 10
-CORRELATED_ELEMENTS = 10.0  # that match or fail together, because they belong to one thing
+CORRELATED_ELEMENTS = 10.0  # number of elements that match or fail together, because they belong to one object
 
 
 @dataclass

@@ -51,7 +51,7 @@ class Calibration:
     coverage: tuple[tuple[float, float], ...]  # pairs of a range's cumulative probability and the share of beams below
 
     def settings(self) -> PreciseSettings:
-        """Parameters of the estimator, with shares of explained beams relative to the usual one in this place."""
+        """Parameters of the estimator; the thresholds of explained beams are relative to the usual share here."""
         default = PreciseSettings()
         return PreciseSettings(
             min_explained_share=0.77 * self.usual,
@@ -130,19 +130,19 @@ def _pose_precision(
             inverse = np.linalg.inv(evidence.curvature[0] + np.eye(3))
             errors.append(error + inverse @ evidence.xi[0])
             covariances.append(inverse @ (evidence.xi_noise_covariance[0] + evidence.xi_model_covariance[0]) @ inverse)
-    off, stated = np.array(errors), np.array(covariances)
+    error, stated = np.array(errors), np.array(covariances)
 
     def excess_deviation(values: Array, variance: Array) -> float:
         return float(np.sqrt(max(0.0, (1.4826 * np.median(np.abs(values))) ** 2 - float(np.median(variance)))))
 
-    position = excess_deviation(off[:, :2].ravel(), stated[:, [0, 1], [0, 1]].ravel())
-    heading = excess_deviation(off[:, 2], stated[:, 2, 2])
+    position = excess_deviation(error[:, :2].ravel(), stated[:, [0, 1], [0, 1]].ravel())
+    heading = excess_deviation(error[:, 2], stated[:, 2, 2])
     floor = np.diag([position**2, position**2, heading**2])
 
     def nees(inflation: float) -> Array:
-        return np.asarray(np.einsum("ni,nij,nj->n", off, np.linalg.inv(inflation * stated + floor), off))
+        return np.asarray(np.einsum("ni,nij,nj->n", error, np.linalg.inv(inflation * stated + floor), error))
 
-    low, high = 1.0, 1e4
+    low, high = 1.0, 1e4  # bisection for the inflation
     for _ in range(40):
         middle = float(np.sqrt(low * high))
         low, high = (middle, high) if np.median(nees(middle)) > CHI2_MEDIAN else (low, middle)
