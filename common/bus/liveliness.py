@@ -15,6 +15,7 @@ from common.bus.session import wait_until
 from common.messages.topics import Topic, alive_key, standby_key
 from common.messages.wire import ENCODING
 
+QUERY_TIMEOUT_S = 0.5  # within which other sessions answer a query for tokens or latched payloads
 HISTORY_TIMEOUT_S = 0.3  # within which a new liveliness subscriber receives the tokens that existed before it
 
 
@@ -46,13 +47,13 @@ class Liveliness:
 
         self._declared += [self._session.declare_subscriber(key, store), self._session.declare_queryable(key, reply)]
 
-    def query_latched(self, topic: Topic, timeout: float = 0.5) -> bytes | None:
+    def query_latched(self, topic: Topic) -> bytes | None:
         """The newest payload of a latched topic that any session has stored, or None."""
         answers = self._session.get(
             topic.key(self.robot),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=timeout,
+            timeout=QUERY_TIMEOUT_S,
         )
         found = [(published_ns(a.ok), a.ok.payload.to_bytes()) for a in answers if a.ok is not None]
         return max(found, default=(0, None), key=lambda each: each[0])[1]
@@ -75,7 +76,7 @@ class Liveliness:
 
         return end
 
-    def instances(self, service: str, changed: Callable[[], None], timeout: float = 0.5) -> Instances:
+    def instances(self, service: str, changed: Callable[[], None]) -> Instances:
         """The other instances of ``service``, kept up to date; ``changed`` is called from another thread."""
         found = Instances(self.instance)
 
@@ -90,12 +91,12 @@ class Liveliness:
 
         liveliness, alive = self._session.liveliness(), alive_key(self.robot, service)
         for key in (alive, standby_key(self.robot, service)):
-            self._watch_tokens(key, update, timeout)
-            for reply in liveliness.get(key, timeout=timeout):
+            self._watch_tokens(key, update, QUERY_TIMEOUT_S)
+            for reply in liveliness.get(key, timeout=QUERY_TIMEOUT_S):
                 handle_reply(reply)
 
         def refresh() -> None:
-            liveliness.get(alive, zenoh.handlers.Callback(handle_reply), timeout=timeout)
+            liveliness.get(alive, zenoh.handlers.Callback(handle_reply), timeout=QUERY_TIMEOUT_S)
 
         found.refresh = refresh
         return found

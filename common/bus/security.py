@@ -208,7 +208,7 @@ class Credentials:
             )
 
 
-def credentials(folder: Path, names: Sequence[str], robot: str = "*") -> Credentials:
+def read_credentials(folder: Path, names: Sequence[str], robot: str = "*") -> Credentials:
     """Reads the credentials of the first of ``names`` that the folder contains.
 
     Credentials for one robot (NAME-ROBOT) are preferred to those for all robots. Raises UserError if there are none, or

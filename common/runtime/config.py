@@ -29,7 +29,7 @@ from pydantic_settings import (
 )
 
 from common.bus.bus import DEFAULT_ENDPOINT, Link
-from common.bus.security import Credentials, credentials
+from common.bus.security import Credentials, read_credentials
 from common.errors import UserError, first_fault
 
 _file_values: ContextVar[dict[str, Any]] = ContextVar("_file_values")
@@ -109,7 +109,7 @@ class ServiceSettings(BaseSettings):
 
     def credentials(self) -> Credentials | None:
         """Credentials from the folder ``security``, or None if it is not set; raises UserError if they are missing."""
-        return credentials(self.security, (self.role or self.service,), self.robot) if self.security else None
+        return read_credentials(self.security, (self.role or self.service,), self.robot) if self.security else None
 
     def effective(self) -> dict[str, Any]:
         """Values of all settings as plain types, without those that only matter on this machine."""

@@ -72,7 +72,7 @@ def bench_area(
 ) -> int:
     """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
     check_file(json_file, "--json")
-    make_folder(out, "--out")
+    make_folder(out)
     wanted = sorted(float(area) for area in areas.split(","))
     parts = _parts(wanted[-1], seed, out, workers, console)
     rows = []
@@ -198,7 +198,9 @@ def _trial(estimator: PreciseEstimator, observation: Observation, truth: Array) 
     began = time.process_time()
     ranked = estimator.seeds.rank(view, PreciseSettings().ranked_seeds)
     ranking = time.process_time() - began
-    off = difference(ranked, truth)
-    seeded = bool(((np.hypot(off[:, 0], off[:, 1]) < SEED_POSITION_M) & (np.abs(off[:, 2]) < SEED_HEADING_RAD)).any())
+    errors = difference(ranked, truth)
+    seeded = bool(
+        ((np.hypot(errors[:, 0], errors[:, 1]) < SEED_POSITION_M) & (np.abs(errors[:, 2]) < SEED_HEADING_RAD)).any()
+    )
     wrong = posterior.state == "tracking" and not found
     return found, wrong, posterior.state == "ambiguous", seeded, seconds, ranking

@@ -32,7 +32,7 @@ from services.estimator.precise.learning.live_learning import ModelVersion, lear
 
 DELAY_S = 15.0  # of the drive, in which a version is learned
 TEST_SECONDS = 40.0
-ROUGH_SEED, DRIVE_SEED, TEST_SEED = 5, 6, 7
+ROUGH_SEED, DRIVE_SEED, TEST_SEED = 5, 6, 7  # parts of the random seeds: of the rough map, the drive and the test
 
 
 def start_estimator(rough: World, scene: Scene, start: Array) -> PreciseEstimator:
@@ -93,10 +93,11 @@ def key_scan_bytes(keys: KeyScanCollector) -> int:
     return sum(key.ranges.nbytes for key in keys.verified.values())
 
 
-def test_errors(rough: World, scene: Scene, version: ModelVersion | None) -> dict[str, float]:
+def errors_of_test_drive(rough: World, scene: Scene, version: ModelVersion | None) -> dict[str, float]:
     """Position errors of another drive, with a version or with the rough map.
 
-    Those that are aligned do not count where the map as a whole lies.
+    For the aligned errors, the estimated path is first moved and turned as a whole to fit the true one best, so that an
+    offset of the whole map does not count.
     """
     path = scene.path(TEST_SECONDS)
     estimator = start_estimator(rough, scene, path[0])
@@ -121,7 +122,9 @@ def refine(name: str, seed: int, seconds: float) -> dict[str, Any]:
     rough = noisy_grid(Scene.of(world, BEAMS, [seed, ROUGH_SEED]))
     scene = Scene.of(world, BEAMS, [seed, DRIVE_SEED])
     learned, version = drive_and_learn(rough, scene, scene.path(seconds))
-    before, after = (test_errors(rough, Scene.of(world, BEAMS, [seed, TEST_SEED]), each) for each in (None, version))
+    before, after = (
+        errors_of_test_drive(rough, Scene.of(world, BEAMS, [seed, TEST_SEED]), each) for each in (None, version)
+    )
     return {"world": world.name, "rough": before, "after": after, **learned}
 
 

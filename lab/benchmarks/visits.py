@@ -86,7 +86,7 @@ def bench_visits(
     The maps, logs and models are written to ``out``.
     """
     check_file(json_file, "--json")
-    make_folder(out, "--out")
+    make_folder(out)
     names = ["office", *map(str, range(seed, seed + worlds))]
     jobs = [VisitsJob(name, visits, scans, seed, str(out)) for name in names]
     results = run_trials("visits", run_visits, jobs, out, workers, console)

@@ -55,7 +55,7 @@ class RobotWithMapper:
     def __init__(self, robot: Robot, choose: ChooseViewpoint) -> None:
         self.run, self.finished = ExplorationRun(), False
         self._choose, self._policy = choose, GeodesicPolicy(robot, None)
-        self._navigator = Navigator(robot, preset=self._policy)
+        self._navigator = Navigator(robot, chosen_policy=self._policy)
         self._mapper: Mapper | None = None  # built for the first scan
         self._map: PlannedMap | None = None
         self._map_stamp_ns = -MAP_PERIOD_NS

@@ -98,7 +98,7 @@ def run(params: NavigationRun) -> RunTrace:
     """Drives until the controller reports that the goal is reached or refused, and the robot stands."""
     setup = params.simulation
     policy = GeodesicPolicy(setup.robot, setup.world, epistemic=params.epistemic)
-    navigator = Navigator(setup.robot, world=setup.world, preset=policy)
+    navigator = Navigator(setup.robot, world=setup.world, chosen_policy=policy)
     robot = LocalisedRobot(prepare_factory(params.estimator), navigator, policy, params.odometry)
     navigator.on_goal(Goal(stamp_ns=0, seq=1, pose=Pose(x=params.goal[0], y=params.goal[1])))
     trace, scans_after_end = robot.trace, 0

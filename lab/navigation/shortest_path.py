@@ -125,7 +125,7 @@ def load_shortest_paths(name: str, radius: float = Robot().radius, seed: int = 0
 
 @dataclass(frozen=True)
 class Trip:
-    """A drive from standstill at ``start`` to ``goal``."""
+    """Start pose, goal and shortest path of a navigation trial; the robot begins at rest."""
 
     start: tuple[float, float, float]  # m, m, rad
     goal: tuple[float, float]  # m

@@ -52,7 +52,7 @@ class TrainPreciseOptions:
 
 
 def default_samples(world: World) -> int:
-    """Number of training scans, in proportion to the free area, so that large worlds are learned as exactly as small."""
+    """Number of training scans, in proportion to the free area: large worlds are learned as exactly as small ones."""
     return max(MIN_SAMPLES, round(SAMPLES_PER_M2 * world.free_area))
 
 

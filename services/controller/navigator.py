@@ -39,10 +39,10 @@ class Navigator:
     robot: Robot = field(default_factory=Robot)
     parameters: ActionParameters = field(default_factory=ActionParameters)  # of preset `paper`
     world: World | None = None  # lets preset `paper` refuse goals inside walls; without it any goal is accepted
-    preset: Policy | None = None  # the policy; defaults to preset `paper`
+    chosen_policy: Policy | None = None  # defaults to the straight-line policy, preset `paper`
 
     def __post_init__(self) -> None:
-        self.policy: Policy = self.preset or StraightLinePolicy(self.robot, self.parameters, self.world)
+        self.policy: Policy = self.chosen_policy or StraightLinePolicy(self.robot, self.parameters, self.world)
         self.decision = Decision()  # what the policy decided on the latest belief
         self.goal_state = GoalState()
         self._command = VelocityCommand(self.robot)
@@ -80,7 +80,7 @@ class Navigator:
 
     def _explore(self, request: Goal) -> None:
         self.policy.set_goal(None)
-        if self.preset is None or self.world is not None:
+        if self.chosen_policy is None or self.world is not None:
             reason = "cannot explore in a known world: start with `presage up --mapping`"
             self.goal_state.start(request, reason)
             return

@@ -290,7 +290,7 @@ def _prepare_paper(options: EstimatorOptions, world: World) -> EstimatorFactory:
     load = functools.cache(paper_weights.load)  # all estimators share one network
 
     def make(geometry: ScannerGeometry) -> PoseEstimator:
-        model, card = load(paper_weights.nearest(folder, world.name, "paper", len(geometry.angles)))
+        model, card = load(paper_weights.nearest(folder, world.name, len(geometry.angles)))
         check_mount(geometry, card.scanner)
         converted = fit(card.scanner, geometry.angles, geometry.mount, f"{train_command} {_train_options(geometry)}")
         return PaperEstimator(model, card, options.descent, options.initial_pose, converted)

@@ -68,7 +68,7 @@ def model_in_use(options: EstimatorOptions, beams: int | None) -> ModelInUse:
         # Imported only here, because torch takes a second to import and the other estimators do not need it.
         from services.estimator.paper import weights as paper_weights
 
-        path = paper_weights.nearest(options.models or find_folder(world.name, "paper"), world.name, "paper", beams)
+        path = paper_weights.nearest(options.models or find_folder(world.name, "paper"), world.name, beams)
         return _learned(options.estimator, world, path, path.name)
     return ModelInUse(options.estimator, world)
 

@@ -95,7 +95,7 @@ def drive(
     ``stop`` the simulator's obstacle stop, ``change`` a function called before each scan, and ``seen`` a function that
     changes the scan for the controller.
     """  # fmt: skip
-    navigator = Navigator(robot, preset=GeodesicPolicy(robot, known or world))
+    navigator = Navigator(robot, chosen_policy=GeodesicPolicy(robot, known or world))
     navigator.on_goal(to)
     poses, statuses, contacts = [], [], 0
     with closing(Simulation(SimulationSetup(world, scanner, robot, start, seed, obstacle_stop=stop))) as simulation:

@@ -50,9 +50,9 @@ class PosePrior:
 
     def difference(self, pose: Array) -> tuple[Array, float]:
         """Difference (3,) of the mean from a pose, and its squared Mahalanobis distance."""
-        off = self.mean - pose
-        off[2] = se2.wrap(off[2])
-        return off, float(off @ self.information @ off)
+        difference = self.mean - pose
+        difference[2] = se2.wrap(difference[2])
+        return difference, float(difference @ self.information @ difference)
 
 
 NO_PRIOR = PosePrior(np.zeros(3), np.zeros((3, 3)))

@@ -209,10 +209,10 @@ def learn_motion(stamps: Array, poses: Array, odom: Array | None) -> MotionNoise
 
 def _learn_odometry(noise: MotionNoise, steps: Array, odom_steps: Array) -> MotionNoise:
     """Fits the variances per metre and per radian by least squares of the squared errors, each clipped at 99 %."""
-    off = se2.between(odom_steps, steps)
+    error = se2.between(odom_steps, steps)
     by = np.column_stack([np.hypot(odom_steps[:, 0], odom_steps[:, 1]), np.abs(odom_steps[:, 2])])
-    position = np.mean(off[:, :2] ** 2, axis=1)
-    heading = off[:, 2] ** 2
+    position = np.mean(error[:, :2] ** 2, axis=1)
+    heading = error[:, 2] ** 2
     (path_by_path, path_by_turn), (turn_by_path, turn_by_turn) = (
         _non_negative_least_squares(by, np.minimum(square, np.quantile(square, 0.99))) for square in (position, heading)
     )

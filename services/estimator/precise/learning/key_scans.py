@@ -132,8 +132,8 @@ class KeyScanCollector:
     def _is_due(self, pose: Array) -> bool:
         if self._last_key is None:
             return True
-        off = se2.between(self._last_key, pose)
-        return bool(np.hypot(off[0], off[1]) >= MIN_DISTANCE_M or abs(off[2]) >= MIN_TURN_RAD)
+        motion = se2.between(self._last_key, pose)
+        return bool(np.hypot(motion[0], motion[1]) >= MIN_DISTANCE_M or abs(motion[2]) >= MIN_TURN_RAD)
 
     def _correct_for_motion(self, observation: Observation, velocity: Array) -> Array:
         """Returns the ranges (B,) in m along the scanner's beams, as if all were measured at the stamp."""
