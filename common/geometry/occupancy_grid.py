@@ -31,7 +31,7 @@ Cells = npt.NDArray[np.uint8]
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, 255  # as in nav_msgs/OccupancyGrid, whose -1 is 255 in an unsigned byte
 MAX_CELLS = 16_000_000  # 4000 by 4000
-CACHED_MAPS = 4
+CACHED_MAPS = 4  # whose geometry is kept
 
 
 class OccupancyGrid(BaseModel):

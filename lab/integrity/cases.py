@@ -21,7 +21,7 @@ from services.estimator.shared.interface import Observation
 from services.simulator.odometry import Odometer, OdometryNoise
 
 BEAMS = 622
-KIDNAPPING_PERIOD_S = 2.0
+KIDNAPPING_PERIOD_S = 2.0  # between two kidnappings
 START_DEVIATION = np.array([0.05, 0.05, np.deg2rad(1)])  # m, m, rad, of a known start; 7 cm RMS
 WRONG_MAP_SEED = 1_000_000  # added to a world's seed to get the building that the wrong map shows
 MAP_SCALE = 1.01  # factor on all coordinates of case scaled-map

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from common.messages.definitions import Goal
     from common.robot.base import Robot
 
-LINE_LENGTH_M = 0.6
+LINE_LENGTH_M = 0.6  # of the straight approach, which the robot drives exactly
 LINE_SPEED = 0.2  # m/s
 SETTLING_TIME_S = 0.3  # time constant of the arrival; longer than scan period, latency and braking time together
 CONVERGENCE_M = 0.1  # a differential base corrects its lateral error over a few times this distance

@@ -35,7 +35,7 @@ PAUSE_NS = 2_000_000_000  # how long the robot stands at a goal of a user before
 STALLED_NS = 8_000_000_000  # after this time without a motion of `STALLED_M`, the goal counts as unreachable
 STALLED_M = 0.2
 VIEWPOINT_TOLERANCE_M = 0.1
-HOME_TOLERANCE_M = 0.005
+HOME_TOLERANCE_M = 0.005  # of the goal at the start; below `RETURNED_M`, so that a robot that reaches it has returned
 RETURNED_M = 0.02  # if the robot stopped late and stands farther than this from the start, it tries again
 SAME_PLACE_M = 0.1  # a new viewpoint this close to the present goal does not replace it
 

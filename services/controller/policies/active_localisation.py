@@ -37,7 +37,7 @@ MIN_WEIGHT = 1e-3  # hypotheses with less weight are ignored: without them, the 
 # improbable they are, and the information of a scan about an improbable one would be worth hardly a metre.
 MIN_COUNTED_WEIGHT = 0.05
 MAX_HYPOTHESES = 6  # scans are predicted for each
-PLACE_SPACING_M = 1.0
+PLACE_SPACING_M = 1.0  # of the places that are compared
 MIN_PATH_M, MAX_PATH_M = 0.8, 12.0  # length of the path to a place
 MAX_PLACES = 60
 CHOICE_PERIOD_NS = 1_000_000_000  # minimum time between two choices of a place

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.geometry.world import World
 
-RESOLUTION_M = 0.1
+RESOLUTION_M = 0.1  # cell size for planning
 MAX_CELLS = 2_000_000  # a world that would need more cells gets larger ones
 MAX_CLEARANCE_M = 3.0  # in a growing map; computing larger ones would take long
 

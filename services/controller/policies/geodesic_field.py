@@ -31,7 +31,7 @@ STOP_RANGE_M = 0.05  # within this range it costs even more: there, noise in the
 MAX_WALL_COST = 1.0  # additional cost of a metre at the minimum clearance, for each of the two ranges
 UNKNOWN_COST = 30.0  # additional cost of a metre where nothing is known: a path through it is the last resort
 ATTRACTOR_RANGE_M = 3.0  # length of the path within which the attractor is chosen
-MAX_ATTRACTOR_CANDIDATES = 12
+MAX_ATTRACTOR_CANDIDATES = 12  # points of the path that are tried, evenly spaced
 MAX_LINE_COST_RATIO = 1.02  # cost of the straight line to the attractor, relative to the path on the grid
 # Half of the 16 neighbours as (rows, columns); the other half are their opposites. A knight's move passes over two more
 # cells, which must be free as well.

@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from common.robot.base import Robot
 
 HOLD_S = 0.4  # how long most policies hold their action; the next scan leads to a new decision
-STEP_S = 1 / 15
+STEP_S = 1 / 15  # time step of predicted motion: the scan period of the shipped scanner
 SHORT_HOLDS_S = STEP_S * np.arange(1, 6)  # of policies that brake, or stop turning, for their target later
 TURN_ACCELERATION_SHARE = 0.4  # share of the acceleration that a turn during motion may use
-NEAR_ATTRACTOR_M = 0.5
+NEAR_ATTRACTOR_M = 0.5  # nearer than this, the robot does not turn to the attractor any more
 STANDING_SPEED = 0.02  # m/s or rad/s; anything slower counts as standing
 
 

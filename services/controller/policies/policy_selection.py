@@ -32,7 +32,7 @@ WALKING_SPEED = 1.0  # m/s at which moving obstacles are assumed to approach
 LINE_SAMPLES = (np.arange(6) + 0.5) / 6  # shares of the line to the attractor at which its information is looked up
 MOTION_SAMPLES = 5  # every so many steps of a motion
 HINDERED_M = 0.05  # the status names obstacles if they make the way longer by this much
-GAP_TOLERANCE_M = 1e-3
+GAP_TOLERANCE_M = 1e-3  # for rounding errors
 
 
 @dataclass(frozen=True)

@@ -30,11 +30,11 @@ if TYPE_CHECKING:
 
 CELL_M = 0.5  # the information of scans changes slowly over the map
 MAX_CELLS = 10_000  # a map that would need more gets larger cells, so that the first scan takes about a second at most
-DIRECTIONS = 48
+DIRECTIONS = 48  # of the rays that stand for a scan, evenly spaced over a full turn
 DEFAULT_SIGMA_M = 0.02  # of a range, if the scanner does not state it
 MAP_ERROR_M = 0.01  # of a surface along its normal
 MIN_INCIDENCE = 0.05  # cosine of the angle between beam and normal, below which the first order no longer holds
-MAX_RAY_STEPS = 60
+MAX_RAY_STEPS = 60  # of sphere tracing
 UNKNOWN_VARIANCE = 1e4  # m² and rad², of a pose about which scans give no information
 
 

@@ -21,7 +21,7 @@ SPACING_M = 0.1  # between elements, across the beams
 # the distance that beams have at this range on a surface that faces the scanner.
 MIN_GAP_M, GAP_BEAMS = 0.12, 6.0
 MAX_ROUGHNESS_M = 0.03  # standard deviation of the points from the line; rougher elements are corners
-MIN_POINTS = 3
+MIN_POINTS = 3  # from which the direction of a surface is computed
 
 
 @dataclass(frozen=True)

@@ -54,12 +54,12 @@ DOUBTFUL_CONTRADICTION, DOUBTFUL_RATIO, FADING_SCANS = 0.05, 1.5, 50
 MAX_SUSPECT_SCANS = 10  # after this many suspect scans in a row, the last of them begins another piece
 MAX_SLIP = 6.0  # standard deviations of the motion; a scan that matches farther from the prior begins a piece
 CLOSE_TO_PRIOR = np.array([0.1, 0.1, 0.1])  # m, m, rad: after a suspect scan, a match farther away may be accidental
-NO_PIECE = -1
+NO_PIECE = -1  # of a suspect scan, instead of the number of a piece
 # Standard deviations of the motion. With odometry: of its error, as a share of the motion. Without: of the change of
 # the velocity in one second, m/s and rad/s, and of the velocity itself where the last one is unknown.
 ODOMETRY_PATH, ODOMETRY_TURN_BY_PATH, ODOMETRY_TURN = 0.4, 0.5, 1.0  # m/m, rad/m, rad/rad
-ACCELERATION = np.array([1.0, 1.0, 3.0])
-MAX_VELOCITY = np.array([1.0, 1.0, 1.5])
+ACCELERATION = np.array([1.0, 1.0, 3.0])  # change of the velocity in one second
+MAX_VELOCITY = np.array([1.0, 1.0, 1.5])  # the velocity itself
 STANDING_DEVIATION = np.array([0.002, 0.002, 0.002])  # m, m, rad: in addition to both
 MAX_MOTION = 3 * MAX_VELOCITY  # in one second; a robot that seems to move faster was kidnapped
 # Scans over which these deviations are learned, and the largest error that counts, in deviations.

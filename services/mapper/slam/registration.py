@@ -21,7 +21,7 @@ RESIDUAL_M = 0.03  # standard deviation of the distance between partners, and sc
 PRIOR_SCALE = 2.0  # standard deviations, scale of the prior's Cauchy weight: wheels slip
 PRIOR_INFLATION = 2.0  # factor on the deviations of the prior, because those of the elements are too large as well
 MATCHED_M = 0.15  # an element whose partner is nearer than this is matched
-MIN_PARTNERS = 10
+MIN_PARTNERS = 10  # elements with a counterpart in the target; with fewer there is no match
 CORRELATED_ELEMENTS = 10.0  # number of elements that match or fail together, because they belong to one object
 
 

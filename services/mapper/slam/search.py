@@ -10,7 +10,7 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from services.mapper.slam.elements import Elements
 
-CELL_M = 0.15
+CELL_M = 0.15  # of the grid that is searched
 SECTORS = 8  # of the directions of normals
 TURN_STEP = 0.03  # rad
 MAX_ELEMENTS = 200  # of the moved group that are used

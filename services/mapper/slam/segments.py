@@ -15,7 +15,7 @@ from common.robot.scan_geometry import Sweep
 from services.mapper.slam.elements import Elements, concatenate
 from services.mapper.slam.registration import MATCHED_M, Surface
 
-KEY_SCANS_PER_SEGMENT = 8
+KEY_SCANS_PER_SEGMENT = 8  # successive ones that form a segment
 PERSON_M, GAP_M = 0.7, 0.3  # size of a person, the largest moving object, and largest gap between its parts
 PASSED_M = 0.3  # behind an element, along its normal, from where a beam counts as having passed through it
 

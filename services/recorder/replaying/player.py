@@ -14,7 +14,7 @@ from common.messages.requests import PlayerReply, PlayerRequest
 from common.messages.topics import CMD_VEL, HEALTH, ROOT, TOPICS, Topic
 
 MAX_LAG_S = 1.0  # a replay that lags further behind continues from its position instead of catching up
-MAX_STEPS = 10_000
+MAX_STEPS = 10_000  # in one request
 LOOP_GAP_S = 0.1  # pause between the end of a loop and its next pass
 
 

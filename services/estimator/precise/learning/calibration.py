@@ -24,10 +24,11 @@ if TYPE_CHECKING:
     from services.estimator.precise.likelihood import Evidence
     from services.estimator.shared.generative_models import Expected, GenerativeModel
 
-EM_STEPS = 30
+EM_STEPS = 30  # of expectation maximisation
 PRIOR_BEAMS = 10.0  # pseudo-count of each kind of beam
 CHI2_MEDIAN = 2.366  # median of chi squared with three degrees of freedom
 MAX_POSITION_ERROR_M = 0.3  # larger errors mean that another place was found; the covariance does not describe them
+# Probabilities at which the calibration curve is evaluated.
 PROBABILITIES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 
 

@@ -31,7 +31,7 @@ from services.estimator.shared.generative_models import CORNER_ANGLE_RAD
 
 CARVED_DISTANCE_CELLS = 0.5  # minimum of phi at a node through which beams pass
 PASSING_CELLS = 0.25  # a beam passes a node within this distance
-EM_STEPS = 15
+EM_STEPS = 15  # of expectation maximisation
 OUTLIER_SHARE, OUTLIER_RANGE_M = 0.1, 25.0  # weight and width of the uniform part of the density
 BEAMS_AT_ONCE = 2_000_000  # processed together in a sweep, which limits memory
 MAX_ERROR_M = 0.1  # a larger error means that the beam ended at another surface
