@@ -1,7 +1,7 @@
 """Goals, teleports, obstacles and driving over the bus.
 
 Every action returns an `ActionResult`. An action that cannot be carried out raises UserError with the reason, which
-`RobotControl.do` turns into a result.
+`RobotControl.carry_out` turns into a result.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class RobotControl:
             requests.SaveMap: self._save_map,
         }
 
-    def do(self, robot: str, action: requests.Action) -> ActionResult:
+    def carry_out(self, robot: str, action: requests.Action) -> ActionResult:
         """Carries out an action. Returns the reason if that fails; does not raise UserError."""
         if "replay" in self._roster.services(robot):
             return ActionResult(ok=False, reason="this is a recording: choose the live robot to act on it")

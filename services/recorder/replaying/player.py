@@ -36,7 +36,7 @@ class Player:
             return self._position
         return min(self.end, self._position + max(0.0, now - self._since) * self.rate)
 
-    def wait(self, position: float, now: float) -> float:
+    def time_until(self, position: float, now: float) -> float:
         """Seconds until a message at ``position`` is due: 0 if it is due now, infinity while paused."""
         if self._steps:
             return 0.0
