@@ -36,8 +36,8 @@ class Elements:
         """The elements in the parent frame of the frame with ``pose`` (3,)."""
         return Elements(se2.transform(pose, self.points), se2.rotate(float(pose[2]), self.normals), self.lengths)
 
-    def select(self, which: npt.NDArray[np.integer | np.bool_]) -> Elements:
-        """Some of the elements."""
+    def part(self, which: npt.NDArray[np.integer | np.bool_]) -> Elements:
+        """The elements with these indices, or in this mask."""
         return Elements(self.points[which], self.normals[which], self.lengths[which])
 
     def divided(self) -> Elements:

@@ -213,7 +213,7 @@ class FrontEnd:
             return found
         last = self.poses[-1]
         starts = [last if self._velocity is None else se2.compose(last, self._velocity * period)]
-        near = elements.select(np.hypot(*elements.points.T) < SEARCH_RANGE_M)
+        near = elements.part(np.hypot(*elements.points.T) < SEARCH_RANGE_M)
         if len(near):
             starts += list(search(surface.elements, near, prior.mean, SEARCH_WINDOW))
         others = [register(surface, elements, start, prior) for start in starts]

@@ -118,8 +118,8 @@ def compare_segments(first: Segment, surface: Surface, second: Segment, pose: Ar
     second_matches = surface.partner_distances(placed) < MATCHED_M
     first_matches = Surface(placed).partner_distances(first.elements) < MATCHED_M
     first_in_second = first.elements.transformed(se2.inverse(pose))
-    contradicting = _count_contradicting(first.scans, placed.select(~second_matches))
-    contradicting += _count_contradicting(second.scans, first_in_second.select(~first_matches))
+    contradicting = _count_contradicting(first.scans, placed.part(~second_matches))
+    contradicting += _count_contradicting(second.scans, first_in_second.part(~first_matches))
     matched = int(second_matches.sum())
     return Agreement(matched, matched + int(first_matches.sum()), contradicting)
 
