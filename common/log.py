@@ -23,7 +23,7 @@ _original_stderr: list[TextIO] = []  # the stream in use since stderr was redire
 
 
 def begin_logging(service: str, argv: Sequence[str] | None = None) -> None:
-    """Set up JSON logging before the settings are read, if they ask for it, so that errors in them are JSON too."""
+    """Sets up JSON logging before the settings are read, if they ask for it, so that errors in them are JSON too."""
     arguments = sys.argv[1:] if argv is None else argv
     enabled = os.environ.get("PRESAGE_LOG_JSON", "").lower() in {"1", "true", "yes", "on", "t", "y"}
     if "--no-log-json" not in arguments and ("--log-json" in arguments or enabled):
@@ -31,7 +31,7 @@ def begin_logging(service: str, argv: Sequence[str] | None = None) -> None:
 
 
 def report_failure(service: str, error: Exception) -> None:
-    """Log or print, in one line, the error that ends the process."""
+    """Logs or prints, in one line, the error that ends the process."""
     if _original_stderr:
         logger(service).error(str(error))
     else:
@@ -39,7 +39,7 @@ def report_failure(service: str, error: Exception) -> None:
 
 
 def set_up_logging(level: str = "info", *, as_json: bool = False, service: str = "", robot: str = "") -> None:
-    """Install one handler for structlog and the standard library's loggers (used by zenoh.handlers for callbacks).
+    """Installs one handler for structlog and the standard library's loggers (used by zenoh.handlers for callbacks).
 
     With ``as_json``, every line is an object with time, level, service, robot and event, including warnings, uncaught
     exceptions and the output of native code.

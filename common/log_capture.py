@@ -25,7 +25,7 @@ class CapturedLine:
 
 
 def parse_line(raw: str, stream: str) -> CapturedLine | None:
-    """Parse a line: zenoh's lines state level and module; others are warnings on stderr and information on stdout.
+    """Parses a line: zenoh's lines state level and module; others are warnings on stderr and information on stdout.
 
     Returns None for an empty line.
     """
@@ -37,7 +37,7 @@ def parse_line(raw: str, stream: str) -> CapturedLine | None:
 
 
 def capture(handle: Callable[[CapturedLine], None]) -> TextIO:
-    """Redirect file descriptors 1 and 2 to ``handle``, which is called from other threads.
+    """Redirects file descriptors 1 and 2 to ``handle``, which is called from other threads.
 
     Returns a stream that writes to the original stderr. Python's `print` still writes to the original stdout. Pending
     lines are handled before the interpreter exits.

@@ -13,7 +13,7 @@ from common.geometry.world import World
 from common.robot.ranges import normalise_driver_ranges
 from common.robot.scanner import SCANNERS, Scanner
 from presage.laser_scan import LaserScan
-from services.estimator.factory import EstimatorOptions, Geometry, Name, prepare
+from services.estimator.factory import EstimatorOptions, EstimatorPreset, ScannerGeometry, prepare_factory
 from services.estimator.paper.perception import Descent
 from services.estimator.precise.gauss_newton import Optimiser
 from services.estimator.precise.likelihood import Likelihood
@@ -33,7 +33,7 @@ class Estimator:
     def __init__(
         self,
         world: World | str | Path,
-        preset: Name = "precise",
+        preset: EstimatorPreset = "precise",
         *,
         scanner: Scanner | str | None = None,
         mount: Numbers | None = None,
@@ -78,16 +78,16 @@ class Estimator:
             initial_pose=None if initial_pose is None else np.asarray(initial_pose, float),
             descent=descent or Descent(),
         )
-        self._make = prepare(options)
+        self._make = prepare_factory(options)
         self._bound_to_beams = preset == "paper"
         if isinstance(scanner, str) and scanner not in SCANNERS:
             raise UserError(f"no scanner {scanner!r}: give a Scanner, or one of {', '.join(SCANNERS)}")
         self.scanner = SCANNERS[scanner] if isinstance(scanner, str) else scanner
         self._mount = None if mount is None else np.asarray(mount, float)
-        self._geometry: Geometry | None = None  # of the scans
+        self._geometry: ScannerGeometry | None = None  # of the scans
         self._core: PoseEstimator | None = None  # made for this geometry
         if self.scanner is not None:
-            self._core_for(Geometry.of(self.scanner))
+            self._core_for(ScannerGeometry.of(self.scanner))
 
     def update(
         self, scan: LaserScan | Numbers, *, stamp: float | None = None, odom: Numbers | None = None
@@ -150,7 +150,7 @@ class Estimator:
             sigma_relative=scanner.sigma_relative,
         )
 
-    def _core_for(self, geometry: Geometry) -> PoseEstimator:
+    def _core_for(self, geometry: ScannerGeometry) -> PoseEstimator:
         """The estimator for scans of this geometry; made for that of the first scan."""
         if self._mount is not None:
             geometry = replace(geometry, mount=self._mount, mount_assumed=False)

@@ -9,7 +9,7 @@ import numpy as np
 from common.errors import UserError
 from common.geometry.se2 import Array
 from common.robot.ranges import normalise_driver_ranges, ranges_for_localisation
-from services.estimator.factory import Geometry
+from services.estimator.factory import ScannerGeometry
 from services.estimator.shared.interface import Observation
 
 
@@ -42,9 +42,9 @@ class LaserScan(Observation):
             object.__setattr__(self, name, value)
 
     @property
-    def geometry(self) -> Geometry:
+    def geometry(self) -> ScannerGeometry:
         """Beams, mount and noise of the scanner."""
-        return Geometry(
+        return ScannerGeometry(
             self.angles, self.mount, self.range_max, self.sigma, self.sigma_relative, mount_assumed=self.mount_assumed
         )
 

@@ -1,7 +1,4 @@
-"""Publish, subscribe, query and answer messages over zenoh.
-
-Only this module, session.py and liveliness.py import zenoh.
-"""
+"""Publishes and subscribes to messages, and sends and answers requests, over zenoh."""
 
 from __future__ import annotations
 
@@ -27,11 +24,11 @@ from common.messages.topics import Query, Topic, topic_of
 from common.messages.wire import ENCODING, DecodeError, Message
 
 R = TypeVar("R", bound=Reply)
-JOIN_PAUSE_S = 0.2  # between two attempts to join a router that refuses
+JOIN_PAUSE_S = 0.2  # between two attempts to connect to a router that refuses the credentials
 
 
 class Bus(Liveliness):
-    """A zenoh session with which to publish, subscribe and query on the keys of one robot."""
+    """A zenoh session that publishes, subscribes and queries on the keys of one robot."""
 
     def __init__(
         self, session: zenoh.Session, robot: str, security: Credentials | None = None, *, lossless: bool = True
@@ -49,7 +46,7 @@ class Bus(Liveliness):
         return Bus(self._session, robot, self._security, lossless=lossless)
 
     def undeclare_all(self) -> None:
-        """Undeclare everything that was declared with this bus, to stop serving its robot."""
+        """Undeclares everything that was declared with this bus, to stop serving its robot."""
         declared: list[Any] = [*self._declared, *self._publishers.values()]
         self._declared.clear()
         self._publishers.clear()
@@ -57,7 +54,7 @@ class Bus(Liveliness):
             each.undeclare()
 
     def put(self, topic: Topic, payload: bytes, service: str = "*", key: str | None = None) -> None:
-        """Publish bytes on the topic's key, or on ``key`` if given (as in a replay).
+        """Publishes bytes on the topic's key, or on ``key`` if given (as in a replay).
 
         Raises UserError if the role of the credentials may not publish the topic.
         """
@@ -79,7 +76,7 @@ class Bus(Liveliness):
             return self._publishers[key]
 
     def wait_matching(self, topic: Topic, timeout: float, service: str = "*", key: str | None = None) -> bool:
-        """Wait until the topic has a subscriber; returns False if it has none within ``timeout`` s.
+        """Waits until the topic has a subscriber; returns False if it has none within ``timeout`` s.
 
         Messages that are published earlier may be lost.
         """
@@ -89,7 +86,7 @@ class Bus(Liveliness):
     def subscribe(
         self, topic: Topic, inbox: Inbox, *, keep_all: bool = False, robot: str | None = None
     ) -> Callable[[], None]:
-        """Put the payloads of a topic into ``inbox``, by the topic's queue policy or, with ``keep_all``, all of them.
+        """Puts the payloads of a topic into ``inbox``, by the topic's queue policy or, with ``keep_all``, all of them.
 
         Returns a function that ends the subscription.
         """
@@ -111,7 +108,7 @@ class Bus(Liveliness):
         return unsubscribe
 
     def serve(self, query: Query, inbox: Inbox, service: str = "*") -> None:
-        """Put requests into ``inbox`` as `IncomingRequest`s, which the receiver has to answer."""
+        """Puts requests into ``inbox`` as `IncomingRequest`s, which the receiver has to answer."""
 
         def on_query(call: zenoh.Query) -> None:
             payload = call.payload.to_bytes() if call.payload is not None else b""
@@ -140,7 +137,7 @@ class Bus(Liveliness):
         service: str = "*",
         robot: str | None = None,
     ) -> R:
-        """Send a request and wait for the first reply.
+        """Sends a request and waits for the first reply.
 
         Raises UserError if there is no reply within ``timeout`` s, or if it is an error or cannot be decoded.
         """
@@ -167,7 +164,7 @@ class Bus(Liveliness):
     def send_request(
         self, query: Query, request: Request, number: int, inbox: Inbox, timeout: float = 5.0, service: str = "*"
     ) -> None:
-        """Send a request and return at once; exactly one `RequestResult` with ``number`` is put into ``inbox``.
+        """Sends a request and returns at once; exactly one `RequestResult` with ``number`` is put into ``inbox``.
 
         It arrives after about ``timeout`` s at the latest. The request is sent once: if the session has just opened and
         does not know the queryables yet, the result is that there is no service.
@@ -199,7 +196,7 @@ class Bus(Liveliness):
         service: str = "*",
         robot: str | None = None,
     ) -> threading.Event:
-        """Send a request to all services that serve the query, including several instances of one service.
+        """Sends a request to all services that serve the query, including several instances of one service.
 
         Each reply is put into ``inbox`` as a `RequestResult`. Returns an event that is set when no more replies will
         arrive.
@@ -246,7 +243,7 @@ def open_bus(
     give_up: Callable[[], bool] = lambda: False,
     log_filter: str = LOG_FILTER,
 ) -> Iterator[Bus]:
-    """Open a session, and close it at the end of the ``with`` block.
+    """Opens a session, and closes it at the end of the ``with`` block.
 
     With credentials, waits until a router accepts them, for at most ``connect_timeout`` s; None means no limit. Exits
     the process if ``give_up()`` returns true while waiting. Raises UserError if no router accepts the credentials in
@@ -255,14 +252,14 @@ def open_bus(
     if link.security is None and not link.insecure:
         refuse_exposure(link.listen)
     zenoh.init_log_from_env_or(log_filter)
-    began, waiting = time.monotonic(), False
+    start_s, waiting = time.monotonic(), False
     join_timeout = JOIN_TIMEOUT_S if connect_timeout is None else min(connect_timeout, JOIN_TIMEOUT_S)
     while (session := open_session(link, join_timeout)) is None:
         assert link.security is not None  # noqa: S101 - open_session returns None only with credentials
         rejection = explain_rejection(link.security.member.name, link.connect)
         if give_up():
             raise SystemExit(0)
-        if connect_timeout is not None and time.monotonic() - began > connect_timeout:
+        if connect_timeout is not None and time.monotonic() - start_s > connect_timeout:
             raise UserError(rejection)
         if connect_timeout is None and not waiting:
             logging.getLogger(__name__).warning("%s; waiting", rejection)

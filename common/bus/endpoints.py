@@ -11,12 +11,12 @@ NETWORK_PROTOCOLS = frozenset({"tcp", "udp", "tls", "quic", "ws", "vsock"})  # z
 
 
 def with_tls(endpoint: str) -> str:
-    """Replace tcp by tls in an endpoint, because sessions with credentials send nothing unencrypted."""
+    """Replaces tcp by tls in an endpoint, because sessions with credentials send nothing unencrypted."""
     return endpoint.replace("tcp/", "tls/", 1) if endpoint.startswith("tcp/") else endpoint
 
 
 def refuse_exposure(listen: Sequence[str]) -> None:
-    """Raise UserError if a session without credentials would listen on addresses that other machines reach."""
+    """Raises UserError if a session without credentials would listen on addresses that other machines reach."""
     if exposed := [endpoint for endpoint in listen if not on_loopback(endpoint)]:
         raise UserError(
             f"listen {', '.join(exposed)}: any machine that reaches this address could drive the robot. Either give "
@@ -40,7 +40,7 @@ def on_loopback(endpoint: str) -> bool:
 def explain_rejection(name: str, connect: Sequence[str]) -> str:
     """Error message for when no router accepts the credentials ``name``."""
     return (
-        f"no router at {', '.join(map(with_tls, connect)) or 'no endpoint'} lets {name!r} in: "
+        f"no router at {', '.join(map(with_tls, connect)) or 'no endpoint'} accepts {name!r}: "
         "is a router running there, with --security and credentials of the same authority? "
         "Its log lists the connections it refuses"
     )

@@ -11,8 +11,8 @@ from common.messages.requests import Reply
 from common.messages.topics import MAX_BYTES, Query, Topic
 from common.messages.wire import DecodeError
 
-MAX_KEYS = 1000  # counted separately; a sender that invents keys must not fill memory
-OTHERS = "others"  # name under which all further keys are counted
+MAX_KEYS = 1000  # number of keys that have their own counters, so that a sender that invents keys cannot fill memory
+OTHERS = "others"  # counter of all further keys
 
 
 @dataclass(frozen=True)
@@ -60,13 +60,13 @@ class RequestResult:
 class Inbox:
     """A bounded, thread-safe queue that counts every dropped entry.
 
-    Of a topic with queue policy "newest", it holds at most one sample of each source.
+    It holds at most one sample of each source for a topic with the queue policy "newest".
     """
 
     def __init__(
         self, capacity: int = 10_000, max_bytes: int = 1 << 28, changed: threading.Condition | None = None
     ) -> None:
-        """Hold at most ``capacity`` entries and ``max_bytes`` bytes of payload.
+        """Holds at most ``capacity`` entries and ``max_bytes`` bytes of payload.
 
         ``changed`` is notified of each new entry; several inboxes may share it, so that one loop can wait for all.
         """
@@ -85,14 +85,14 @@ class Inbox:
         self._lock = changed or lock
 
     def put(self, entry: Sample | IncomingRequest | RequestResult, *, newest_only: bool = False) -> None:
-        """Add an entry. With ``newest_only``, it replaces a waiting sample of the same key and source.
+        """Adds an entry. With ``newest_only``, it replaces a waiting sample of the same key and source.
 
         Entries that are too large or do not fit are dropped and counted; dropped requests are refused.
         """
         size = len(entry.payload)
         full_key = entry.key if isinstance(entry, Sample) else entry.query.name
         with self._lock:
-            key = self.counted_as(full_key)
+            key = self.counter_name(full_key)
             self.received[key] += 1
             if size > (MAX_BYTES if isinstance(entry, Sample) else 64 * MAX_BYTES):
                 self.oversized[key] += 1
@@ -118,27 +118,29 @@ class Inbox:
             self._bytes += size
             self._changed.notify()
 
-    def counted_as(self, key: str) -> str:
-        """Name under which a key is counted: the key itself, or `OTHERS` if there are too many keys."""
+    def counter_name(self, key: str) -> str:
+        """Name of the counter of a key: the key itself, or `OTHERS` if there are too many keys."""
         if key not in self._counted and len(self._counted) >= MAX_KEYS:
             return OTHERS
         self._counted.add(key)
         return key
 
-    def tally(self) -> tuple[Counter[str], Counter[str], Counter[str]]:
+    def handled_counts(self) -> tuple[Counter[str], Counter[str], Counter[str]]:
         """Counts by key at one moment: samples that have left the queue (taken or dropped), dropped, oversized."""
         with self._lock:
             taken = self.received.copy()
-            taken.subtract(self.counted_as(entry.key) for entry in self._entries.values() if isinstance(entry, Sample))
+            taken.subtract(
+                self.counter_name(entry.key) for entry in self._entries.values() if isinstance(entry, Sample)
+            )
             return taken, self.dropped.copy(), self.oversized.copy()
 
-    def arrivals(self) -> tuple[Counter[str], Counter[str], Counter[str]]:
+    def received_counts(self) -> tuple[Counter[str], Counter[str], Counter[str]]:
         """Counts by key at one moment: received (including waiting entries), dropped, oversized."""
         with self._lock:
             return self.received.copy(), self.dropped.copy(), self.oversized.copy()
 
     def get(self, timeout: float) -> Sample | IncomingRequest | RequestResult | None:
-        """Take the oldest entry, waiting at most ``timeout`` s for one; returns None if there is none."""
+        """Takes the oldest entry, waiting at most ``timeout`` s for one; returns None if there is none."""
         with self._lock:
             if not self._entries and timeout > 0:
                 self._changed.wait(timeout)
@@ -149,7 +151,7 @@ class Inbox:
             return entry
 
     def wake(self) -> None:
-        """Make a waiting `get` return."""
+        """Makes a waiting `get` return."""
         with self._lock:
             self._changed.notify_all()
 

@@ -1,8 +1,8 @@
 """Names and ordering of several instances of one service.
 
-The instance that was started first is active (it leads); the others stand by and publish nothing until it is gone.
-Names begin with the time of the start, so sorted names are instances by age. Where the clocks of hosts differ, all
-instances still agree on the order.
+The instance that was started first is active (it leads); the others stand by and publish nothing until it has ended.
+Names begin with the time of the start, so that sorting the names sorts the instances by age. Even if the clocks of the
+hosts differ, all instances agree on the order.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Instance:
 
     @classmethod
     def parse(cls, name: str) -> Instance | None:
-        """Parse an instance name; returns None if ``name`` is not one."""
+        """Parses an instance name; returns None if ``name`` is not one."""
         match = re.fullmatch(r"([0-9a-f]{12})~(.+)~(\d+)~([0-9a-f]*)", name)
         return cls(int(match[1], 16), match[2], int(match[3]), match[4]) if match else None
 
@@ -53,7 +53,7 @@ class Instances:
         self._lock = threading.Lock()
 
     def update(self, name: str, *, leads: bool, alive: bool) -> None:
-        """Record that an instance that leads, or waits, is now alive or no longer alive."""
+        """Records that an instance that leads, or waits, is now alive or no longer alive."""
         # Ignore this session, also with an earlier start time: zenoh may repeat an old token of it.
         if name.partition("~")[2] == self.own_name.partition("~")[2]:
             return
@@ -90,7 +90,7 @@ class SourceSelector:
         self._leaders: dict[tuple[str, str], frozenset[str]] = {}  # by robot and service
 
     def update(self, robot: str, service: str, name: str, alive: bool) -> None:  # noqa: FBT001 - called by zenoh
-        """Record that an instance that leads is now alive or no longer alive."""
+        """Records that an instance that leads is now alive or no longer alive."""
         if Instance.parse(name) is not None:
             before = self._leaders.get((robot, service), frozenset())
             self._leaders[robot, service] = before | {name} if alive else before - {name}

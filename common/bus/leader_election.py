@@ -16,13 +16,13 @@ class LeaderElection:
     """Lets this instance become active when no other is, and ends it if an older instance is active too."""
 
     def __init__(self, bus: Bus, service: str, log: Logger, wake: Callable[[], None]) -> None:
-        """Take part in the election for ``service``; ``wake`` is called from another thread when instances change."""
+        """Takes part in the election for ``service``; ``wake`` is called from another thread when instances change."""
         self._bus, self._service, self._log, self._wake = bus, service, log, wake
         self._others: Instances | None = None
         self._end_standby: Callable[[], None] | None = None  # set while this instance stands by
 
     def try_activate(self) -> bool:
-        """Become active, or stand by if another instance is active; returns whether this instance is active now."""
+        """Becomes active, or stands by if another instance is active; returns whether this instance is active now."""
         if self._others is None:
             wait_until(self._bus.linked, LINK_TIMEOUT_S)  # without a link, other instances cannot be found
             self._others = self._bus.instances(self._service, self._wake)
@@ -41,12 +41,12 @@ class LeaderElection:
         return True
 
     def refresh(self) -> None:
-        """Query the active instances again; call it now and then, because a notification may get lost."""
+        """Queries the active instances again; call it now and then, because a notification may get lost."""
         if self._others is not None:
             self._others.refresh()
 
     def check(self) -> None:
-        """Raise UserError if an older instance is active too, as after two parts of a network were joined."""
+        """Raises UserError if an older instance is active too, as after two parts of a network were joined."""
         if self._others is not None and self._others.must_yield():
             older = describe_instance(self._others.leaders()[0])
             raise UserError(

@@ -15,14 +15,15 @@ from common.bus.session import wait_until
 from common.messages.topics import Topic, alive_key, standby_key
 from common.messages.wire import ENCODING
 
-HISTORY_TIMEOUT_S = 0.3  # for a new liveliness subscriber to receive the tokens that existed before it
+QUERY_TIMEOUT_S = 0.5  # within which other sessions answer a query for tokens or latched payloads
+HISTORY_TIMEOUT_S = 0.3  # within which a new liveliness subscriber receives the tokens that existed before it
 
 
 class Liveliness:
     """Declares and watches the liveliness tokens of one robot's services, and serves its latched topics."""
 
     def __init__(self, session: zenoh.Session, robot: str) -> None:
-        """Use ``session`` for the keys of ``robot``; nothing is declared yet."""
+        """Uses ``session`` for the keys of ``robot``; nothing is declared yet."""
         self.robot = robot
         self.zid = str(session.zid())
         self.instance = Instance(time.time_ns() // 10**6, socket.gethostname(), os.getpid(), self.zid).name
@@ -32,7 +33,7 @@ class Liveliness:
         self._declared: list[object] = []  # zenoh undeclares objects that are garbage-collected
 
     def serve_latched(self, topic: Topic) -> None:
-        """Subscribe to a latched topic, and serve its last payload to sessions that call `query_latched`."""
+        """Subscribes to a latched topic, and serves its last payload to sessions that call `query_latched`."""
         key = topic.key(self.robot)
 
         def store(sample: zenoh.Sample) -> None:
@@ -46,26 +47,26 @@ class Liveliness:
 
         self._declared += [self._session.declare_subscriber(key, store), self._session.declare_queryable(key, reply)]
 
-    def query_latched(self, topic: Topic, timeout: float = 0.5) -> bytes | None:
+    def query_latched(self, topic: Topic) -> bytes | None:
         """The newest payload of a latched topic that any session has stored, or None."""
         answers = self._session.get(
             topic.key(self.robot),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=timeout,
+            timeout=QUERY_TIMEOUT_S,
         )
         found = [(published_ns(a.ok), a.ok.payload.to_bytes()) for a in answers if a.ok is not None]
         return max(found, default=(0, None), key=lambda each: each[0])[1]
 
     def declare_alive(self, service: str) -> None:
-        """Declare the service alive until the session ends.
+        """Declares the service alive until the session ends.
 
         Call it last: others receive declarations in order, so that an alive service has all its subscriptions.
         """
         self._declared.append(self._session.liveliness().declare_token(alive_key(self.robot, service, self.instance)))
 
     def stand_by(self, service: str) -> Callable[[], None]:
-        """Declare that this instance waits until no other is active; returns a function that ends it."""
+        """Declares that this instance waits until no other is active; returns a function that ends it."""
         token = self._session.liveliness().declare_token(standby_key(self.robot, service, self.instance))
         self._declared.append(token)
 
@@ -75,7 +76,7 @@ class Liveliness:
 
         return end
 
-    def instances(self, service: str, changed: Callable[[], None], timeout: float = 0.5) -> Instances:
+    def instances(self, service: str, changed: Callable[[], None]) -> Instances:
         """The other instances of ``service``, kept up to date; ``changed`` is called from another thread."""
         found = Instances(self.instance)
 
@@ -90,12 +91,12 @@ class Liveliness:
 
         liveliness, alive = self._session.liveliness(), alive_key(self.robot, service)
         for key in (alive, standby_key(self.robot, service)):
-            self._watch_tokens(key, update, timeout)
-            for reply in liveliness.get(key, timeout=timeout):
+            self._watch_tokens(key, update, QUERY_TIMEOUT_S)
+            for reply in liveliness.get(key, timeout=QUERY_TIMEOUT_S):
                 handle_reply(reply)
 
         def refresh() -> None:
-            liveliness.get(alive, zenoh.handlers.Callback(handle_reply), timeout=timeout)
+            liveliness.get(alive, zenoh.handlers.Callback(handle_reply), timeout=QUERY_TIMEOUT_S)
 
         found.refresh = refresh
         return found
@@ -132,7 +133,7 @@ class Liveliness:
         return {str(answer.ok.key_expr) for answer in answers if answer.ok is not None}
 
     def _watch_tokens(self, key: str, changed: Callable[[zenoh.Sample], None], timeout: float) -> None:
-        """Call ``changed`` for every token of ``key``; returns after it was called for the existing ones.
+        """Calls ``changed`` for every token of ``key``; returns after it was called for the existing ones.
 
         Zenoh (1.10) does not report when a subscriber has received all existing tokens, so they are queried first and
         then awaited. The query has two faults: it misses some tokens while sessions are still connecting, and, for a
@@ -149,7 +150,7 @@ class Liveliness:
         wait_until(lambda: not missing, HISTORY_TIMEOUT_S, period=0.001)
 
     def watch_alive(self, changed: Callable[[str, bool], None]) -> None:
-        """Call ``changed(service, is_alive)`` for the services alive now and at every change, from another thread."""
+        """Calls ``changed(service, is_alive)`` for the services alive now and at every change, from another thread."""
         self._watch_services(self.robot, lambda _, service, alive: changed(service, alive))
 
     def watch_robots(self, changed: Callable[[str, str, bool], None]) -> None:
@@ -157,7 +158,7 @@ class Liveliness:
         self._watch_services("*", changed)
 
     def _watch_services(self, robots: str, changed: Callable[[str, str, bool], None]) -> None:
-        """Report every new instance of a service as alive, and the service as gone with its last instance."""
+        """Reports every new instance of a service as alive, and the service as gone with its last instance."""
         instances: dict[tuple[str, str], set[str]] = {}
 
         def update(robot: str, service: str, name: str, alive: bool) -> None:  # noqa: FBT001
@@ -169,7 +170,7 @@ class Liveliness:
         self.watch_instances(update, robots)
 
     def watch_instances(self, changed: Callable[[str, str, str, bool], None], robots: str | None = None) -> None:
-        """Call ``changed(robot, service, instance, is_alive)`` for all active instances, and at every change."""
+        """Calls ``changed(robot, service, instance, is_alive)`` for all active instances, and at every change."""
 
         def update(sample: zenoh.Sample) -> None:
             _, robot, _, service, name = str(sample.key_expr).split("/")

@@ -193,7 +193,7 @@ class Credentials:
         }
 
     def check(self, allowed: Callable[[str, Any], bool], row: Topic | Query, robot: str) -> None:
-        """Raise UserError if the role may not use a topic or query, which the router would drop silently."""
+        """Raises UserError if the role may not use a topic or query, which the router would drop silently."""
         member = self.member
         if member.robots != EVERY_ROBOT and robot not in member.robots:
             raise UserError(f"{member.name!r} is for {', '.join(member.robots)}, not for robot {robot!r}")
@@ -208,8 +208,8 @@ class Credentials:
             )
 
 
-def credentials(folder: Path, names: Sequence[str], robot: str = "*") -> Credentials:
-    """Read the credentials of the first of ``names`` that the folder contains.
+def read_credentials(folder: Path, names: Sequence[str], robot: str = "*") -> Credentials:
+    """Reads the credentials of the first of ``names`` that the folder contains.
 
     Credentials for one robot (NAME-ROBOT) are preferred to those for all robots. Raises UserError if there are none, or
     if a file is missing or invalid.

@@ -37,7 +37,7 @@ class Link:
     multicast: bool = False
     lossless: bool = True  # publishers wait for slow subscribers instead of dropping messages
     security: Credentials | None = None  # with credentials, only a router listens
-    insecure: bool = False  # may listen on other addresses than loopback without credentials
+    insecure: bool = False  # allows listening on other addresses than loopback without credentials
 
     @property
     def connect_option(self) -> str:
@@ -81,7 +81,7 @@ def _config(link: Link, join_timeout: float = JOIN_TIMEOUT_S) -> zenoh.Config:
 
 
 def open_session(link: Link, join_timeout: float = JOIN_TIMEOUT_S) -> zenoh.Session | None:
-    """Open a session; raises UserError if the endpoints cannot be used.
+    """Opens a session; raises UserError if the endpoints cannot be used.
 
     In secure mode, returns None if no router accepts the credentials within ``join_timeout`` s for each endpoint.
     """
@@ -100,7 +100,7 @@ def open_session(link: Link, join_timeout: float = JOIN_TIMEOUT_S) -> zenoh.Sess
 
 
 def wait_until(condition: Callable[[], bool], timeout: float, period: float = 0.02) -> bool:
-    """Wait until ``condition()`` is true; returns False if it is still false after ``timeout`` s."""
+    """Waits until ``condition()`` is true; returns False if it is still false after ``timeout`` s."""
     deadline = time.monotonic() + timeout
     while not condition():
         if time.monotonic() > deadline:

@@ -28,7 +28,7 @@ SINGLE_PROCESS = {"viewer"}  # one process for all robots, whose heartbeat has t
 
 
 def main(service: str) -> None:
-    """Check a service; raises ValueError, OSError or UserError, with the reason, if it is not healthy."""
+    """Checks a service; raises ValueError, OSError or UserError, with the reason, if it is not healthy."""
     if service == "router":
         _reach_router()
         return
@@ -55,7 +55,7 @@ def find_fault(service: str, beats: dict[str, Report], robots: Collection[str], 
 
 
 def _check_page() -> None:
-    """Check that the web server responds; status 401, which asks for a token, is fine."""
+    """Checks that the web server responds; status 401, which asks for a token, is fine."""
     with socket.create_connection(PAGE, CONNECT_TIMEOUT_S) as page:
         page.sendall(f"GET / HTTP/1.0\r\nHost: {PAGE[0]}\r\n\r\n".encode())
         line = page.recv(100).split(b"\r\n")[0].decode("latin-1")
@@ -64,7 +64,7 @@ def _check_page() -> None:
 
 
 def _reach_router() -> None:
-    """Open a session like a service's, but without listening on a port."""
+    """Opens a session like a service's, but without listening on a port."""
     # Imported here because these imports take as long as all others together.
     from dataclasses import replace
 

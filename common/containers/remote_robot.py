@@ -33,13 +33,13 @@ class RemoteService(Service):
     inputs: ClassVar[tuple[Topic, ...]] = (SCAN,)
 
     def __init__(self, settings: RemoteSettings) -> None:
-        """Start in the state that no scan has arrived."""
+        """Starts in the state that no scan has arrived."""
         super().__init__(settings)
         self.note = "no scan so far"
         self._last_scan: float | None = None  # s, monotonic clock; None while no scans arrive
 
     def on_sample(self, sample: Sample) -> None:  # noqa: ARG002 - the contents do not matter
-        """Record the time, and log the first scan."""
+        """Records the time, and logs the first scan."""
         if self._last_scan is None:
             self.log.info("scans are arriving", robot=self.loop.bus.robot)
         self._last_scan, self.note = time.monotonic(), ""
@@ -49,7 +49,7 @@ class RemoteService(Service):
         return None if self._last_scan is None else self._last_scan + SCAN_TIMEOUT_S - time.monotonic()
 
     def on_timer(self) -> None:
-        """Log that scans have stopped."""
+        """Logs that scans have stopped."""
         self._last_scan, self.note = None, f"no scan for {SCAN_TIMEOUT_S:g} s"
         self.log.warning(self.note, robot=self.loop.bus.robot)
 

@@ -45,7 +45,7 @@ def robot_names(environment: Mapping[str, str]) -> list[str]:
 
 
 def main(argv: list[str]) -> int:
-    """Run the program and return the exit status, which is 2 for invalid arguments."""
+    """Runs the program and returns the exit status, which is 2 for invalid arguments."""
     if not argv or argv[0] in {"-h", "--help"}:
         print(HELP)
         return 0
@@ -89,7 +89,7 @@ class ProcessGroup:
         self._stop_requested = False
 
     def run(self) -> int:
-        """Run until a signal arrives or, without ``restart``, until all processes have ended; returns the status."""
+        """Runs until a signal arrives or, without ``restart``, until all processes have ended; returns the status."""
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._request_stop)
         try:
@@ -107,7 +107,7 @@ class ProcessGroup:
         self._stop_requested = True
 
     def _supervise(self, process: RobotProcess, now: float) -> None:
-        """Start a process when it is due, and handle its end."""
+        """Starts a process when it is due, and handles its end."""
         if process.child is None:
             if process.next_start is not None and now >= process.next_start:
                 self._start(process, now)
@@ -141,7 +141,7 @@ class ProcessGroup:
         process.output.start()
 
     def _stop_all(self) -> None:
-        """Terminate all processes, and kill those that do not end in time."""
+        """Terminates all processes, and kills those that do not end in time."""
         children = [process.child for process in self.processes if process.child is not None]
         for child in children:
             child.terminate()
@@ -158,7 +158,7 @@ class ProcessGroup:
 
 
 def _refuse(error: str) -> int:
-    """Print an error; returns the exit status for invalid arguments."""
+    """Prints an error; returns the exit status for invalid arguments."""
     print(f"fleet: {error}", file=sys.stderr)
     return 2
 

@@ -1,4 +1,4 @@
-"""How much of the area that a robot can reach is free in a map of it."""
+"""Measures how much of the area that a robot can reach is free in a map."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ Cells = npt.NDArray[np.uint8]
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, 255  # as in nav_msgs/OccupancyGrid, whose -1 is 255 in an unsigned byte
 MAX_CELLS = 16_000_000  # 4000 by 4000
-CACHED_MAPS = 4
+CACHED_MAPS = 4  # whose geometry is kept
 
 
 class OccupancyGrid(BaseModel):
@@ -48,7 +48,7 @@ class OccupancyGrid(BaseModel):
 
     @classmethod
     def of(cls, values: Cells, resolution: float, origin: tuple[float, float, float]) -> OccupancyGrid:
-        """Create a grid from cells (rows, columns) of FREE, OCCUPIED and UNKNOWN, lowest row first.
+        """Creates a grid from cells (rows, columns) of FREE, OCCUPIED and UNKNOWN, lowest row first.
 
         Raises ValueError for other values.
         """
@@ -80,7 +80,7 @@ class OccupancyGrid(BaseModel):
         return list(zip(x, y, strict=True))
 
     def to_map(self, points: npt.ArrayLike) -> Array:
-        """Transform points (N, 2) in m from the grid's frame, with origin at its lower left corner, to map."""
+        """Transforms points (N, 2) in m from the grid's frame, with origin at its lower left corner, to map."""
         x, y, yaw = self.origin
         moved: Array = (rotate(yaw, points) if yaw else np.asarray(points, float)) + np.array([x, y])
         return moved
@@ -102,7 +102,7 @@ class OccupancyGrid(BaseModel):
 
 @functools.lru_cache(CACHED_MAPS)
 def _unpacked(packed: str, width: int, height: int) -> Cells:
-    """Decode cells; raises ValueError if they are invalid. Never decompresses more bytes than there are cells."""
+    """Decodes cells; raises ValueError if they are invalid. Never decompresses more bytes than there are cells."""
     reader, count = zlib.decompressobj(), width * height
     try:
         plain = reader.decompress(base64.b64decode(packed, validate=True), count)

@@ -38,7 +38,7 @@ class OutlineIndex:
 
     @classmethod
     def of(cls, segments: Array, circles: Array) -> OutlineIndex:
-        """Lists the outlines."""
+        """Builds the index of segments (S, 4) and circles (C, 3)."""
         radius = circles[:, 2:]
         points = np.concatenate([segments.reshape(-1, 2), circles[:, :2] - radius, circles[:, :2] + radius])
         points = points if len(points) else np.zeros((1, 2))

@@ -1,7 +1,7 @@
 """Reads a ROS map (map.yaml and its image) by the rules of nav2's map_server.
 
-A darker pixel is more likely to be occupied; the mode defines how it is interpreted. map_server may leave a percentage
-between free and occupied, for which presage has to decide: see `cells`.
+A darker pixel is more likely to be occupied; the mode defines how it is interpreted. In some modes map_server publishes
+percentages between free and occupied; `cells` describes how they become free, occupied or unknown cells here.
 """
 
 from __future__ import annotations

@@ -69,6 +69,6 @@ def rotation(yaw: float) -> Array:
 
 
 def transform(pose: npt.ArrayLike, points: npt.ArrayLike) -> Array:
-    """Transform points (..., 2) in m from the frame with the given ``pose`` (3,) to its parent frame."""
+    """Transforms points (..., 2) in m from the frame with the given ``pose`` (3,) to its parent frame."""
     p = np.asarray(pose, float)
     return np.asarray(p[:2] + rotate(float(p[2]), points))

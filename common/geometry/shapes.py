@@ -78,7 +78,7 @@ class Obstacle(WorldPart):
 
 
 def check_ring(ring: list[tuple[float, float]]) -> None:
-    """Raise ValueError if the corners, in order, do not form a simple polygon."""
+    """Raises ValueError if the corners, in order, do not form a simple polygon."""
     polygon = shapely.Polygon(ring)
     if not polygon.is_valid or polygon.area <= 0:
         raise ValueError(f"the polygon is not simple: {shapely.is_valid_reason(polygon)}")

@@ -30,7 +30,7 @@ FOLDER = Path(__file__).resolve().parents[2] / "worlds"
 NOT_YAML = (yaml.YAMLError, ValueError)  # raised by `parse_yaml`
 
 POINTS_PER_BLOCK = 100_000  # a shapely point needs a few hundred bytes
-MAX_SAMPLING_ATTEMPTS = 50  # without a result, before a grid counts as having no suitable place
+MAX_SAMPLING_ATTEMPTS = 50  # after this many attempts without a result, a grid counts as having no suitable place
 
 
 class Start(WorldPart):
@@ -142,14 +142,14 @@ class World(WorldPart):
         """(N,) distances in m from points (N, 2) to the edge of free space; negative outside it."""
         points = np.asarray(points, float).reshape(-1, 2)
         if self.grid is None:
-            return self._free_area.signed(points)
+            return self._free_area.signed_distance(points)
         return self._limit_by_obstacles(points, 0.0 - self.grid.shapes.distance(FREE, points))
 
     def surface_distance(self, points: npt.ArrayLike) -> Array:
         """(N,) distances in m from points (N, 2) to the nearest surface, negative behind; unknown cells have none."""
         points = np.asarray(points, float).reshape(-1, 2)
         if self.grid is None:
-            return self._free_area.signed(points)
+            return self._free_area.signed_distance(points)
         return self._limit_by_obstacles(points, self.grid.shapes.distance(OCCUPIED, points))
 
     def has_room(self, place: Array, radius: float) -> bool:
@@ -183,12 +183,12 @@ class World(WorldPart):
             distance = self.grid.shapes.lattice_distances(OCCUPIED, x, y, max_distance).ravel()
             distance = self._limit_by_obstacles(nodes, distance)
             return np.clip(distance, -max_distance, max_distance).reshape(len(y), len(x))
-        columns = [self._free_area.signed(np.column_stack([np.full(len(y), x_k), y])) for x_k in x]
+        columns = [self._free_area.signed_distance(np.column_stack([np.full(len(y), x_k), y])) for x_k in x]
         return np.clip(np.stack(columns, axis=1), -max_distance, max_distance)
 
     def _limit_by_obstacles(self, points: Array, distance: Array) -> Array:
         """(N,) the smaller one of ``distance`` and the distance of points (N, 2) to the obstacles."""
-        return np.minimum(distance, -self._furniture_area.signed(points)) if self.obstacles else distance
+        return np.minimum(distance, -self._furniture_area.signed_distance(points)) if self.obstacles else distance
 
     def sample_free(self, count: int, rng: np.random.Generator, clearance: float = 0.0) -> Array:
         """(count, 2) points distributed uniformly over free space, at least ``clearance`` m from its edge.
@@ -274,7 +274,7 @@ class _Area:
         self._area = area
         self._edges = shapely.STRtree(shapely.linestrings(np.stack([ends[:-1], ends[1:]], axis=1)[joined]))
 
-    def signed(self, points: Array) -> Array:
+    def signed_distance(self, points: Array) -> Array:
         """(N,) distances in m from points (N, 2) to the edge of the area; positive inside."""
         blocks = [points[begin : begin + POINTS_PER_BLOCK] for begin in range(0, len(points), POINTS_PER_BLOCK)]
         return np.concatenate([self._signed(block) for block in blocks]) if blocks else np.zeros(0)

@@ -7,7 +7,7 @@ from typing import Any
 import yaml
 
 MAX_NODES = 1_000_000  # 10 000 obstacles need about 200 000
-MAX_DEPTH = 100
+MAX_DEPTH = 100  # much deeper nesting crashes the C parser
 # PyYAML's C parser is ten times as fast, but missing if PyYAML was built without libyaml.
 LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
@@ -17,7 +17,7 @@ class TooLargeError(ValueError):
 
 
 def parse_yaml(text: str | bytes) -> Any:
-    """Parse ``text`` safely.
+    """Parses ``text`` safely.
 
     Raises yaml.YAMLError or ValueError (for a date such as 2020-13-45) if it is not valid YAML, and TooLargeError if it
     exceeds the limits. The limits are checked before loading, because 100 000 nested brackets crash the process in the

@@ -18,7 +18,6 @@ from common.limits import Angle, Distance, PositiveAngle, PositiveDistance
 from common.messages.pose import Pose as Pose  # noqa: PLC0414 - most modules import it from here
 from common.messages.pose import Twist as Twist  # noqa: PLC0414
 from common.messages.wire import (
-    Beams,
     Bytes,
     Costs,
     Count,
@@ -30,6 +29,7 @@ from common.messages.wire import (
     NotNegative,
     Points,
     Poses,
+    ScanRanges,
     Text,
 )
 from common.robot.motion_distortion import beam_times, sweep_time
@@ -51,7 +51,7 @@ class Scan(Stamped):
     angle_increment: Angle  # rad, between beams; negative if they run clockwise, as of a scanner mounted upside down
     range_min: Distance  # m
     range_max: PositiveDistance  # m
-    ranges: Beams  # (B,) m; +inf is nothing within range_max, -inf is too close (REP-117), 0 is not measured
+    ranges: ScanRanges  # (B,) m; +inf is nothing within range_max, -inf is too close (REP-117), 0 is not measured
     mount: Pose = Pose(x=0.0, y=0.0)  # pose of the scanner in base_link
     scan_time: NotNegative = 0.0  # s, between scans
     time_increment: Annotated[float, Field(ge=-1, le=1)] = 0.0  # s, between beams; negative if the last beam was
@@ -95,7 +95,7 @@ class Truth(Stamped):
     frame_id: Name = "map"
 
 
-class Hypothesis(Message):
+class BeliefHypothesis(Message):
     """One Gaussian of a belief's mixture."""
 
     pose: Pose  # base_link in map
@@ -103,7 +103,7 @@ class Hypothesis(Message):
     weight: Annotated[float, Field(ge=0, le=1)]  # share of the mixture; the weights sum to 1
 
     @model_validator(mode="after")
-    def _shape(self) -> Hypothesis:
+    def _shape(self) -> BeliefHypothesis:
         if self.covariance is not None and self.covariance.shape != (3, 3):
             raise ValueError(f"covariance has shape {self.covariance.shape}, not (3, 3)")
         return self
@@ -125,7 +125,7 @@ class Belief(Stamped):
     free_energy: Finite | None = None  # nats, accuracy + complexity
     accuracy: Finite | None = None  # nats, -ln p(o | pose)
     complexity: Finite | None = None  # nats, divergence of the posterior from the prior
-    hypotheses: Annotated[list[Hypothesis], Field(max_length=64)] = []  # noqa: RUF012
+    hypotheses: Annotated[list[BeliefHypothesis], Field(max_length=64)] = []  # noqa: RUF012
     # best first; the first one is at `pose`
     probability: Annotated[float, Field(ge=0, le=1)] | None = None  # that `pose` is within 0.2 m and 5 degrees of the
     # truth; nil if the estimator states none
@@ -153,7 +153,7 @@ class Prediction(Stamped):
 
     angle_min: Angle  # rad, in laser
     angle_increment: Angle  # rad
-    ranges: Beams  # (B,) m, g(pose)
+    ranges: ScanRanges  # (B,) m, g(pose)
     sigma: Floats = np.zeros(0, np.float32)  # (B,) m, standard deviation of the ranges; empty if unknown
     frame_id: Name = "laser"
 

@@ -22,7 +22,7 @@ class Pose(Message):
 
     @classmethod
     def of(cls, pose: npt.ArrayLike) -> Pose:
-        """Create a pose from (3,) x, y, yaw in m and rad."""
+        """Creates a pose from (3,) x, y, yaw in m and rad."""
         x, y, yaw = np.asarray(pose, float)
         return cls(x=float(x), y=float(y), yaw=float(yaw))
 

@@ -31,7 +31,7 @@ class Transform:
         """(3,) projection to the plane: x and y in m, yaw of the x axis in rad."""
         return np.array([*self.translation[:2], np.arctan2(self.rotation[1, 0], self.rotation[0, 0])])
 
-    def apart(self, other: Transform) -> float:
+    def difference(self, other: Transform) -> float:
         """Largest difference between the translations (m) or elements of the rotation matrices (about rad)."""
         moved, turned = np.abs(self.translation - other.translation), np.abs(self.rotation - other.rotation)
         return float(max(moved.max(), turned.max()))
@@ -70,7 +70,7 @@ def read_rotation(q: Any) -> Array:
 
 
 def read_pose(position: Any, orientation: Any) -> Transform:
-    """Read a geometry_msgs/Pose or Transform; raises ValueError if it is not finite or not a rotation."""
+    """Reads a geometry_msgs/Pose or Transform; raises ValueError if it is not finite or not a rotation."""
     translation = np.array([position.x, position.y, position.z], float)
     if not np.isfinite(translation).all():
         raise ValueError(f"position {translation.tolist()} m is not finite")

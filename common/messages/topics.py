@@ -29,7 +29,7 @@ class Topic:
     message: type[m.Stamped]
     publisher: str  # the service or services that publish it
     rate: float  # nominal, Hz; 0 if it is published on events
-    queue: Literal["newest", "all"]  # which messages a slow receiver keeps; the recorder keeps all of every topic
+    queue: Literal["newest", "all"]  # which messages a slow receiver keeps; the recorder always keeps all
     recorded: bool = True
     per_service: bool = False  # each service has its own key below that of the topic
     multiple_publishers: bool = False  # several sessions may publish at once; else the first, until it is silent

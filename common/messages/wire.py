@@ -33,7 +33,7 @@ class Binary:
     """Schema of an array field of shape (N, *row) with elements of type ``dtype``.
 
     ``values`` are the allowed numbers: ``finite``, or ``ranges`` (REP-117: +inf is no return, -inf is too close, NaN is
-    not allowed). ``largest`` limits the magnitude of the finite ones, ``max_rows`` the number of rows.
+    not allowed). ``largest`` limits the magnitude of finite numbers, ``max_rows`` the number of rows.
     """
 
     dtype: Literal["<f4", "<f8", "u1"]
@@ -43,14 +43,14 @@ class Binary:
     max_rows: int | None = None
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Accept bytes or anything that numpy converts; store a read-only array; serialise it as bytes."""
+        """Accepts bytes or anything that numpy converts; stores a read-only array, and serialises it as bytes."""
         return core_schema.with_info_plain_validator_function(
             self.validate,
             serialization=core_schema.plain_serializer_function_ser_schema(lambda array: array.tobytes()),
         )
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        """Describe the bytes with keys that begin with x-, as JSON has no equivalent of MessagePack's bin type."""
+        """Describes the bytes with keys that begin with x-, as JSON has no equivalent of MessagePack's bin type."""
         limits = {"x-largest": self.largest, "x-max-rows": self.max_rows}
         return {
             "type": "string",
@@ -61,7 +61,7 @@ class Binary:
         }
 
     def validate(self, value: Any, info: core_schema.ValidationInfo) -> npt.NDArray[Any]:
-        """Convert to an array of shape (N, *row); raises ValueError for a wrong length, type or number."""
+        """Converts to an array of shape (N, *row); raises ValueError for a wrong length, type or number."""
         dtype = np.dtype(self.dtype)
         if isinstance(value, bytes):
             if len(value) % (dtype.itemsize * int(np.prod(self.row))):
@@ -91,7 +91,9 @@ Text = Annotated[str, Field(max_length=1_000_000)]
 Name = Annotated[str, Field(max_length=200)]
 
 Ranges = Annotated[npt.NDArray[np.float32], Binary("<f4", values="ranges", largest=MAX_DISTANCE_M)]
-Beams = Annotated[npt.NDArray[np.float32], Binary("<f4", values="ranges", largest=MAX_DISTANCE_M, max_rows=MAX_BEAMS)]
+ScanRanges = Annotated[
+    npt.NDArray[np.float32], Binary("<f4", values="ranges", largest=MAX_DISTANCE_M, max_rows=MAX_BEAMS)
+]
 Costs = Annotated[npt.NDArray[np.float32], Binary("<f4", values="ranges")]
 Floats = Annotated[npt.NDArray[np.float32], Binary("<f4")]
 Bytes = Annotated[npt.NDArray[np.uint8], Binary("u1")]
@@ -106,12 +108,12 @@ class Message(BaseModel):
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore", arbitrary_types_allowed=True)
 
     def encode(self) -> bytes:
-        """Encode as MessagePack."""
+        """Encodes as MessagePack."""
         return bytes(msgpack.packb(self.model_dump()))
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
-        """Decode and validate a payload; raises DecodeError, and nothing else, for any invalid bytes."""
+        """Decodes and validates a payload; raises DecodeError, and nothing else, for any invalid bytes."""
         try:
             return cls.model_validate(msgpack.unpackb(payload), context=FROM_WIRE)
         except ValidationError as error:

@@ -18,7 +18,7 @@ NOT_MEASURED = 0.0  # m
 
 
 def normalise_driver_ranges(ranges: npt.NDArray[Numbers], range_min: float, range_max: float) -> npt.NDArray[Numbers]:
-    """Convert a driver's ranges of any shape to those of a scan message; all in m.
+    """Converts a driver's ranges of any shape to those of a scan message; all in m.
 
     ``range_max`` and larger values become +inf, because drivers report them when there is no return. Values above 0 and
     below ``range_min`` become -inf (too close). NaN, 0 and negative values become 0 (not measured), because drivers

@@ -79,13 +79,13 @@ class Scanner(BaseModel):
         return np.hypot(self.sigma, self.sigma_relative * np.asarray(ranges))
 
     def add_noise(self, ranges: Array, rng: np.random.Generator) -> Array:
-        """Add this scanner's noise to exact ``ranges`` in m; +inf stays +inf."""
+        """Adds this scanner's noise to exact ``ranges`` in m; +inf stays +inf."""
         draws = rng.standard_normal(np.shape(ranges))
         finite = np.isfinite(ranges)
         return np.asarray(ranges + np.where(finite, self.deviation(np.where(finite, ranges, 0.0)), 0.0) * draws)
 
     def limit(self, ranges: Array) -> Array:
-        """Replace ranges beyond the scanner's limits (REP-117): +inf for too far, -inf for too close."""
+        """Replaces ranges beyond the scanner's limits (REP-117): +inf for too far, -inf for too close."""
         far = np.where(ranges > self.range_max, np.inf, ranges)
         return np.where(far < self.range_min, -np.inf, far)
 

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from common.geometry.se2 import Array
 
-CELL_M = 1.0
+CELL_M = 1.0  # of the grid in which beam ends are grouped
 MIN_ENDS_PER_CELL = 3  # in a cell with fewer, beams are stray
 
 

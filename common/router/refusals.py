@@ -62,7 +62,7 @@ class ZenohLogParser:
     _caching: dict[str, int] = field(default_factory=dict)  # by thread: number of following lines to ignore
 
     def read(self, line: str) -> Refusal | str | None:
-        """Read a line; returns a refusal, the text of another error or warning, or None for any other line."""
+        """Reads a line; returns a refusal, the text of another error or warning, or None for any other line."""
         plain = COLOUR.sub("", line).rstrip()
         match = LINE.match(plain)
         if match is None:
@@ -82,7 +82,7 @@ class ZenohLogParser:
         return None
 
     def _read_access_line(self, thread: str, text: str) -> Refusal | None:
-        """Read a line of zenoh's access control; returns a refusal, or None if the line is about something else."""
+        """Reads a line of zenoh's access control; returns a refusal, or None if the line is about something else."""
         if "caching permissions" in text:
             self._caching[thread] = CACHING_LINES
             return None
@@ -104,12 +104,12 @@ class Refusals:
     """Counts refusals by reason, and logs each combination of reason, name and topic at most once a second."""
 
     def __init__(self, log: Logger) -> None:
-        """Log to ``log``."""
+        """Logs to ``log``."""
         self.counts: Counter[str] = Counter()  # by reason
         self._log, self._may_log, self._parser = log, LogRateLimiter(), ZenohLogParser()
 
     def process_line(self, line: str) -> None:
-        """Process one line of zenoh's log."""
+        """Processes one line of zenoh's log."""
         found = self._parser.read(line)
         if isinstance(found, str):
             self._log.warning("zenoh", said=found)
@@ -124,7 +124,7 @@ class Refusals:
 
 @contextmanager
 def capture_zenoh_log(refusals: Refusals) -> Iterator[None]:
-    """Pass zenoh's log, which it writes to standard output, to ``refusals`` until the block ends.
+    """Passes zenoh's log, which it writes to standard output, to ``refusals`` until the block ends.
 
     The process must not print to standard output during this time.
     """

@@ -68,7 +68,7 @@ class RouterSettings(ServiceSettings):
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run a router until SIGTERM or Ctrl-C.
+    """Runs a router until SIGTERM or Ctrl-C.
 
     Exits with status 2 and a one-line message if the settings or endpoints cannot be used.
     """
@@ -87,7 +87,7 @@ def main(argv: list[str] | None = None) -> None:
 
 
 def route(link: Link, log: Logger, received: list[int], metrics: str = "") -> None:
-    """Run a router until ``received`` has a signal; ``metrics`` is the address for metrics, or empty for none."""
+    """Runs a router until ``received`` has a signal; ``metrics`` is the address for metrics, or empty for none."""
     refusals, facts = Refusals(log), {}
     with ExitStack() as stack:
         if link.security is None:
@@ -98,9 +98,9 @@ def route(link: Link, log: Logger, received: list[int], metrics: str = "") -> No
             facts["lets_in"] = [member.name for member in link.security.members]
         if metrics:
             from common.router.metrics import router_metrics
-            from common.runtime.metrics_server import serve
+            from common.runtime.metrics_server import serve_registry
 
-            log.info("metrics", address=stack.enter_context(serve(router_metrics(bus), metrics)))
+            log.info("metrics", address=stack.enter_context(serve_registry(router_metrics(bus), metrics)))
         log.info("router listens", endpoints=", ".join(link.listen), **facts)
         while not received:  # Windows has no sigwait
             time.sleep(STOP_PERIOD_S)

@@ -29,7 +29,7 @@ from pydantic_settings import (
 )
 
 from common.bus.bus import DEFAULT_ENDPOINT, Link
-from common.bus.security import Credentials, credentials
+from common.bus.security import Credentials, read_credentials
 from common.errors import UserError, first_fault
 
 _file_values: ContextVar[dict[str, Any]] = ContextVar("_file_values")
@@ -109,7 +109,7 @@ class ServiceSettings(BaseSettings):
 
     def credentials(self) -> Credentials | None:
         """Credentials from the folder ``security``, or None if it is not set; raises UserError if they are missing."""
-        return credentials(self.security, (self.role or self.service,), self.robot) if self.security else None
+        return read_credentials(self.security, (self.role or self.service,), self.robot) if self.security else None
 
     def effective(self) -> dict[str, Any]:
         """Values of all settings as plain types, without those that only matter on this machine."""
@@ -135,12 +135,12 @@ class ServiceSettings(BaseSettings):
 
 
 def split_endpoints(text: str) -> tuple[str, ...]:
-    """Split comma-separated endpoints."""
+    """Splits comma-separated endpoints."""
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
 def join_negative_values(argv: list[str]) -> list[str]:
-    """Write ``--start -3,1`` as ``--start=-3,1``: argparse takes a word that begins with a minus as an option."""
+    """Writes ``--start -3,1`` as ``--start=-3,1``: argparse takes a word that begins with a minus as an option."""
     joined: list[str] = []
     for argument in argv:
         if re.match(r"-[.\d]", argument) and joined and re.fullmatch(r"--[a-z][a-z-]*", joined[-1]):
@@ -151,7 +151,7 @@ def join_negative_values(argv: list[str]) -> list[str]:
 
 
 def load_settings(cls: type[S], argv: list[str] | None = None) -> S:
-    """Load the settings of a service from all sources.
+    """Loads the settings of a service from all sources.
 
     ``argv`` defaults to the arguments of the process. With ``--print-config``, prints the settings and exits. Raises
     UserError for an invalid setting or file.
@@ -197,7 +197,7 @@ class _HelpFormatter(argparse.RawDescriptionHelpFormatter):
 
 
 def _read_file(cls: type[ServiceSettings], path: Path) -> dict[str, Any]:
-    """Read one service's settings: top-level keys apply to all services, the section of a service only to it."""
+    """Reads one service's settings: top-level keys apply to all services, the section of a service only to it."""
     data = _load_mapping(path)
     known = cls.model_fields.keys() - cls.private
     shared = {k: v for k, v in data.items() if not isinstance(v, dict) and k in known}
@@ -213,7 +213,7 @@ def read_section(path: Path, name: str) -> dict[str, Any]:
 
 
 def load_section(cls: type[M], path: Path | None, name: str, **options: object) -> M:
-    """Load the section ``name`` of a settings file as ``cls``; ``options`` that are not empty take precedence.
+    """Loads the section ``name`` of a settings file as ``cls``; ``options`` that are not empty take precedence.
 
     Raises UserError if a setting is unknown or invalid.
     """

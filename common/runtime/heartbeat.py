@@ -1,4 +1,4 @@
-"""A status file written once a second, for health checks on the same machine.
+"""Writes a status file once a second, for health checks on the same machine.
 
 A health check over the bus would need a zenoh session, which costs half a second of CPU time for each check. This
 module imports only the standard library, so that a health check starts in 20 ms.
@@ -20,14 +20,14 @@ class Heartbeat:
     """Writes the heartbeat file of one process. All processes of a machine share its monotonic clock."""
 
     def __init__(self, folder: Path | None, service: str, robot: str) -> None:
-        """Write into ``folder``, or nowhere if it is None."""
+        """Writes into ``folder``, or nowhere if it is None."""
         self._path = None if folder is None else folder / f"{service}@{robot}.beat"
         self._times = CountTimes()
 
     def beat(
         self, counts: Mapping[str, Mapping[str, int]], *, linked: bool, note: str = "", idle: bool = False
     ) -> None:
-        """Write the current state; ``counts`` are the totals so far, by key and kind.
+        """Writes the current state; ``counts`` are the totals so far, by key and kind.
 
         Errors in writing are ignored: a health check notices the old time in the file.
         """

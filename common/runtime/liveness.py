@@ -1,4 +1,4 @@
-"""Tracks which services of a robot are alive, since when, and their problems.
+"""Tracks which services of a robot are alive, since when, and what is wrong with them.
 
 `presage top`, `presage doctor`, the page and the health checks of containers all use this model and only show its
 results. It imports only the standard library, so that a health check starts in 20 ms. Times are s of a monotonic clock.
@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Literal
 if TYPE_CHECKING:
     from common.messages.definitions import Health
 
-REQUIRED_SERVICES = ("simulator", "estimator", "controller")  # without which a robot does not navigate
+REQUIRED_SERVICES = ("simulator", "estimator", "controller")  # a robot needs all of them to navigate
 OPTIONAL_SERVICES = ("recorder", "viewer")
 REPLAY = "replay"  # publishes the messages of all other services, and no health messages
 SUBSTITUTES = {"simulator": "bridge_ros2", "estimator": "mapper"}  # services that take the place of another
 
-REPORT_TIMEOUT_S = 2.5  # without a report (health message or heartbeat), which comes once a second, a service is late
+REPORT_TIMEOUT_S = 2.5  # a service is late if its last report (health message or heartbeat, one a second) is older
 INPUT_TIMEOUT_S = 2.0  # inputs newer than this count as arriving
 RESULT_TIMEOUT_S = 5.0  # without a result while inputs arrive, a service is faulty
 FORGET_AFTER_S = 30.0  # a service that ended longer ago is no longer listed
@@ -38,7 +38,7 @@ RESULTS = {
 }
 COUNT_KINDS = ("received", "published", "written")
 
-State = Literal["alive", "late", "absent"]
+LivenessState = Literal["alive", "late", "absent"]
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class ServiceLiveness:
     """The state of one service. A late service is connected but does not report."""
 
     name: str
-    state: State
+    state: LivenessState
     problem: str = ""  # empty if the service needs no attention
     since: float | None = None  # time at which the state began; None if the service was not seen
     health: Health | None = None  # its last health message
@@ -81,7 +81,7 @@ def find_problem(service: str, robot: str, report: Report, now: float, default_t
     ``default_time`` stands in for the time of the last result while there is none.
     """
     if (age := now - report.time) > REPORT_TIMEOUT_S:
-        return f"no sign of life for {age:.0f} s: it is stopped, hangs, or gets no processor time"
+        return f"no report for {age:.0f} s: it is stopped, hangs, or gets no processor time"
     if not report.linked:
         return "not connected to any session; is the router running?"
     if service not in RESULTS or report.idle:
@@ -119,7 +119,7 @@ class CountTimes:
         self._counts: dict[tuple[str, str], int] = {}
 
     def update(self, counts: Mapping[str, Mapping[str, int]], now: float) -> None:
-        """Store the totals so far, by key and kind."""
+        """Stores the totals so far, by key and kind."""
         for key, row in counts.items():
             for kind in COUNT_KINDS:
                 count = row.get(kind, 0)
@@ -158,7 +158,7 @@ class RobotLiveness:
         self._scan_at = -math.inf
 
     def set_alive(self, names: Collection[str], now: float) -> None:
-        """Store the names of all services that have a liveliness token. Call it about once a second."""
+        """Stores the names of all services that have a liveliness token. Call it about once a second."""
         for name in names:
             if (service := self._service(name, now)) is not None:
                 service.has_token, service.token_at = True, now
@@ -168,7 +168,7 @@ class RobotLiveness:
                 del self._services[name]
 
     def add_health(self, health: Health, now: float) -> None:
-        """Store a health message."""
+        """Stores a health message."""
         service = self._service(health.service, now)
         if service is not None and service.health is not None and health.uptime < service.health.uptime:
             self._services.pop(health.service)  # the service was restarted
@@ -180,7 +180,7 @@ class RobotLiveness:
         service.report = Report(now, note=health.note, idle=health.idle, last=service.times.last)
 
     def add_scan(self, now: float) -> None:
-        """Store the arrival of a scan. While scans arrive, as from a robot's own driver, no simulator is needed."""
+        """Stores the arrival of a scan. While scans arrive, as from a robot's own driver, no simulator is needed."""
         self._scan_at = now
 
     def services(self, now: float) -> list[ServiceLiveness]:

@@ -148,7 +148,7 @@ Values = Iterable[tuple[tuple[str, ...], float]]  # label values and value of ea
 
 
 def new_registry() -> CollectorRegistry:
-    """Create a registry with the CPU, memory and open files of the process."""
+    """Creates a registry with the CPU, memory and open files of the process."""
     disable_created_metrics()  # type: ignore[no-untyped-call]
     registry = CollectorRegistry()
     ProcessCollector(registry=registry)
@@ -156,13 +156,13 @@ def new_registry() -> CollectorRegistry:
 
 
 def gauge(registry: CollectorRegistry, name: str) -> Gauge:
-    """Register a gauge of the table."""
+    """Registers a gauge of the table."""
     definition = BY_NAME[name]
     return Gauge(name, definition.about, definition.labels, registry=registry)
 
 
 def add_build_info(registry: CollectorRegistry, robot: str, service: str) -> None:
-    """Register the metric whose labels are the versions of the running program."""
+    """Registers the metric whose labels are the versions of the running program."""
     known, definition = versions(), BY_NAME["presage_build"]
     packages = {"version": "presage", "zenoh": "eclipse-zenoh", "python": "python", "commit": "commit"}
     values = {label: known.get(name, "unknown") for label, name in packages.items()}
@@ -183,7 +183,7 @@ class ServiceMetrics(Collector):
     """
 
     def __init__(self, robot: str, service: str, inbox: Inbox, counts: Callable[[], Mapping[str, Any]]) -> None:
-        """Collect from ``inbox`` and ``counts``.
+        """Collects from ``inbox`` and ``counts``.
 
         ``counts()`` returns published and undecodable by key, failed, events by name, and began (s, monotonic clock).
         """
@@ -210,8 +210,8 @@ class ServiceMetrics(Collector):
 
     @contextmanager
     def step(self, sample: Sample) -> Iterator[None]:
-        """Measure latency and duration while the block handles ``sample``."""
-        key = self._inbox.counted_as(sample.key)
+        """Measures latency and duration while the block handles ``sample``."""
+        key = self._inbox.counter_name(sample.key)
         if key not in self._children:
             robot, topic = topic_labels(key)
             labels = (robot, self.service, topic)
@@ -223,7 +223,7 @@ class ServiceMetrics(Collector):
             yield
 
     def published(self, key: str, message: Stamped) -> None:
-        """Update the gauges with a message that was just published."""
+        """Updates the gauges with a message that was just published."""
         robot, _ = topic_labels(key)
         if isinstance(message, Health):
             self._health, self._last_health_time = message, time.monotonic()
@@ -238,9 +238,9 @@ class ServiceMetrics(Collector):
                 self._probability.labels(robot, self.service).set(message.probability)
 
     def collect(self) -> Iterator[Metric]:
-        """Yield the counters."""
+        """Yields the counters."""
         counts = self._counts()
-        received, dropped, oversized = self._inbox.arrivals()
+        received, dropped, oversized = self._inbox.received_counts()
         undecodable = counts["undecodable"]
         counters = {
             "received": received,

@@ -27,8 +27,8 @@ def split_address(setting: str) -> tuple[str, int]:
 
 
 @contextmanager
-def serve(registry: CollectorRegistry, setting: str) -> Iterator[str]:
-    """Serve the registry over HTTP, with a thread for each request; yields the URL.
+def serve_registry(registry: CollectorRegistry, setting: str) -> Iterator[str]:
+    """Serves the registry over HTTP, with a thread for each request; yields the URL.
 
     Raises UserError if the address cannot be listened on.
     """
@@ -49,8 +49,8 @@ def serve(registry: CollectorRegistry, setting: str) -> Iterator[str]:
 
 
 @contextmanager
-def measure(loop: Loop, setting: str) -> Iterator[ServiceMetrics]:
-    """Serve the metrics of a loop until the block ends."""
+def serve_loop_metrics(loop: Loop, setting: str) -> Iterator[ServiceMetrics]:
+    """Serves the metrics of a service loop at the address ``setting`` until the block ends; yields the metrics."""
     service = loop.service
 
     def counts() -> dict[str, Any]:
@@ -64,6 +64,6 @@ def measure(loop: Loop, setting: str) -> Iterator[ServiceMetrics]:
         }
 
     metrics = ServiceMetrics(loop.bus.robot, service.name, loop.inbox, counts)
-    with serve(metrics.registry, setting) as address:
+    with serve_registry(metrics.registry, setting) as address:
         service.log.info("metrics", address=address)
         yield metrics

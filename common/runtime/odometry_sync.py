@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from common.messages.definitions import Odom, Scan
 
-MAX_SILENCE_NS = 1_000_000_000  # without odometry, after which scans no longer wait for it
+MAX_SILENCE_NS = 1_000_000_000  # scans no longer wait for odometry that has been silent for longer
 ScanWithOdometry = tuple[Scan, Odom | None]
 
 
 class OdometrySync:
-    """Holds a scan back until its odometry arrives; without it, until later odometry or the next scan does."""
+    """Holds each scan back until its odometry arrives, or until later odometry or the next scan does."""
 
     def __init__(self) -> None:
         self.clear()

@@ -1,7 +1,7 @@
-"""Refuses to start beside services that speak another protocol version.
+"""Prevents services with different protocol versions from running together.
 
-A service that starts later than one with another protocol version does not start. The service that was running before
-logs an error and continues.
+A service does not start if another one with a different protocol version is running. The running service logs an error
+and continues.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SIMULTANEOUS_START_S = 1.0  # if two start times are closer than this, their ord
 
 
 def build_config_reply(name: str, config: str, uptime: float = 0.0) -> ConfigReply:
-    """Build the reply to the query ``config``: settings as JSON, versions, protocol, host and uptime in s."""
+    """Builds the reply to the query ``config``: settings as JSON, versions, protocol, host and uptime in s."""
     return ConfigReply(
         service=name, config=config, versions=versions(), protocol=PROTOCOL, host=platform.node()[:200], uptime=uptime
     )
@@ -71,7 +71,7 @@ class ProtocolCheck:
     """Compares the protocol version and packages of one service with those of the other services."""
 
     def __init__(self, bus: Bus, service: str, log: Logger) -> None:
-        """Check for ``service``; nothing is queried before `check_at_start`."""
+        """Checks for ``service``; nothing is queried before `check_at_start`."""
         self._bus, self._service, self._log = bus, service, log
         self._inbox = Inbox(capacity=1000)
         self._arrived: queue.SimpleQueue[str] = queue.SimpleQueue()  # services; filled by zenoh's thread
@@ -79,7 +79,7 @@ class ProtocolCheck:
         self._warned: set[str] = set()
 
     def check_at_start(self, mine: ConfigReply) -> None:
-        """Check the running services before this one is declared alive.
+        """Checks the running services before this one is declared alive.
 
         Raises UserError if one of them speaks another protocol.
         """
@@ -93,16 +93,16 @@ class ProtocolCheck:
             self._compare(mine, other)
 
     def _query_all(self) -> bool:
-        """Query all services; returns whether any replied."""
+        """Queries all services; returns whether any replied."""
         self._bus.query_all(CONFIG, Request(), self._inbox, START_TIMEOUT_S).wait(2 * START_TIMEOUT_S)
         return len(self._inbox) > 0
 
     def watch(self) -> None:
-        """Start to watch for services that are alive or become alive; `poll` checks them."""
+        """Watches for services that are alive or become alive; `poll` checks them."""
         self._bus.watch_alive(lambda name, alive: self._arrived.put(name) if alive else None)
 
     def poll(self, mine: Callable[[], ConfigReply]) -> None:
-        """Query services that appeared and check those that replied; to be called about once a second.
+        """Queries services that appeared and checks those that replied; to be called about once a second.
 
         Raises UserError if another protocol is spoken by a service that was started before this one.
         """
@@ -141,7 +141,7 @@ class ProtocolCheck:
         return found
 
     def _compare(self, mine: ConfigReply, other: ConfigReply) -> None:
-        """Log different package versions once: they may still work together."""
+        """Logs different package versions once: they may still work together."""
         if (text := describe_version_differences(mine, other)) and text not in self._warned:
             self._warned.add(text)
             there = f"{other.service} on {other.host or 'an unknown host'}"

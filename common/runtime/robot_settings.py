@@ -65,7 +65,7 @@ class RobotSettings(ServiceSettings):
     ] = 0.0
 
     def build_robot(self) -> Robot:
-        """Build a robot with these limits; raises UserError if it would take too long to stop."""
+        """Builds a robot with these limits; raises UserError if it would take too long to stop."""
         for speed_name, acceleration_name, unit in (
             ("max_speed", "acceleration", "m/s"),
             ("max_turn", "turn_acceleration", "rad/s"),

@@ -1,4 +1,4 @@
-"""Protocol of anything with run() and stop()."""
+"""Interface of a loop that can be run and stopped."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ class Runnable(Protocol):
     """A loop that runs until it is stopped."""
 
     def run(self) -> None:
-        """Run; returns after `stop` was called."""
+        """Runs until `stop` is called."""
         ...
 
     def stop(self) -> None:
-        """Make `run` return after its current step; safe to call from a signal handler."""
+        """Makes `run` return after its current step; safe to call from a signal handler."""
         ...

@@ -11,7 +11,7 @@ from common.robot.base import Robot
 from common.robot.ranges import is_surface
 
 REACTION_TIME_S = 2 / 15  # the scan is up to one 15 Hz period old, and the command holds for another
-FOOTPRINT_MARGIN_M = 0.01  # must be free around the footprint
+FOOTPRINT_MARGIN_M = 0.01  # distance around the footprint that must be free
 PATH_STEP_S = 1 / 60  # between the points of a stopping path: 17 mm at 1 m/s, which is exact to 0.1 mm
 
 
@@ -26,7 +26,7 @@ def scan_points(scan: Scan) -> Array:
 
 
 def clip_twist(twist: Array, robot: Robot) -> Array:
-    """Limit a twist (3,) vx, vy m/s, wz rad/s to the robot's maximum velocities, keeping its direction.
+    """Limits a twist (3,) vx, vy m/s, wz rad/s to the robot's maximum velocities, keeping its direction.
 
     Returns zeros if the twist is not finite.
     """
@@ -57,7 +57,7 @@ def ramp(current: Array, target: Array, robot: Robot, dt: float, *, hard: bool =
 def limit_velocity(
     twist: Array, points: Array, robot: Robot, current: Array | None = None, hold: float = REACTION_TIME_S
 ) -> tuple[Array, bool]:
-    """Slow a twist (3,) so that the robot can stop before any of the obstacle ``points`` (K, 2) m in base_link.
+    """Slows a twist (3,) so that the robot can stop before any of the obstacle ``points`` (K, 2) m in base_link.
 
     Returns the limited twist and whether it was changed. This is an admissible velocity in the sense of the dynamic
     window approach (Fox, Burgard, Thrun 1997). The footprint is round, so turning on the spot is always allowed, and so
@@ -71,18 +71,18 @@ def limit_velocity(
     if current is None and twist[2] == 0:
         return allowed, bool((allowed != twist).any())
 
-    def clear(scale: float) -> bool:
+    def is_clear(scale: float) -> bool:
         target = allowed * [scale, scale, 1.0]
-        return _clear(target if current is None else current, target, points, robot, hold)
+        return _is_path_clear(target if current is None else current, target, points, robot, hold)
 
-    if clear(1.0):
+    if is_clear(1.0):
         return allowed, bool((allowed != twist).any())
-    if not clear(0.0):
+    if not is_clear(0.0):
         return np.zeros(3), True
     low, high = 0.0, 1.0
     for _ in range(6):
         middle = (low + high) / 2
-        low, high = (middle, high) if clear(middle) else (low, middle)
+        low, high = (middle, high) if is_clear(middle) else (low, middle)
     return allowed * [low, low, 1.0], True
 
 
@@ -131,8 +131,8 @@ def _ramp_velocities(current: Array, target: Array, robot: Robot, times: Array) 
     return np.column_stack([current[:2] + change[:2] * scale[:, None], current[2] + np.clip(change[2], -turn, turn)])
 
 
-def _clear(current: Array, target: Array, points: Array, robot: Robot, hold: float) -> bool:
-    """Whether the footprint approaches no point to contact on the stopping path."""
+def _is_path_clear(current: Array, target: Array, points: Array, robot: Robot, hold: float) -> bool:
+    """Whether the footprint touches no point that it approaches on the stopping path."""
     path, contact = stopping_path(current, target, robot, hold), robot.radius + FOOTPRINT_MARGIN_M
     travelled = float(np.hypot(*np.diff(path, axis=0).T).sum())
     points = points[np.hypot(points[:, 0], points[:, 1]) < contact + travelled]

@@ -1,4 +1,4 @@
-"""Base class of a service: open, receive, step, publish, report health, end."""
+"""Base class of a service, and the main function of its process."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ S = TypeVar("S", bound=ServiceSettings)
 
 
 class Service(ABC):
-    """Base class of a service: declares its inputs and handles what arrives. Override the methods that are needed.
+    """Base class of a service, which declares its inputs and handles their messages. Override the methods you need.
 
     All ``on_...`` methods are called from one thread, that of the loop.
     """
@@ -40,10 +40,10 @@ class Service(ABC):
     all_robots: ClassVar[bool] = False  # subscribes to topics of other robots too
     single: ClassVar[bool] = False  # only one instance is active; others stand by until it is gone
     serves_latched: ClassVar[tuple[Topic, ...]] = ()  # latched topics whose last message it stores for late joiners
-    restores_latched: ClassVar[tuple[Topic, ...]] = ()  # latched topics whose last message it needs when it starts
+    restores_latched: ClassVar[tuple[Topic, ...]] = ()  # latched topics whose last message it needs at its start
 
     def __init__(self, settings: ServiceSettings) -> None:
-        """Store the settings. Anything that may fail belongs in `open`."""
+        """Stores the settings. Anything that may fail belongs in `open`."""
         self.settings = settings
         self.log: Logger = logger(self.name)
         self.counters: Counter[str] = Counter()  # published in health
@@ -59,10 +59,10 @@ class Service(ABC):
         return self._loop
 
     def open(self) -> None:
-        """Prepare for the first message. Raise UserError to end the process with a one-line message."""
+        """Prepares for the first message. Raise UserError to end the process with a one-line message."""
 
     def on_sample(self, sample: Sample) -> None:
-        """Handle a received payload: by default decode it and call `on_message`. Override it to get the bytes."""
+        """Handles a received payload: by default decodes it and calls `on_message`. Override it to get the bytes."""
         try:
             message = sample.topic.message.decode(sample.payload)
         except DecodeError as error:
@@ -75,38 +75,38 @@ class Service(ABC):
         return {}
 
     def on_message(self, topic: Topic, message: Stamped) -> None:
-        """Handle a valid message of one of the inputs."""
+        """Handles a valid message of one of the inputs."""
 
     def on_restored(self, last: dict[Topic, Stamped]) -> None:
-        """Handle the last messages of ``restores_latched``: called at most once, within 5 s of the start."""
+        """Handles the last messages of ``restores_latched``: called at most once, within 5 s of the start."""
 
     def on_request(self, query: Query, request: Request) -> Reply:
-        """Handle a valid request and return the reply. A UserError becomes a reply with ok=False."""
+        """Handles a valid request and returns the reply. A UserError becomes a reply with ok=False."""
         return Reply(ok=False, reason=f"{self.name} does not answer {query.name} ({type(request).__name__})")
 
     def on_reply(self, query: Query, number: int, reply: Reply) -> None:
-        """Handle the reply to `request`: called exactly once for each request, with ok=False if it failed."""
+        """Handles the reply to a request: called once for each `send_request`, with ok=False if the request failed."""
 
     def due(self) -> float | None:
         """Seconds until `on_timer` is to be called, or None if no timer is set."""
         return None
 
     def on_timer(self) -> None:
-        """Handle the timer: called when the time that `due` returned has passed."""
+        """Handles the timer: called when the time that `due` returned has passed."""
 
     def close(self) -> None:
-        """Release resources after the last message."""
+        """Releases resources after the last message."""
 
     def publish(self, topic: Topic, message: Stamped) -> None:
-        """Publish a message with the next sequence number of its key."""
+        """Publishes a message with the next sequence number of its key."""
         self.loop.publish(topic, message)
 
     def make_loop(self, bus: Bus) -> Runnable:
-        """Create the loop that runs this service on a session."""
+        """Creates the loop that runs this service on a session."""
         return Loop(self, bus, Inbox())
 
     def send_request(self, query: Query, request: Request, timeout: float = 5.0) -> int:
-        """Send a request without waiting.
+        """Sends a request without waiting.
 
         Returns the number with which `on_reply` is called, after about ``timeout`` s at the latest.
         """
@@ -133,7 +133,7 @@ class _SignalHandler:
 
 
 def main(settings_class: type[S], make: Callable[[S], Service], argv: list[str] | None = None) -> None:
-    """Run a service as a process until SIGTERM or Ctrl-C.
+    """Runs a service as a process until SIGTERM or Ctrl-C.
 
     A UserError ends the process with status 2 and a one-line message.
     """

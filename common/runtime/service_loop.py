@@ -36,7 +36,7 @@ class Loop:
     """Runs one service on one session."""
 
     def __init__(self, service: Service, bus: Bus, inbox: Inbox) -> None:
-        """Connect a service with a session; ``inbox`` queues what arrives for it."""
+        """Connects a service with a session; ``inbox`` queues the messages and requests that arrive for it."""
         self.service, self.bus, self.inbox = service, bus, inbox
         self.published: Counter[str] = Counter()  # by key
         self.undecodable: Counter[str] = Counter()  # by key
@@ -55,14 +55,14 @@ class Loop:
         service._loop = self  # noqa: SLF001 - a service publishes through its loop
 
     def run(self) -> None:
-        """Run the service until `stop`, and serve its metrics if the settings name an address for them."""
+        """Runs the service until `stop`, and serves its metrics if the settings name an address for them."""
         if not (address := self.service.settings.metrics):
             self._run()
             return
         # Imported here because the Prometheus client is slow to import and rarely used.
-        from common.runtime.metrics_server import measure
+        from common.runtime.metrics_server import serve_loop_metrics
 
-        with measure(self, address) as self._metrics:
+        with serve_loop_metrics(self, address) as self._metrics:
             self._run()
 
     def _run(self) -> None:
@@ -77,7 +77,7 @@ class Loop:
             self.service.close()
 
     def open(self) -> None:
-        """Open the service before it receives anything.
+        """Opens the service before it receives anything.
 
         Raises UserError if running services use another protocol version, or if the service itself cannot start.
         """
@@ -85,7 +85,7 @@ class Loop:
         self.service.open()
 
     def try_start(self) -> bool:
-        """Subscribe, serve queries and declare the service alive; returns False while another instance is active."""
+        """Subscribes, serves queries and declares the service alive; returns False while another instance is active."""
         if self._election is not None and not self._election.try_activate():
             return False
         service, bus = self.service, self.bus
@@ -107,14 +107,14 @@ class Loop:
         return True
 
     def _restore(self) -> None:
-        """Query the latched topics until one answers: after a router's restart, sessions first have to reconnect."""
+        """Queries the latched topics until one answers: after a router's restart, sessions first have to reconnect."""
         if (
             self.service.restores_latched
             and time.monotonic() < self._restore_until
             and (found := self._query_latched())
         ):
             self._restore_until = 0.0
-            self.guard(lambda: self.service.on_restored(found))
+            self.run_guarded(lambda: self.service.on_restored(found))
 
     def _query_latched(self) -> dict[Topic, Stamped]:
         found: dict[Topic, Stamped] = {}
@@ -127,12 +127,12 @@ class Loop:
         return found
 
     def stop(self) -> None:
-        """Make `run` return after its current step; safe to call from a signal handler."""
+        """Makes `run` return after its current step; safe to call from a signal handler."""
         self._stopping = True
         self.inbox.wake()
 
     def publish(self, topic: Topic, message: Stamped) -> None:
-        """Publish a message with the next sequence number of its key."""
+        """Publishes a message with the next sequence number of its key."""
         key = topic.key(self.bus.robot, self.service.name)
         numbered = message.model_copy(update={"seq": self.published[key]})
         self.bus.put(topic, numbered.encode(), self.service.name)
@@ -141,14 +141,14 @@ class Loop:
             self._metrics.published(key, numbered)
 
     def send_request(self, query: Query, request: Request, timeout: float) -> int:
-        """Send a request and return its number; the reply arrives through the inbox."""
+        """Sends a request and returns its number; the reply arrives through the inbox."""
         self._request_number += 1
         self.bus.send_request(query, request, self._request_number, self.inbox, timeout)
         return self._request_number
 
     def reject(self, key: str, reason: str) -> None:
-        """Count a payload that could not be used, and log it at most once a second."""
-        name = self.inbox.counted_as(key)
+        """Counts a payload that could not be used, and logs it at most once a second."""
+        name = self.inbox.counter_name(key)
         self.undecodable[name] += 1
         if self._may_log(name):
             self.service.log.warning("payload dropped", key=key, reason=reason, so_far=self.undecodable[name])
@@ -159,24 +159,24 @@ class Loop:
         self.handle(self.inbox.get(max(0.0, min(until_health, 0.5 if due is None else due))))
         due = self.service.due()
         if due is not None and due <= 0:
-            self.guard(self.service.on_timer)
-        self.pulse()
+            self.run_guarded(self.service.on_timer)
+        self.publish_health_if_due()
 
     def handle(self, event: Sample | IncomingRequest | RequestResult | None) -> None:
-        """Handle one entry of the inbox; raises UserError if an older instance has become active."""
+        """Handles one entry of the inbox; raises UserError if an older instance has become active."""
         if self._election is not None:
             self._election.check()
         if isinstance(event, Sample):
             if self._accepts(event):
                 with nullcontext() if self._metrics is None else self._metrics.step(event):
-                    self.guard(lambda: self.service.on_sample(event))
+                    self.run_guarded(lambda: self.service.on_sample(event))
         elif isinstance(event, IncomingRequest):
             self._answer(event)
         elif isinstance(event, RequestResult):
-            self.guard(lambda: self.service.on_reply(event.query, event.number, event.reply()))
+            self.run_guarded(lambda: self.service.on_reply(event.query, event.number, event.reply()))
 
-    def pulse(self) -> None:
-        """Publish health and repeat the periodic checks, once a second."""
+    def publish_health_if_due(self) -> None:
+        """Publishes health and repeats the periodic checks if a second has passed since the last time."""
         if (now := time.monotonic()) >= self._next_health:
             late = now - self._next_health > HEALTH_PERIOD_S  # after a long step, skip the health messages missed
             self._next_health = (now if late else self._next_health) + HEALTH_PERIOD_S
@@ -203,8 +203,8 @@ class Loop:
             )
         return False
 
-    def guard(self, step: Callable[[], None]) -> None:
-        """Run a step; an exception other than UserError is counted and logged, so that no input stops the service."""
+    def run_guarded(self, step: Callable[[], None]) -> None:
+        """Runs a step; an exception other than UserError is counted and logged, so that no input stops the service."""
         try:
             step()
         except UserError:

@@ -12,7 +12,7 @@ from scipy import ndimage
 from common.geometry.se2 import Array
 from common.geometry.world import World
 from lab.accuracy.correlative import CorrelativeMatcher
-from services.estimator.factory import EstimatorOptions, Geometry, Name, load_model, prepare
+from services.estimator.factory import EstimatorOptions, EstimatorPreset, ScannerGeometry, load_model, prepare_factory
 from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.particle_filter.sensor import Sensor
 from services.estimator.particle_filter.settings import ParticleFilterSettings
@@ -33,11 +33,11 @@ class EstimatorSetup:
     """What an estimator is made from: a world, the scanner, a seed, and what presage has learned of the world."""
 
     world: World
-    geometry: Geometry
+    geometry: ScannerGeometry
     seed: int
     learned: GenerativeModel | None = None  # None for the model shipped for the world
 
-    def options(self, estimator: Name, model: str = "learned") -> EstimatorOptions:
+    def options(self, estimator: EstimatorPreset, model: str = "learned") -> EstimatorOptions:
         """The options of an estimator made as by the estimator service."""
         own = self.learned if model == "learned" and estimator == "precise" else None
         return EstimatorOptions(self.world, estimator, model, seed=self.seed, generative_model=own)
@@ -77,7 +77,7 @@ class ScanMatchedOdometry:
 
     name = "scan-matched"
 
-    def __init__(self, estimator: PoseEstimator, geometry: Geometry) -> None:
+    def __init__(self, estimator: PoseEstimator, geometry: ScannerGeometry) -> None:
         self._estimator, self._geometry = estimator, geometry
         self.restart()
 
@@ -147,8 +147,8 @@ def _on_learned_field(setup: EstimatorSetup) -> PoseEstimator:
     return setup.particle_filter(settings, sensor)
 
 
-def _by_service(estimator: Name, model: str = "learned") -> Callable[[EstimatorSetup], PoseEstimator]:
-    return lambda setup: prepare(setup.options(estimator, model))(setup.geometry)
+def _by_service(estimator: EstimatorPreset, model: str = "learned") -> Callable[[EstimatorSetup], PoseEstimator]:
+    return lambda setup: prepare_factory(setup.options(estimator, model))(setup.geometry)
 
 
 def _with_particles(**changed: object) -> Callable[[EstimatorSetup], PoseEstimator]:

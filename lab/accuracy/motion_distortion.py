@@ -27,7 +27,7 @@ from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import Scene
 from lab.accuracy.tasks import is_at
 from presage.terminal.output import check_file, write_json
-from services.estimator.factory import Geometry
+from services.estimator.factory import ScannerGeometry
 from services.estimator.shared.interface import Observation
 from services.simulator.odometry import Odometer, OdometryNoise
 
@@ -61,7 +61,7 @@ def run(job: DistortionJob) -> list[dict[str, Any]]:
         for kind in SCANS:
             scene.rng = np.random.default_rng((job.seed, number, 1))
             estimator = COMPARED_ESTIMATORS[job.estimator].make(
-                EstimatorSetup(world, Geometry.of(scene.scanner), job.seed)
+                EstimatorSetup(world, ScannerGeometry.of(scene.scanner), job.seed)
             )
             estimator.restart(path[0], np.diag([0.01, 0.01, 0.01]))
             estimates = []

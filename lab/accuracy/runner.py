@@ -21,7 +21,7 @@ from lab.accuracy.compared_estimators import COMPARED_ESTIMATORS, EstimatorSetup
 from lab.accuracy.scenes import TWINS, Scene
 from lab.statistics import bootstrap_interval, median, root_mean_square, wilson_interval
 from lab.workers import pool
-from services.estimator.factory import Geometry
+from services.estimator.factory import ScannerGeometry
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.learning.field_learning import Recipe, learn_field, learn_scales, measure_ripple
 from services.estimator.precise.learning.surfaces import Beams
@@ -81,7 +81,7 @@ def run(job: AccuracyJob) -> dict[tuple[str, str], tasks.TaskOutcome]:
 
 def _estimator(job: AccuracyJob, world: World) -> PoseEstimator:
     """The job's estimator; for the world of two identical rooms, trains a field from 2000 scans if it needs one."""
-    geometry, compared = Geometry.of(job.scanner), COMPARED_ESTIMATORS[job.estimator]
+    geometry, compared = ScannerGeometry.of(job.scanner), COMPARED_ESTIMATORS[job.estimator]
     learned = None
     if world is TWINS and compared.learns:
         learned = quick_field(TWINS, geometry, np.random.default_rng(job.seed), limited=True)
@@ -97,7 +97,7 @@ def _scene(job: AccuracyJob, world: World, number: int) -> Scene:
 
 
 def quick_field(
-    world: World, geometry: Geometry, rng: np.random.Generator, samples: int = 2000, *, limited: bool = False
+    world: World, geometry: ScannerGeometry, rng: np.random.Generator, samples: int = 2000, *, limited: bool = False
 ) -> FieldModel:
     """A distance field trained on exact rays with the scanner's noise, without a simulator.
 

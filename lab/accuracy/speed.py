@@ -18,7 +18,7 @@ from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import Scene
 from lab.workers import pool
 from presage.terminal.output import check_file, write_json
-from services.estimator.factory import Geometry
+from services.estimator.factory import ScannerGeometry
 
 LIMITS = {"tracking": 5.0, "from nothing": 500.0}  # ms per update, the requirement for preset precise
 ESTIMATORS = ("precise", "precise-exact", "particle-filter", "amcl-defaults", "correlative")
@@ -61,7 +61,7 @@ def measure(estimator: str, world_name: str, beams: int, seed: int) -> dict[str,
     """Times one estimator: 20 global searches, then tracking along a path."""
     scene = Scene.of(load_world(world_name), beams, seed)
     began = time.perf_counter()
-    geometry = Geometry.of(scene.scanner)
+    geometry = ScannerGeometry.of(scene.scanner)
     estimator_under_test = COMPARED_ESTIMATORS[estimator].make(EstimatorSetup(scene.world, geometry, seed))
     ready = time.perf_counter() - began
     searches = []

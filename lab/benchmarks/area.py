@@ -22,7 +22,7 @@ from lab.integrity import changes
 from lab.integrity.buildings import make_building
 from lab.workers import pool
 from presage.terminal.output import check_file, make_folder, write_json
-from services.estimator.factory import Geometry
+from services.estimator.factory import ScannerGeometry
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.field import DistanceField, FieldModel
 from services.estimator.precise.gauss_newton import View, difference
@@ -72,7 +72,7 @@ def bench_area(
 ) -> int:
     """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
     check_file(json_file, "--json")
-    make_folder(out, "--out")
+    make_folder(out)
     wanted = sorted(float(area) for area in areas.split(","))
     parts = _parts(wanted[-1], seed, out, workers, console)
     rows = []
@@ -104,7 +104,7 @@ def _parts(area: float, seed: int, out: Path, workers: int, console: Console) ->
 def _part(out: Path, seed: int) -> Part:
     file = out / f"building-{seed}.npz"
     if not file.exists():
-        world, rng, geometry = make_building(seed).world, np.random.default_rng(seed), Geometry.of(SCANNER)
+        world, rng, geometry = make_building(seed).world, np.random.default_rng(seed), ScannerGeometry.of(SCANNER)
         model = quick_field(world, geometry, rng, SCANS)
         visited = se2.compose(world.sample_poses(SCANS, rng, 0.27), geometry.mount)[:, :2]
         places = seed_places(model.field, visited)
@@ -146,7 +146,9 @@ def site_of(parts: list[Part]) -> Site:
 def _measure(site: Site, places: int, moved: float, seed: int, console: Console) -> dict[str, Any]:
     """One row of the table."""
     rng = np.random.default_rng([seed, len(site.parts), round(100 * moved)])
-    estimator = PreciseEstimator(site.model, site.seeds, np.array(SCANNER.mount), Geometry.of(SCANNER).likelihood())
+    estimator = PreciseEstimator(
+        site.model, site.seeds, np.array(SCANNER.mount), ScannerGeometry.of(SCANNER).likelihood()
+    )
     _trial(estimator, *_scan(site, moved, rng))  # compiles
     title = f"{site.area:.0f} m², {moved:.0%} moved"
     trials = [
@@ -196,7 +198,9 @@ def _trial(estimator: PreciseEstimator, observation: Observation, truth: Array) 
     began = time.process_time()
     ranked = estimator.seeds.rank(view, PreciseSettings().ranked_seeds)
     ranking = time.process_time() - began
-    off = difference(ranked, truth)
-    seeded = bool(((np.hypot(off[:, 0], off[:, 1]) < SEED_POSITION_M) & (np.abs(off[:, 2]) < SEED_HEADING_RAD)).any())
+    errors = difference(ranked, truth)
+    seeded = bool(
+        ((np.hypot(errors[:, 0], errors[:, 1]) < SEED_POSITION_M) & (np.abs(errors[:, 2]) < SEED_HEADING_RAD)).any()
+    )
     wrong = posterior.state == "tracking" and not found
     return found, wrong, posterior.state == "ambiguous", seeded, seconds, ranking

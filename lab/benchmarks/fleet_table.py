@@ -31,6 +31,23 @@ def _large_fleet_note(row: dict[str, Any], rate: float) -> str:
 
 def show(rows: list[dict[str, Any]], plan: FleetPlan, console: Console) -> dict[str, dict[str, float | None]]:
     """Prints the table. Returns, by estimator, the ratios of one process for all robots to one process per robot."""
+    console.print(_table(rows, plan))
+    _print_searches(rows, console)
+    size = rows[0]["message_bytes"]
+    console.print(
+        "bytes per message: "
+        + ", ".join(f"{name} {count}" for name, count in size.items())
+        + f"; scans to the estimator: {size['scan'] * plan.rate / 1e3:.1f} kB/s per robot",
+        highlight=False,
+    )
+    for row in rows:
+        if row["way"] == DEPLOYMENTS[0]:
+            console.print(_large_fleet_note(row, plan.rate), highlight=False)
+    _warn_of_other_load(rows, console)
+    return {name: _compare_deployments(name, rows, console) for name in dict.fromkeys(row["estimator"] for row in rows)}
+
+
+def _table(rows: list[dict[str, Any]], plan: FleetPlan) -> Table:
     table = Table(
         title=f"{plan.world}, {plan.beams} beams at {plan.rate:g} Hz, one core, "
         f"{100 * plan.share:g} % of the scans answered within {1e3 / plan.rate:.1f} ms",
@@ -59,7 +76,11 @@ def show(rows: list[dict[str, Any]], plan: FleetPlan, console: Console) -> dict[
             f"{row['memory_per_robot_mb']:.1f}",
             f"{row['memory_mb']:.0f}",
         )
-    console.print(table)
+    return table
+
+
+def _print_searches(rows: list[dict[str, Any]], console: Console) -> None:
+    """Prints how one robot's global searches delay the others."""
     for row in rows:
         if (other := row["while_one_searches"]) is not None and other["p99_ms"] is not None:
             console.print(
@@ -68,16 +89,10 @@ def show(rows: list[dict[str, Any]], plan: FleetPlan, console: Console) -> dict[
                 f"p50 {other['p50_ms']:.1f}, p99 {other['p99_ms']:.1f} ms",
                 highlight=False,
             )
-    size = rows[0]["message_bytes"]
-    console.print(
-        "bytes per message: "
-        + ", ".join(f"{name} {count}" for name, count in size.items())
-        + f"; scans to the estimator: {size['scan'] * plan.rate / 1e3:.1f} kB/s per robot",
-        highlight=False,
-    )
-    for row in rows:
-        if row["way"] == DEPLOYMENTS[0]:
-            console.print(_large_fleet_note(row, plan.rate), highlight=False)
+
+
+def _warn_of_other_load(rows: list[dict[str, Any]], console: Console) -> None:
+    """Prints a warning if other processes used the core too."""
     others = max(window["others_share"] for row in rows for window in row["windows"])
     if others > MAX_OTHER_LOAD:
         console.print(
@@ -85,20 +100,22 @@ def show(rows: list[dict[str, Any]], plan: FleetPlan, console: Console) -> dict[
             f"share of a busy core than several processes do. Compare processor times, or repeat on an idle machine",
             highlight=False,
         )
-    ratios: dict[str, dict[str, float | None]] = {}
-    for name in dict.fromkeys(row["estimator"] for row in rows):
-        one, each = (
-            next(r for r in rows if r["estimator"] == name and r["way"] == deployment) for deployment in DEPLOYMENTS
-        )
-        ratios[name] = {
-            "robots_served": one["robots_served"] / each["robots_served"] if each["robots_served"] else None,
-            "robots_by_cpu": one["robots_by_cpu"] / each["robots_by_cpu"],
-            "memory_per_robot": each["memory_per_robot_mb"] / max(one["memory_per_robot_mb"], 0.1),
-        }
-        served = f"{ratios[name]['robots_served']:.2f}" if each["robots_served"] else "an unknown number of"
-        console.print(
-            f"{name}: one process for all serves {served} times as many robots as one process per robot; "
-            f"extrapolated from processor time, {ratios[name]['robots_by_cpu']:.2f} times",
-            highlight=False,
-        )
+
+
+def _compare_deployments(estimator: str, rows: list[dict[str, Any]], console: Console) -> dict[str, float | None]:
+    """Prints and returns the ratios of one process for all robots to one process per robot."""
+    one, each = (
+        next(r for r in rows if r["estimator"] == estimator and r["way"] == deployment) for deployment in DEPLOYMENTS
+    )
+    ratios = {
+        "robots_served": one["robots_served"] / each["robots_served"] if each["robots_served"] else None,
+        "robots_by_cpu": one["robots_by_cpu"] / each["robots_by_cpu"],
+        "memory_per_robot": each["memory_per_robot_mb"] / max(one["memory_per_robot_mb"], 0.1),
+    }
+    served = f"{ratios['robots_served']:.2f}" if each["robots_served"] else "an unknown number of"
+    console.print(
+        f"{estimator}: one process for all serves {served} times as many robots as one process per robot; "
+        f"extrapolated from processor time, {ratios['robots_by_cpu']:.2f} times",
+        highlight=False,
+    )
     return ratios

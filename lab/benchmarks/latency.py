@@ -17,7 +17,7 @@ from rich.table import Table
 
 from common.bus.bus import Bus, Link, open_bus
 from common.bus.inbox import Inbox, Sample
-from common.bus.security import credentials
+from common.bus.security import read_credentials
 from common.errors import UserError
 from common.geometry import se2
 from common.geometry.world import load_world
@@ -39,7 +39,7 @@ def echo_main() -> None:
     """Entry point of the echo process: returns every payload it receives, in order."""
     inbox = Inbox()
     folder, connect = os.environ.get("PRESAGE_SECURITY"), (os.environ["PRESAGE_CONNECT"],)
-    security = credentials(Path(folder), ("simulator",), ECHO_ROBOT) if folder else None
+    security = read_credentials(Path(folder), ("simulator",), ECHO_ROBOT) if folder else None
     with open_bus(Link(robot=ECHO_ROBOT, connect=connect, security=security)) as bus:
         bus.subscribe(ODOM, inbox, keep_all=True)
         bus.publisher(TRUTH)

@@ -22,10 +22,11 @@ from lab.benchmarks.mapping import trajectory_errors
 from presage.live.latest_messages import LatestMessages
 from presage.session.running import link_of
 
-GAIN, REACH_M = 3.0, 0.25  # 1/s, of the distance from a point of the path; where the next one is due
+GAIN = 3.0  # 1/s, commanded speed per distance from the next point of the path
+REACHED_M = 0.25  # distance from a point at which the robot turns to the next one
 MAX_SPEED, MAX_TURN = 0.7, 1.0  # m/s, rad/s
 TIMEOUT_S = 5.0
-STUCK_NS = 60_000_000_000
+STUCK_NS = 60_000_000_000  # without reaching a new point
 
 
 def random_path(world: str, seconds: float, seed: int, start: Array) -> Array:
@@ -50,7 +51,7 @@ def drive_path(bus: Bus, path: Array) -> tuple[Array, Array]:
             continue
         truths[message.stamp_ns] = pose = message.pose.array()
         progress_ns = progress_ns or message.stamp_ns
-        while k + 1 < len(path) and np.hypot(*(path[k] - pose)[:2]) < REACH_M:
+        while k + 1 < len(path) and np.hypot(*(path[k] - pose)[:2]) < REACHED_M:
             k, progress_ns = k + 1, message.stamp_ns
         if message.stamp_ns - progress_ns > STUCK_NS:
             raise UserError(f"the robot is stuck at ({pose[0]:.2f}, {pose[1]:.2f})")
@@ -63,7 +64,7 @@ def drive_path(bus: Bus, path: Array) -> tuple[Array, Array]:
 
 
 def main() -> None:
-    """Drives, and prints errors and dropped scans."""
+    """Drives along a random path, and prints errors and dropped scans."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--world", default="office", help="the world of the simulator")
     parser.add_argument("--seconds", type=float, default=600.0)

@@ -24,7 +24,7 @@ from lab.integrity.buildings import make_building
 from lab.integrity.cases import BEAMS, START_DEVIATION
 from lab.integrity.maps import noisy_grid
 from presage.terminal.output import check_file, write_json
-from services.estimator.factory import EstimatorOptions, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.key_scans import KeyScanCollector
@@ -32,12 +32,12 @@ from services.estimator.precise.learning.live_learning import ModelVersion, lear
 
 DELAY_S = 15.0  # of the drive, in which a version is learned
 TEST_SECONDS = 40.0
-ROUGH_SEED, DRIVE_SEED, TEST_SEED = 5, 6, 7
+ROUGH_SEED, DRIVE_SEED, TEST_SEED = 5, 6, 7  # parts of the random seeds: of the rough map, the drive and the test
 
 
 def start_estimator(rough: World, scene: Scene, start: Array) -> PreciseEstimator:
     """An estimator in the rough map, near a pose."""
-    made = prepare(EstimatorOptions(rough, model="exact"))(Geometry.of(scene.scanner))
+    made = prepare_factory(EstimatorOptions(rough, model="exact"))(ScannerGeometry.of(scene.scanner))
     assert isinstance(made, PreciseEstimator)  # noqa: S101 - for the type checker
     made.restart(start + START_DEVIATION * scene.rng.standard_normal(3), np.diag(START_DEVIATION**2))
     return made
@@ -93,10 +93,11 @@ def key_scan_bytes(keys: KeyScanCollector) -> int:
     return sum(key.ranges.nbytes for key in keys.verified.values())
 
 
-def test_errors(rough: World, scene: Scene, version: ModelVersion | None) -> dict[str, float]:
+def errors_of_test_drive(rough: World, scene: Scene, version: ModelVersion | None) -> dict[str, float]:
     """Position errors of another drive, with a version or with the rough map.
 
-    Those that are aligned do not count where the map as a whole lies.
+    For the aligned errors, the estimated path is first moved and turned as a whole to fit the true one best, so that an
+    offset of the whole map does not count.
     """
     path = scene.path(TEST_SECONDS)
     estimator = start_estimator(rough, scene, path[0])
@@ -121,12 +122,14 @@ def refine(name: str, seed: int, seconds: float) -> dict[str, Any]:
     rough = noisy_grid(Scene.of(world, BEAMS, [seed, ROUGH_SEED]))
     scene = Scene.of(world, BEAMS, [seed, DRIVE_SEED])
     learned, version = drive_and_learn(rough, scene, scene.path(seconds))
-    before, after = (test_errors(rough, Scene.of(world, BEAMS, [seed, TEST_SEED]), each) for each in (None, version))
+    before, after = (
+        errors_of_test_drive(rough, Scene.of(world, BEAMS, [seed, TEST_SEED]), each) for each in (None, version)
+    )
     return {"world": world.name, "rough": before, "after": after, **learned}
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """The Markdown table of docs/mapping.md, in mm: median, RMS and maximum; and medians without the map's place."""
+    """The Markdown table of docs/refinement.md, in mm: median, RMS and maximum; and medians without the map's place."""
     cells = []
     for row in rows:
         errors = [

@@ -67,16 +67,16 @@ def relation_errors(poses: Array, stamps: Array, relations: Array) -> Errors:
     first, second = (
         np.stack([np.interp(times, stamps, axis) for axis in unwrapped.T], axis=-1) for times in relations[:, :2].T
     )
-    off = se2.between(relations[:, 2:], se2.between(first, second))
-    return np.hypot(off[:, 0], off[:, 1]), np.abs(se2.wrap(off[:, 2]))
+    error = se2.between(relations[:, 2:], se2.between(first, second))
+    return np.hypot(error[:, 0], error[:, 1]), np.abs(se2.wrap(error[:, 2]))
 
 
 def trajectory_errors(poses: Array, truths: Array) -> Errors:
     """Errors of the known poses of a trajectory (N, 3), moved and turned as a whole so that its positions fit best."""
     known = np.isfinite(poses).all(axis=1)
     poses, truths = poses[known], truths[known]
-    off = fitted(poses, truths) - truths
-    return np.hypot(*off[:, :2].T), np.abs(se2.wrap(off[:, 2]))
+    error = fitted(poses, truths) - truths
+    return np.hypot(*error[:, :2].T), np.abs(se2.wrap(error[:, 2]))
 
 
 def fitted(poses: Array, truths: Array) -> Array:

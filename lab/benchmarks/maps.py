@@ -37,7 +37,7 @@ def bench_map(
     """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
     check_file(json_file, "--json")
     if out is not None:
-        make_folder(out, "--out")
+        make_folder(out)
     with tempfile.TemporaryDirectory() as folder:
         path = world or str(write_map(out or Path(folder), rooms(size, seed)))
         rows = measure(path, beams, seed)

@@ -173,7 +173,7 @@ def bench_recorder(load: RecorderLoad, out: Path | None, json_file: Path | None,
             f"--seconds {load.seconds:g} at --rate {load.rate:g} give less than one message per topic: increase either"
         )
     if out is not None:
-        make_folder(out, "--out")
+        make_folder(out)
     with tempfile.TemporaryDirectory() as folder:
         result = measure(load, out or Path(folder), console)
     table = Table(

@@ -29,15 +29,15 @@ from presage.learning.map_of_log import MapOptions, map_command
 from presage.learning.train_drive import TrainDriveOptions, train_from_drive
 from presage.logs.log import Reading
 from presage.terminal.output import check_file, make_folder, write_json
-from services.estimator.factory import EstimatorOptions, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.precise.learning import weights
 from services.estimator.shared.generative_models import GenerativeModel, RayCaster
 
-TEST_SECONDS = 40.0  # length of the other drive
-WALLS_EVERY = 10  # scan of the drive that refines shows walls to compare
+TEST_SECONDS = 40.0  # length of the second drive, on which the map is tested
+WALLS_EVERY = 10  # every 10th scan of the first drive is used to compare the walls
 GRID, PLAN, NOTHING = "grid", "floor plan", "nothing"  # a noisy grid of 5 cm cells, or the walls without furniture
-ROUGH_SEED, DRIVE_SEED, TEST_SEED = 5, 6, 7
-IN_MAP = np.zeros(3)  # the frame of a map that is the true world's
+ROUGH_SEED, DRIVE_SEED, TEST_SEED = 5, 6, 7  # parts of the random seeds: of the rough map, the drive and the test
+SAME_FRAME = np.zeros(3)  # frame of a map in the true world, if the two are the same
 QUIET = Console(quiet=True)
 
 
@@ -59,7 +59,7 @@ def bench_refinement(
     The maps, logs and models are written to ``out``.
     """
     check_file(json_file, "--json")
-    make_folder(out, "--out")
+    make_folder(out)
     names = ["office", *map(str, range(seed, seed + worlds))]
     jobs = [RefinementJob(name, seed, seconds, str(out)) for name in names]
     results = run_trials("refinement", refine_and_test, jobs, out, workers, console)
@@ -83,7 +83,7 @@ def refine_and_test(job: RefinementJob) -> dict[str, Any]:
     path = drive_for(test, building, TEST_SECONDS)
     check = ModelTest(drive, poses[::WALLS_EVERY], test, path, test.clean(path))
     true = TrainDriveOptions(log, str(_write(out, world)), out / "true-poses", reading=reading)
-    at_true_poses = check.learned(train_from_drive(true, QUIET), world, IN_MAP)
+    at_true_poses = check.learned(train_from_drive(true, QUIET), world, SAME_FRAME)
     rows = []
     for start, rough in roughs.items():
         file = "" if rough is None else str(_write(out, rough))
@@ -121,7 +121,7 @@ class ModelTest:
 
     def rough(self, world: World) -> dict[str, float]:
         """Errors in a map without learning, whose frame is that of the true world."""
-        return self._errors(RayCaster(world), EstimatorOptions(world, model="exact"), IN_MAP)
+        return self._errors(RayCaster(world), EstimatorOptions(world, model="exact"), SAME_FRAME)
 
     def learned(self, file: Path, world: World, frame: Array) -> dict[str, float]:
         """Errors with the weights ``file`` of a map, whose ``frame`` (3,) is given in the true world."""
@@ -146,7 +146,7 @@ class ModelTest:
         """Poses (M, 3) of the other drive's scans in the map, and whether they are reported as `tracking`."""
         rng = np.random.default_rng(0)  # all models get the same scans
         scene = Scene(self.test.world, self.test.scanner, rng)
-        estimator = prepare(options)(Geometry.of(scene.scanner))
+        estimator = prepare_factory(options)(ScannerGeometry.of(scene.scanner))
         start = self.path[0] + START_DEVIATION * rng.standard_normal(3)
         estimator.restart(se2.compose(se2.inverse(frame), start), np.diag(START_DEVIATION**2))
         scans = (scene.observe(ranges, k * PERIOD_S) for k, ranges in enumerate(self.clean))
@@ -205,7 +205,7 @@ def _trajectory(tum: Path, poses: Array) -> tuple[Array, Array]:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """The Markdown table of docs/mapping.md, in mm: medians, and RMS after a semicolon."""
+    """The Markdown table of docs/refinement.md, in mm: medians, and RMS after a semicolon."""
 
     def pair(errors: dict[str, float] | None, quantity: str) -> str:
         if errors is None:

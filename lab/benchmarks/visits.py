@@ -35,7 +35,7 @@ from lab.navigation.shortest_path import ShortestPaths
 from presage.learning.map_of_log import MapOptions, map_command
 from presage.logs.log import Reading
 from presage.terminal.output import check_file, make_folder, write_json
-from services.estimator.factory import EstimatorOptions, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.field_learning import Recipe, learn_field
@@ -86,7 +86,7 @@ def bench_visits(
     The maps, logs and models are written to ``out``.
     """
     check_file(json_file, "--json")
-    make_folder(out, "--out")
+    make_folder(out)
     names = ["office", *map(str, range(seed, seed + worlds))]
     jobs = [VisitsJob(name, visits, scans, seed, str(out)) for name in names]
     results = run_trials("visits", run_visits, jobs, out, workers, console)
@@ -222,7 +222,7 @@ def _localise(
     options: EstimatorOptions, scanner: Scanner, scans: list[Observation], poses: Array
 ) -> list[float | None]:
     """Errors in m of single scans from unknown poses; None if not found."""
-    estimator = prepare(options)(Geometry.of(scanner))
+    estimator = prepare_factory(options)(ScannerGeometry.of(scanner))
     errors: list[float | None] = []
     for scan, pose in zip(scans, poses, strict=True):
         estimator.restart()
@@ -263,7 +263,7 @@ def office_building() -> Building:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """The Markdown table of docs/mapping.md: single scans found of all, and the median error of these in mm.
+    """The Markdown table of docs/refinement.md: single scans found of all, and the median error of these in mm.
 
     Rooms are entered if the visit's drive went there.
     """

@@ -240,7 +240,7 @@ def all_experiments(
     from lab.paper.suite import run_all
 
     seed, out = context.obj
-    make_folder(out, "--out")
+    make_folder(out)
     run_all(trials, seed, out, worker_count(), console)
 
 

@@ -44,7 +44,7 @@ def worker_count(extra: int = 0) -> int:
 
 def show(experiment: ModuleType, run: Callable[[], Result], out: Path) -> None:
     """Runs the experiment, then prints its table, its notes and the files it wrote."""
-    make_folder(out, "--out")
+    make_folder(out)
     result = run()
     print(f"\n{experiment.table(result.summary)}\n")
     if result.notes:

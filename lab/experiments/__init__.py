@@ -1,1 +1,1 @@
-"""What the experiments share."""
+"""Code that several experiments use."""

@@ -12,7 +12,7 @@ import shapely
 from common.errors import UserError
 from common.geometry.world import load_world
 from lab.accuracy.scenes import Scene
-from services.estimator.factory import EstimatorOptions, Factory, Geometry, prepare
+from services.estimator.factory import EstimatorFactory, EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.paper.perception import Descent
 from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.particle_filter.settings import ParticleFilterSettings
@@ -84,7 +84,7 @@ def create_estimator(
 ) -> PoseEstimator:
     """A new estimator without a start pose. The paper's starts at the map's centre, as in the paper."""
     scanner, kind = scene.scanner, name.split(",", maxsplit=1)[0]
-    geometry = Geometry.of(scanner)
+    geometry = ScannerGeometry.of(scanner)
     if kind == "paper":
         return _factory(field.world, "paper", Descent() if name.endswith(TEN_STEPS) else descent)(geometry)
     if kind == "precise":
@@ -99,8 +99,8 @@ def create_estimator(
 
 
 @functools.lru_cache(maxsize=8)
-def _factory(world: str, name: str, descent: Descent) -> Factory:
+def _factory(world: str, name: str, descent: Descent) -> EstimatorFactory:
     try:
-        return prepare(EstimatorOptions(world, name, descent=descent))  # type: ignore[arg-type]
+        return prepare_factory(EstimatorOptions(world, name, descent=descent))  # type: ignore[arg-type]
     except UserError as error:
         raise UserError(f"{error}; or leave {name} out with --estimators") from None

@@ -22,7 +22,7 @@ MAX_DRAWS = 20_000
 
 @dataclass(frozen=True)
 class Journey:
-    """A drive from standstill at ``start`` to within `ARRIVAL_DISTANCE` of ``goal``, in m."""
+    """Start and goal, in m. The robot begins at rest and must come within `ARRIVAL_DISTANCE` of the goal."""
 
     start: tuple[float, float]
     goal: tuple[float, float]

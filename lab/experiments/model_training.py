@@ -86,19 +86,19 @@ def train_paper(scene: Scene, heading: float, samples: int, steps: int, seed: in
     """
     use_one_core()  # floating-point sums depend on the number of threads
     train = _usable(sample_scans(scene, samples, heading), scene)
-    judge = _usable(sample_scans(scene, TEST_SCANS, heading, noise=False), scene)
-    watch = TrainingData(judge.poses[:CURVE_SCANS], judge.ranges[:CURVE_SCANS])
+    test = _usable(sample_scans(scene, TEST_SCANS, heading, noise=False), scene)
+    curve = TrainingData(test.poses[:CURVE_SCANS], test.ranges[:CURVE_SCANS])
     parameters = training.TrainingParameters(
         max(1, -(-steps // -(-samples // BATCH_SIZE))), BATCH_SIZE, LEARNING_RATE, seed
     )
     norm = Normalisation.of(scene.world.bounds, float(train.ranges.max()))
     began = time.process_time()
     trainer = training.Trainer(
-        DecoderShape(scene.scanner.beams, HIDDEN_UNITS, CHANNELS), norm, parameters, train, watch
+        DecoderShape(scene.scanner.beams, HIDDEN_UNITS, CHANNELS), norm, parameters, train, curve
     )
     model = trainer.run()
     took = time.process_time() - began
-    error = np.abs(model.ranges(judge.poses) - judge.ranges)
+    error = np.abs(model.ranges(test.poses) - test.ranges)
     card = ModelCard(
         preset="paper",
         world=scene.world,
@@ -127,9 +127,9 @@ def train_paper(scene: Scene, heading: float, samples: int, steps: int, seed: in
     return TrainedDecoder(model, card)
 
 
-def learn_precise(scene: Scene, samples: int, recipe: Recipe | None = None) -> TrainedField:
+def learn_precise(scene: Scene, samples: int) -> TrainedField:
     """Trains the distance field on ``samples`` noisy scans at random headings; a tenth of them calibrates precision."""
-    scanner, recipe = scene.scanner, recipe or Recipe()
+    scanner, recipe = scene.scanner, Recipe()
     mount, angles = np.array(scanner.mount), scanner.angles()
     data = sample_scans(scene, samples, None)
     split = max(1, samples // CALIBRATION_DIVISOR)
@@ -154,8 +154,8 @@ def range_errors(model: PaperModel | FieldModel, scene: Scene, data: TrainingDat
         return np.asarray(np.abs(model.ranges(data.poses) - usable_ranges(data.ranges, scene.scanner.range_max)))
     expected = model.expect(se2.compose(data.poses, np.array(scene.scanner.mount)), scene.scanner.angles()).ranges
     both = np.isfinite(expected) & np.isfinite(data.ranges)
-    off = np.subtract(expected, data.ranges, out=np.full(expected.shape, np.nan), where=both)
-    return np.asarray(np.abs(off))
+    error = np.subtract(expected, data.ranges, out=np.full(expected.shape, np.nan), where=both)
+    return np.asarray(np.abs(error))
 
 
 def _usable(data: TrainingData, scene: Scene) -> TrainingData:

@@ -107,7 +107,7 @@ def ratio(value: float) -> str:
     return f"{value:.{1 if value < 10 else 0}f}"
 
 
-def mean_std(summary: Mapping[str, Any], quantity: str, digits: int = 3) -> str:
+def mean_std(summary: Mapping[str, Any], quantity: str) -> str:
     """Formats the summary's QUANTITY_mean_m and QUANTITY_std_m as mean ± standard deviation."""
     mean, std = summary.get(f"{quantity}_mean_m"), summary.get(f"{quantity}_std_m")
-    return f"{number(mean, digits)} ± {number(std, digits)}"
+    return f"{number(mean, 4)} ± {number(std, 4)}"

@@ -19,12 +19,12 @@ from common.versions import commit
 from lab.workers import pool
 
 Job = TypeVar("Job")  # a frozen dataclass of plain values, because it is pickled and compared with stored jobs
-Result = dict[str, Any]  # can be written as JSON
+TrialResult = dict[str, Any]  # can be written as JSON
 
 
 def run_trials(
-    name: str, trial: Callable[[Job], Result], jobs: Sequence[Job], out: Path, workers: int, console: Console
-) -> list[Result]:
+    name: str, trial: Callable[[Job], TrialResult], jobs: Sequence[Job], out: Path, workers: int, console: Console
+) -> list[TrialResult]:
     """Runs ``trial`` on every job in worker processes. Returns the results in the order of the jobs.
 
     ``trial`` must be a module-level function whose result depends on its job alone. Finished trials are stored in
@@ -44,7 +44,7 @@ def run_trials(
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(name, total=len(jobs), completed=len(done))
 
-        def store_result(index: int, result: Result) -> None:
+        def store_result(index: int, result: TrialResult) -> None:
             done[index] = result
             store.add(index, result)
             bar.advance(task)
@@ -64,11 +64,11 @@ def run_trials(
 
 
 def _run_in_parallel(
-    trial: Callable[[Job], Result],
+    trial: Callable[[Job], TrialResult],
     jobs: Sequence[Job],
     remaining: list[int],
     workers: int,
-    store_result: Callable[[int, Result], None],
+    store_result: Callable[[int, TrialResult], None],
 ) -> None:
     try:
         with pool(workers) as executor:
@@ -91,9 +91,9 @@ class TrialStore:
         plain = json.dumps([commit(), [asdict(job) for job in jobs]], sort_keys=True, default=str)
         self.key = hashlib.sha256(plain.encode()).hexdigest()
 
-    def read(self) -> dict[int, Result]:
+    def read(self) -> dict[int, TrialResult]:
         """Results by index. Ignores an incomplete last line; deletes a file of other jobs or another commit."""
-        done: dict[int, Result] = {}
+        done: dict[int, TrialResult] = {}
         if not self.path.exists():
             return done
         lines = self.path.read_text(encoding="utf-8").splitlines()
@@ -109,7 +109,7 @@ class TrialStore:
         self.path.write_text("\n".join([self.key, *(json.dumps(pair) for pair in done.items())]) + "\n", "utf-8")
         return done
 
-    def add(self, index: int, result: Result) -> None:
+    def add(self, index: int, result: TrialResult) -> None:
         """Appends a result."""
         first = "" if self.path.exists() else self.key + "\n"
         with self.path.open("a", encoding="utf-8") as file:

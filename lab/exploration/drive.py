@@ -35,10 +35,10 @@ LAST_SCANS = 15  # while the robot comes to a stand
 
 @dataclass
 class ExplorationRun:
-    """What happened, one entry for each scan."""
+    """What happened in one exploration."""
 
-    truths: list[Array] = field(default_factory=list)  # (3,)
-    beliefs: list[Array] = field(default_factory=list)  # (3,)
+    truths: list[Array] = field(default_factory=list)  # (3,) true pose at each scan
+    beliefs: list[Array] = field(default_factory=list)  # (3,) believed pose at each scan, in map
     contacts: list[Array] = field(default_factory=list)  # (3,) true poses with a contact
     held_back: int = 0  # scans at which the obstacle stop held the robot
     unmatched: int = 0  # scans that did not match the map
@@ -46,7 +46,7 @@ class ExplorationRun:
     reason: str = ""  # of the last status
     map: Map | None = None
     choice_ms: list[float] = field(default_factory=list)  # duration of each choice of a viewpoint
-    targets: list[Array] = field(default_factory=list)  # (3,) in map
+    targets: list[Array] = field(default_factory=list)  # (3,) in map, the viewpoints that were chosen
 
 
 class RobotWithMapper:
@@ -55,7 +55,7 @@ class RobotWithMapper:
     def __init__(self, robot: Robot, choose: ChooseViewpoint) -> None:
         self.run, self.finished = ExplorationRun(), False
         self._choose, self._policy = choose, GeodesicPolicy(robot, None)
-        self._navigator = Navigator(robot, preset=self._policy)
+        self._navigator = Navigator(robot, chosen_policy=self._policy)
         self._mapper: Mapper | None = None  # built for the first scan
         self._map: PlannedMap | None = None
         self._map_stamp_ns = -MAP_PERIOD_NS
@@ -112,7 +112,7 @@ class RobotWithMapper:
 def explore(
     world: World, robot: Robot, choose: ChooseViewpoint, start: Array, seed: int, limit_s: float, *, beams: int = 622
 ) -> ExplorationRun:
-    """Explore a world from ``start`` (3,) until the explorer has finished or failed, or for ``limit_s`` s."""
+    """Explores a world from ``start`` (3,) until the explorer has finished or failed, or for ``limit_s`` s."""
     explorer, scanner = RobotWithMapper(robot, choose), SCANNERS["tim571"].with_beams(beams)
     x, y, yaw = start.tolist()
     run, last_scans = explorer.run, 0
@@ -132,6 +132,7 @@ def explore(
 def measure(run: ExplorationRun, world: World, robot: Robot) -> dict[str, Any]:
     """The numbers of one exploration."""
     truths, beliefs = np.array(run.truths), np.array(run.beliefs)
+    # What can be reached through passages of at least MIN_PASSAGE_M, and through all that the robot just fits through.
     area, tight = (reachable_area(world, radius, truths[0]) for radius in (MIN_PASSAGE_M / 2, robot.radius))
     grid = None if run.map is None else run.map.grid
     # The map's origin is where the robot began.
@@ -148,7 +149,7 @@ def measure(run: ExplorationRun, world: World, robot: Robot) -> dict[str, Any]:
         "contact_scans": len(run.contacts),
         "held_back_scans": run.held_back,
         "lost_scans": run.unmatched,
-        "seconds": len(truths) / 15,
+        "seconds": len(truths) / SCANNERS["tim571"].rate,
         "belief_rms_m": float(np.sqrt((errors**2).mean())),
         "choices": len(run.choice_ms),
         "choice_ms_median": float(np.median(run.choice_ms)) if run.choice_ms else 0.0,

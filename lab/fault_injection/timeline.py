@@ -24,7 +24,7 @@ class Timeline:
         self._changed = threading.Condition(self._lock)
 
     def add(self, row: Row) -> None:
-        """Appends an event and wake up waiting threads."""
+        """Appends an event and wakes up waiting threads."""
         with self._lock:
             self.rows.append(row)
             self._changed.notify_all()

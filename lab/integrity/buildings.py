@@ -25,8 +25,9 @@ MIN_DOOR_OFFSET_M = 0.8  # of a door's centre from the corner of a room
 TEMPLATES = 3  # different sets of furniture in a building
 PLACE_DEVIATION_M, YAW_DEVIATION = 0.08, np.deg2rad(3)  # between rooms with the same set
 CORRIDOR_SPACING_M = 4.0  # mean distance between pieces along a corridor
+WALL_GAP_M = 0.03  # between a wall and a piece that stands against it
 
-CORRIDOR_CATALOGUE = (CATALOGUE[1], CATALOGUE[8])
+CORRIDOR_CATALOGUE = (CATALOGUE[1], CATALOGUE[8])  # shelf and plant
 
 
 @dataclass(frozen=True)
@@ -114,14 +115,14 @@ FloorPlan = tuple[list[Point], list[Obstacle], list[Room]]
 
 def _corridor(rng: np.random.Generator, *, alike: bool = False) -> FloorPlan:
     """Rooms on both sides of a straight corridor."""
-    length, wide, depth, other = rng.uniform(12, 22), rng.uniform(1.7, 2.4), *rng.uniform(3.2, 5.0, 2)
-    other = depth if alike else other
-    height = depth + wide + other
+    length, corridor_width, depth, north_depth = rng.uniform(12, 22), rng.uniform(1.7, 2.4), *rng.uniform(3.2, 5.0, 2)
+    north_depth = depth if alike else north_depth
+    height = depth + corridor_width + north_depth
     south = _row(rng, (0.0, 0.0, 0.0), length, depth, equal=alike)
     # The same divisions, turned by half a turn, if the rooms are alike.
-    north = _turned(south, length, height) if alike else _row(rng, (length, height, np.pi), length, other)
+    north = _turned(south, length, height) if alike else _row(rng, (length, height, np.pi), length, north_depth)
     walls = [wall for row in (south, north) for wall in _walls_of(row)]
-    return _rectangle(length, height), walls, [*south, *north, Room((0.0, depth, 0.0), length, wide)]
+    return _rectangle(length, height), walls, [*south, *north, Room((0.0, depth, 0.0), length, corridor_width)]
 
 
 def _corner(rng: np.random.Generator) -> FloorPlan:
@@ -184,14 +185,14 @@ def _row(
     rooms = []
     for begin, end in pairwise(edges.tolist()):
         door = MIN_DOOR_OFFSET_M + (end - begin - 2 * MIN_DOOR_OFFSET_M) * (side if equal else rng.uniform())
-        rooms.append(Room(_moved(corner, begin), end - begin, depth, door))
+        rooms.append(Room(_along_x(corner, begin), end - begin, depth, door))
     if corner_room:
-        rooms.append(Room(_moved(corner, length), corner_room, depth, MIN_DOOR_OFFSET_M))
+        rooms.append(Room(_along_x(corner, length), corner_room, depth, MIN_DOOR_OFFSET_M))
     return rooms
 
 
-def _moved(corner: tuple[float, float, float], distance: float) -> tuple[float, float, float]:
-    """The pose ``distance`` m further along its x axis."""
+def _along_x(corner: tuple[float, float, float], distance: float) -> tuple[float, float, float]:
+    """The pose ``corner`` moved by ``distance`` m along its x axis."""
     x, y, yaw = se2.compose(corner, [distance, 0.0, 0.0]).tolist()
     return x, y, yaw
 
@@ -268,11 +269,11 @@ def _furnish(
 def _pose_of(item: TemplateItem, room: Room, offset: Array) -> Array:
     """Pose (3,) of an item in the room's frame, with an offset (3,) that leaves it at its wall."""
     width, depth = item.piece.size
-    inner = np.array([room.width, room.depth]) - WALL_M - 0.06  # pieces stand 3 cm from a wall
+    inner = np.array([room.width, room.depth]) - WALL_M - 2 * WALL_GAP_M
     if item.side is None:
         radius = np.hypot(width, depth) / 2
         place = radius + (inner - 2 * radius) * item.place
-        return np.array([*(place + WALL_M / 2 + 0.03), item.yaw]) + offset
+        return np.array([*(place + WALL_M / 2 + WALL_GAP_M), item.yaw]) + offset
     along_wall = inner[item.side % 2]
     along = np.clip(width / 2 + (along_wall - width) * item.place[0] + offset[0], width / 2, along_wall - width / 2)
     x, y, yaw = {
@@ -281,7 +282,7 @@ def _pose_of(item: TemplateItem, room: Room, offset: Array) -> Array:
         2: (along, inner[1] - depth / 2, np.pi),
         3: (depth / 2, along, -np.pi / 2),
     }[item.side]
-    return np.array([x + WALL_M / 2 + 0.03, y + WALL_M / 2 + 0.03, yaw])
+    return np.array([x + WALL_M / 2 + WALL_GAP_M, y + WALL_M / 2 + WALL_GAP_M, yaw])
 
 
 def random_place(building: Building, piece: FurniturePiece, rng: np.random.Generator) -> FurniturePiece:

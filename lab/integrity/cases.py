@@ -21,17 +21,17 @@ from services.estimator.shared.interface import Observation
 from services.simulator.odometry import Odometer, OdometryNoise
 
 BEAMS = 622
-KIDNAPPING_PERIOD_S = 2.0
+KIDNAPPING_PERIOD_S = 2.0  # between two kidnappings
 START_DEVIATION = np.array([0.05, 0.05, np.deg2rad(1)])  # m, m, rad, of a known start; 7 cm RMS
-OTHER_SEED = 1_000_000  # added to a world's seed for the wrong map
-SCALE = 1.01  # of a scaled map
+WRONG_MAP_SEED = 1_000_000  # added to a world's seed to get the building that the wrong map shows
+MAP_SCALE = 1.01  # factor on all coordinates of case scaled-map
 SLIP_SPEED, SLIP_TURN = 0.5, 0.3  # m/s and rad/s that odometry reports in addition while the wheels slip
 SLIP_S, SLIP_PERIOD_S = 1.0, 10.0  # duration, and mean time between two slips
 
 
 @dataclass(frozen=True)
 class Case:
-    """How the world, the scanner, the odometry and the map of a trial differ from each other."""
+    """How the real world, scanner and odometry of a trial differ from what the estimator is given."""
 
     name: str
     seconds: float = 60.0
@@ -143,10 +143,10 @@ def scanner_of(case: Case) -> Scanner:
 def map_of(case: Case, seed: int) -> World:
     """The map that the estimator is given. Its name is unique for each seed and map."""
     if case.map == "other":
-        return make_building(seed + OTHER_SEED, case.building).world
+        return make_building(seed + WRONG_MAP_SEED, case.building).world
     world = make_building(seed, case.building).world
     if case.map == "scaled":
-        return maps.scaled_map(world, SCALE)
+        return maps.scaled_map(world, MAP_SCALE)
     return world if case.map == "exact" else maps.noisy_grid(Scene.of(world, BEAMS, [seed, 5]))
 
 
@@ -227,4 +227,4 @@ def _truths_in_map(case: Case, path: Array) -> Array:
     """The places (N, 3) in the map that correspond to the true poses; NaN in the map of another building."""
     if case.map == "other":
         return np.full_like(path, np.nan)
-    return path * [SCALE, SCALE, 1.0] if case.map == "scaled" else path
+    return path * [MAP_SCALE, MAP_SCALE, 1.0] if case.map == "scaled" else path

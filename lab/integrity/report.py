@@ -45,7 +45,7 @@ of scans whose error along x, along y and in yaw exceeds the protection level.""
 def bench_integrity(plan: IntegrityPlan, out: Path, workers: int, console: Console) -> int:
     """Runs the benchmark, prints a Markdown table, and writes the results into ``out``."""
     _check(plan)
-    make_folder(out, "--out")
+    make_folder(out)
     scores, rows = run(plan, out, workers, console)
     parameters = asdict(plan)
     title = "Integrity: whether an estimator is right about itself"
@@ -71,11 +71,11 @@ def _check(plan: IntegrityPlan) -> None:
 
 def table(scores: dict[str, dict[str, Any]]) -> str:
     """The Markdown table, with a row for each case and estimator."""
-    cases = list(dict.fromkeys(case for own in scores.values() for case in own))
+    cases = list(dict.fromkeys(case for by_case in scores.values() for case in by_case))
     cases = cases[:1] if cases[1:] == ["all"] else cases
     return markdown(
         HEADS,
-        [[case, name, *_cells(own[case])] for case in cases for name, own in scores.items() if case in own],
+        [[case, name, *_cells(by_case[case])] for case in cases for name, by_case in scores.items() if case in by_case],
     )
 
 
@@ -114,7 +114,7 @@ def reliability_diagram(scores: dict[str, dict[str, Any]]) -> Figure | None:
 
     The axes show the probability of an error, so that small ones can be told apart.
     """
-    reported = {name: own["all"]["reliability"] for name, own in scores.items() if own["all"]["reliability"]}
+    reported = {name: bins for name, by_case in scores.items() if (bins := by_case["all"]["reliability"])}
     if not reported:
         return None
     figure, (axes,) = figure_of(width=5.0, height=4.6)

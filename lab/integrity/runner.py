@@ -15,7 +15,13 @@ from lab.integrity.cases import CASES, Trial, make_trial, map_of, scanner_of
 from lab.integrity.logs import LogCase, log_field_file, log_trial
 from lab.integrity.models import field_file
 from lab.integrity.scoring import Estimates, score_case, score_trial
-from services.estimator.factory import EstimatorOptions, Factory, Geometry, Name, prepare
+from services.estimator.factory import (
+    EstimatorFactory,
+    EstimatorOptions,
+    EstimatorPreset,
+    ScannerGeometry,
+    prepare_factory,
+)
 from services.estimator.precise.learning import weights
 from services.estimator.shared.interface import Posterior
 
@@ -142,17 +148,19 @@ def run_trial(job: IntegrityJob) -> dict[str, Any]:
     }
 
 
-def make_factory(job: IntegrityJob, trial: Trial) -> Factory:
+def make_factory(job: IntegrityJob, trial: Trial) -> EstimatorFactory:
     """The estimators of a trial, made as by the estimator service."""
     model = job.model
     if job.estimator == "precise" and model == "learned":
         model = str(weights.path_of(job.models, trial.map_world.name))  # learned before the trials
-    return prepare(EstimatorOptions(trial.map_world, cast("Name", job.estimator), model, seed=job.source.seed))
+    return prepare_factory(
+        EstimatorOptions(trial.map_world, cast("EstimatorPreset", job.estimator), model, seed=job.source.seed)
+    )
 
 
-def localise(trial: Trial, factory: Factory) -> Estimates:
+def localise(trial: Trial, factory: EstimatorFactory) -> Estimates:
     """What an estimator reports for the scans of a trial."""
-    geometry = Geometry.of(trial.scanner)
+    geometry = ScannerGeometry.of(trial.scanner)
     factory(geometry).update(trial.observations[0])  # compiles what is compiled at the first scan
     estimator = factory(geometry)
     estimator.restart(*(trial.start or ()))

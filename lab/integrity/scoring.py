@@ -138,9 +138,9 @@ def score_case(trials: Sequence[dict[str, Any]], scans: Estimates) -> dict[str, 
         "trials_wrong_longer": sum(value > MAX_WRONG_S for value in longest),
         "correct": share(correct, in_map),
         "nees_xy": _mean(scans.nees[scans.tracking, 0]),
-        "nees_xy_median": _quantile(scans.nees[scans.tracking, 0], 0.5),
+        "nees_xy_median": _median(scans.nees[scans.tracking, 0]),
         "nees": _mean(scans.nees[scans.tracking, 1]),
-        "error_median_m": _quantile(distance, 0.5),
+        "error_median_m": _median(distance),
         "error_rms_m": float(np.sqrt(np.mean(distance**2))) if len(distance) else None,
         "recovered": share(recovered, kidnapped),
         "beyond_protection": [_mean((axis > 1)[np.isfinite(axis)]) for axis in scans.excess.T],
@@ -171,6 +171,6 @@ def _mean(values: Array | Mask) -> float | None:
     return float(known.mean()) if len(known) else None
 
 
-def _quantile(values: Array, q: float) -> float | None:
+def _median(values: Array) -> float | None:
     known = values[np.isfinite(values)]
-    return float(np.quantile(known, q)) if len(known) else None
+    return float(np.median(known)) if len(known) else None

@@ -28,7 +28,7 @@ from lab.navigation.in_process import run as run_in_process
 from lab.navigation.shortest_path import START_GOAL_MARGIN, WALL_GAP, Trip, draw_trip, load_shortest_paths
 from lab.navigation.worlds import GENERATED, seed_of, world_of
 from lab.statistics import bootstrap_interval, median, wilson_interval
-from services.estimator.factory import EstimatorOptions, Name
+from services.estimator.factory import EstimatorOptions, EstimatorPreset
 from services.simulator.simulation import SimulationSetup
 
 EXPERIMENT_ID = 7  # part of the random seeds
@@ -113,7 +113,9 @@ class NavigationJob:
         )
         start = np.array(trip.start) if self.start == "known" else None
         model = "exact" if self.world in GENERATED else "learned"
-        estimator = EstimatorOptions(world, cast("Name", self.estimator), model, seed=seed, initial_pose=start)
+        estimator = EstimatorOptions(
+            world, cast("EstimatorPreset", self.estimator), model, seed=seed, initial_pose=start
+        )
         limit = round(self.limit * setup.scanner.rate)
         return NavigationRun(setup, estimator, trip.goal, self.prior == "odometry", self.epistemic, limit)
 

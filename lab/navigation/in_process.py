@@ -17,7 +17,7 @@ from lab.experiments.lockstep import RunTrace
 from services.controller.navigator import Navigator
 from services.controller.policies.planner import GeodesicPolicy
 from services.controller.service import PREDICTED_BEAMS
-from services.estimator.factory import EstimatorOptions, Factory, Geometry, prepare
+from services.estimator.factory import EstimatorFactory, EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.prediction_query import answer_prediction
 from services.estimator.service import belief_message
 from services.estimator.shared.interface import Observation, PoseEstimator
@@ -42,7 +42,7 @@ class NavigationRun:
 class LocalisedRobot:
     """Estimator and controller of one robot, and the record of its drive."""
 
-    factory: Factory
+    factory: EstimatorFactory
     navigator: Navigator
     policy: GeodesicPolicy
     odometry: bool
@@ -52,7 +52,7 @@ class LocalisedRobot:
 
     def step(self, odom: Odom, scan: Scan) -> Twist:
         """The velocity that answers a scan."""
-        geometry = Geometry.of_scan(scan)
+        geometry = ScannerGeometry.of_scan(scan)
         if self._estimator is None:
             self._estimator = self.factory(geometry)
         posterior = self._estimator.update(self._observation(odom, scan))
@@ -81,8 +81,8 @@ class LocalisedRobot:
             time_increment=scan.time_increment,
         )
 
-    def _predict(self, belief: Belief, estimator: PoseEstimator, geometry: Geometry) -> int:
-        """Give the policy the scans that it needs predicted. Returns the microseconds that the controller spent."""
+    def _predict(self, belief: Belief, estimator: PoseEstimator, geometry: ScannerGeometry) -> int:
+        """Gives the policy the scans that it needs predicted. Returns the microseconds that the controller spent."""
         if not self.navigator.goal_state.active:
             return 0
         began = time.thread_time_ns()
@@ -95,11 +95,11 @@ class LocalisedRobot:
 
 
 def run(params: NavigationRun) -> RunTrace:
-    """Drive until the controller reports that the goal is reached or refused, and the robot stands."""
+    """Drives until the controller reports that the goal is reached or refused, and the robot stands."""
     setup = params.simulation
     policy = GeodesicPolicy(setup.robot, setup.world, epistemic=params.epistemic)
-    navigator = Navigator(setup.robot, world=setup.world, preset=policy)
-    robot = LocalisedRobot(prepare(params.estimator), navigator, policy, params.odometry)
+    navigator = Navigator(setup.robot, world=setup.world, chosen_policy=policy)
+    robot = LocalisedRobot(prepare_factory(params.estimator), navigator, policy, params.odometry)
     navigator.on_goal(Goal(stamp_ns=0, seq=1, pose=Pose(x=params.goal[0], y=params.goal[1])))
     trace, scans_after_end = robot.trace, 0
     with closing(Simulation(setup)) as simulation:

@@ -125,7 +125,7 @@ def load_shortest_paths(name: str, radius: float = Robot().radius, seed: int = 0
 
 @dataclass(frozen=True)
 class Trip:
-    """A drive from standstill at ``start`` to ``goal``."""
+    """Start pose, goal and shortest path of a navigation trial; the robot begins at rest."""
 
     start: tuple[float, float, float]  # m, m, rad
     goal: tuple[float, float]  # m
@@ -148,9 +148,8 @@ def draw_trip(name: str, rng: np.random.Generator, robot: Robot, seed: int = 0) 
         path = paths.path(start, goal)
         if len(path) and length(path) >= rule.min_length:
             heading = round(float(rng.uniform(-np.pi, np.pi)), 4)
-            there = float(goal[0]), float(goal[1])
             corners = tuple((float(x), float(y)) for x, y in np.round(path, 4))
-            return Trip((float(start[0]), float(start[1]), heading), there, corners, redrawn)
+            return Trip((float(start[0]), float(start[1]), heading), (float(goal[0]), float(goal[1])), corners, redrawn)
     raise UserError(
         f"world {world.name!r}: no two places {rule.min_length:g} m apart between which the robot could drive"
     )

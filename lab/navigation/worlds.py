@@ -18,7 +18,7 @@ from lab.integrity.buildings import make_building
 TRIPS_PER_WORLD = 5  # before the next generated world
 SEEDS_PER_RUN = 1000  # generated worlds of one run; the next seed of a run has other worlds
 OTHER_BUILDINGS = 100_000_000  # added to a seed for another building
-MIN_DIFFERENCE_M2 = 0.05
+MIN_DIFFERENCE_M2 = 0.05  # between a world and itself turned by half a turn; less counts as symmetric
 Rectangle = tuple[float, float, float, float]  # x0, y0, x1, y1 in m
 
 

@@ -123,13 +123,13 @@ def _row(pose: Array, posteriors: Sequence[Posterior], *, twins: bool) -> dict[s
 
     With ``twins`` also whether the last belief contains both of the two indistinguishable places.
     """
-    off = [round(float(np.hypot(*(p.pose - pose)[:2])), 6) for p in posteriors]
-    wrong = [int(p.state == "tracking" and error > FOUND_DISTANCE) for p, error in zip(posteriors, off, strict=True)]
+    errors = [round(float(np.hypot(*(p.pose - pose)[:2])), 6) for p in posteriors]
+    wrong = [int(p.state == "tracking" and error > FOUND_DISTANCE) for p, error in zip(posteriors, errors, strict=True)]
     last = posteriors[-1]
     statistics = {
         "pose": pose.tolist(),
         "believed": last.pose.tolist(),
-        "error_m": off,
+        "error_m": errors,
         "wrong": wrong,
         "claim": last.state,
     }
@@ -137,7 +137,7 @@ def _row(pose: Array, posteriors: Sequence[Posterior], *, twins: bool) -> dict[s
         return statistics
     twin = twin_of(pose)
     near = [any(np.hypot(*(h.pose - place)[:2]) < CLOSE_DISTANCE for h in last.hypotheses) for place in (pose, twin)]
-    either = min(off[-1], float(np.hypot(*(last.pose - twin)[:2])))
+    either = min(errors[-1], float(np.hypot(*(last.pose - twin)[:2])))
     return {**statistics, "both_kept": int(last.state == "ambiguous" and all(near)), "either_error_m": round(either, 6)}
 
 
@@ -210,11 +210,13 @@ def _map(axes: Axes, world: World, places: Sequence[dict[str, Any]]) -> None:
     """Draws the world, the true places, and lines to the final beliefs that are wrong."""
     drawing.world_map(axes, world)
     true, believed = (np.array([place[key] for place in places])[:, :2] for key in ("pose", "believed"))
-    off = np.hypot(*(believed - true).T) > FOUND_DISTANCE
-    for a, b in zip(true[off], believed[off], strict=True):
+    is_wrong = np.hypot(*(believed - true).T) > FOUND_DISTANCE
+    for a, b in zip(true[is_wrong], believed[is_wrong], strict=True):
         axes.plot(*np.array([a, b]).T, color=drawing.COLOURS["paper"], linewidth=1)
     axes.plot(*true.T, ".", color="#222222", markersize=5, label="true place")
-    axes.plot(*believed[off].T, "x", color=drawing.COLOURS["paper"], markersize=6, label="paper's belief, > 0.5 m off")
+    axes.plot(
+        *believed[is_wrong].T, "x", color=drawing.COLOURS["paper"], markersize=6, label="paper's belief, > 0.5 m off"
+    )
     x0, y0, x1, y1 = world.bounds
     axes.set(xticks=np.arange(x0, x1 + 1, 3), yticks=[y0, y1])
     axes.spines[:].set_visible(False)

@@ -169,7 +169,7 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
     rows = [
         [
             name,
-            results.mean_std(row, "final_error", 4),
+            results.mean_std(row, "final_error"),
             results.millimetres(row["final_error_median_m"]),
             results.ratio(row["final_rms_over_bound"]),
             f"{row['found_within_0.5_m']}/{row['trials']}",

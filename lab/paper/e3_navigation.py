@@ -253,7 +253,7 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
             str(row["scans_held_back"]),
             results.number(row["iterations_mean"], 1),
             f"{results.number(row['time_over_least_median'])}; {results.number(row['time_over_least_max'])}",
-            results.mean_std(row, "error", 4),
+            results.mean_std(row, "error"),
         ]
         for name, row in summary.items()
     ]

@@ -26,7 +26,7 @@ from lab.integrity.models import field_file
 from lab.peers.scans import BUILDING, DRIVES, PLACES, TrialScans, map_file, read_trial_scans
 from lab.statistics import bootstrap_interval, median, root_mean_square, wilson_interval
 from presage.learning.train_drive import TrainDriveOptions, card_of, rectangle
-from services.estimator.factory import EstimatorOptions, Factory, Geometry, prepare
+from services.estimator.factory import EstimatorFactory, EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.drive_learning import learn_drive
 from services.estimator.shared.interface import Observation
@@ -37,9 +37,13 @@ TASKS = {
     ODOMETRY: "b: tracking with odometry",
     LASER: "c: tracking without",
 }
+# The maps: given as polygons or as an occupancy grid, or a field learned from that grid or from scans with known poses.
 POLYGONS, CELLS, FIELD, POSED = "polygons", "5 cm map", "learned from 5 cm map", "learned from posed scans"
 START_DEVIATION = np.array([0.2, 0.2, 0.1])  # m, m, rad, of the given start of a drive
-CONVERGED_M, LAST_SCANS = 0.2, 10
+CONVERGED_M, LAST_SCANS = (
+    0.2,
+    10,
+)  # limit of the median error, and the number of scans at the end of a trial that it is of
 SETTLED_SCANS = 50  # of a drive, before its errors count
 
 
@@ -82,8 +86,8 @@ class PeersJob:
         return read_trial_scans(Path(self.folder) / (PLACES if self.task == STANDING else DRIVES))
 
     @property
-    def teachers(self) -> str:
-        """The drives of which the model is learned: all for a standing robot, else those of the other parity."""
+    def training_drives(self) -> str:
+        """The drives from which the model is learned; the localised drive is never one of them."""
         if self.task == STANDING:
             return "all"
         return "odd" if self.number % 2 == 0 else "even"
@@ -119,7 +123,7 @@ def _model_file(job: PeersJob) -> str:
     kind = ESTIMATORS[job.estimator].map
     if kind == FIELD:
         return str(weights.path_of(Path(job.out), load_world(str(map_file(Path(job.folder)))).name))
-    return str(weights.path_of(Path(job.out), f"posed-{job.teachers}")) if kind == POSED else ""
+    return str(weights.path_of(Path(job.out), f"posed-{job.training_drives}")) if kind == POSED else ""
 
 
 def learn(job: PeersJob) -> dict[str, Any]:
@@ -130,7 +134,7 @@ def learn(job: PeersJob) -> dict[str, Any]:
     elif not path.exists():
         scans = read_trial_scans(Path(job.folder) / DRIVES)
         numbers = range(len(scans.truth))
-        drive = scans.drive({"all": numbers, "odd": numbers[1::2], "even": numbers[::2]}[job.teachers])
+        drive = scans.drive({"all": numbers, "odd": numbers[1::2], "even": numbers[::2]}[job.training_drives])
         options = TrainDriveOptions(Path(DRIVES))
         began = time.monotonic()
         learned = learn_drive(drive, options.recipe, None, lambda _title, _done: None)
@@ -141,13 +145,13 @@ def learn(job: PeersJob) -> dict[str, Any]:
 
 
 @functools.lru_cache(maxsize=4)
-def _factory(folder: str, estimator: str, model: str, seed: int) -> Factory:
+def _factory(folder: str, estimator: str, model: str, seed: int) -> EstimatorFactory:
     """Makes estimators of one kind, compiled by a first update; cached per process."""
     chosen = ESTIMATORS[estimator]
     world = str(Path(folder) / BUILDING if chosen.map in (POLYGONS, POSED) else map_file(Path(folder)))
-    factory = prepare(EstimatorOptions(world, chosen.estimator, model or "exact", seed=seed))  # type: ignore[arg-type]
+    factory = prepare_factory(EstimatorOptions(world, chosen.estimator, model or "exact", seed=seed))  # type: ignore[arg-type]
     scans = read_trial_scans(Path(folder) / PLACES)
-    factory(Geometry.of(scans.scanner)).update(_observation(scans, 0, 0, None))
+    factory(ScannerGeometry.of(scans.scanner)).update(_observation(scans, 0, 0, None))
     return factory
 
 
@@ -159,7 +163,7 @@ def _observation(scans: TrialScans, number: int, k: int, odom: Array | None) -> 
 def trial(job: PeersJob) -> dict[str, Any]:
     """Errors, states and processor times of all scans of one trial."""
     scans, number = job.scans, job.number
-    estimator = _factory(job.folder, job.estimator, _model_file(job), job.seed)(Geometry.of(scans.scanner))
+    estimator = _factory(job.folder, job.estimator, _model_file(job), job.seed)(ScannerGeometry.of(scans.scanner))
     truth = scans.truth[number]
     if job.task != STANDING:
         rng = np.random.default_rng([job.seed, number])
@@ -171,9 +175,9 @@ def trial(job: PeersJob) -> dict[str, Any]:
         began = time.process_time()
         posterior = estimator.update(observation)
         update_ms.append(1e3 * (time.process_time() - began))
-        off = posterior.pose - pose
-        error.append(float(np.hypot(off[0], off[1])))
-        yaw_error.append(abs(float(se2.wrap(off[2]))))
+        difference = posterior.pose - pose
+        error.append(float(np.hypot(difference[0], difference[1])))
+        yaw_error.append(abs(float(se2.wrap(difference[2]))))
         tracking.append(posterior.state == "tracking")
     return {**asdict(job), "error_m": error, "yaw_error_rad": yaw_error, "tracking": tracking, "update_ms": update_ms}
 

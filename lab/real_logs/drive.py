@@ -15,7 +15,7 @@ from common.geometry.se2 import Array
 from common.geometry.world import load_world
 from presage.learning.train_drive import drive_of, split
 from presage.logs.scan_files import read_scans
-from services.estimator.factory import EstimatorOptions, Factory, Geometry, prepare
+from services.estimator.factory import EstimatorFactory, EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.particle_filter.sensor import Sensor
 from services.estimator.particle_filter.settings import ParticleFilterSettings
@@ -133,7 +133,7 @@ def create_estimator(job: StretchJob) -> PoseEstimator:
     drive = job.drive
     if job.estimator == "precise":
         factory = _precise(job.map, job.model)
-        return factory(Geometry(drive.angles, drive.mount, drive.range_max))
+        return factory(ScannerGeometry(drive.angles, drive.mount, drive.range_max))
     settings = AMCL_SETTINGS if job.estimator == "amcl-defaults" else particle_settings(job.particles)
     x, y, yaw = map(float, drive.mount)
     return ParticleFilter(load_world(job.map), settings, (x, y, yaw), job.seed, sensor=_sensor(job.map, settings))
@@ -148,8 +148,8 @@ def particle_settings(changed: tuple[tuple[str, float], ...]) -> ParticleFilterS
 
 
 @functools.lru_cache(maxsize=2)
-def _precise(world: str, model: str) -> Factory:
-    return prepare(EstimatorOptions(world, "precise", model))
+def _precise(world: str, model: str) -> EstimatorFactory:
+    return prepare_factory(EstimatorOptions(world, "precise", model))
 
 
 @functools.lru_cache(maxsize=4)

@@ -80,9 +80,11 @@ class RealLogJob:
 def run(job: RealLogJob, out: Path, workers: int, console: Console) -> results.Result:
     """Trains, tunes and localises. Writes real-NAME.json, .csv, .trials.jsonl, .pdf and .png into ``out``."""
     world = load_world(job.map)
-    plain = StretchJob(str(job.log), job.map, job.mount, "precise", ODOMETRY, 0, seed=job.seed, exchanged=job.exchange)
-    drive = plain.drive
-    half = plain.learned
+    template = StretchJob(
+        str(job.log), job.map, job.mount, "precise", ODOMETRY, 0, seed=job.seed, exchanged=job.exchange
+    )
+    drive = template.drive
+    half = template.learned
     x, y, yaw = drive.mount
     console.print(
         f"{job.log.name}: {len(drive.ranges)} posed scans, the laser at {x:g} m, {y:g} m, {np.rad2deg(yaw):g} deg in "
@@ -95,11 +97,11 @@ def run(job: RealLogJob, out: Path, workers: int, console: Console) -> results.R
             f"{job.log}: {len(drive.ranges)} posed scans; at least {4 * MAX_SEARCH_SCANS} are needed, that is scans "
             "with a reference pose"
         )
-    model, card, tuned = _train_and_tune(job, plain, half, out, console)
-    plain = replace(plain, first=half, model=str(model))
+    model, card, tuned = _train_and_tune(job, template, half, out, console)
+    template = replace(template, first=half, model=str(model))
     jobs = [
         replace(each, estimator=name, particles=_settings(tuned, each.task) if name == "particle-filter" else ())
-        for each in stretches(plain, half, len(drive.ranges), job, odometry=drive.odom is not None)
+        for each in stretches(template, half, len(drive.ranges), job, odometry=drive.odom is not None)
         for name in ESTIMATORS
     ]
     rows = run_trials(job.result, trial, jobs, out, workers, console)
@@ -175,8 +177,8 @@ def _train_and_tune(
             if job.quick
             else tune(replace(stretch, estimator="particle-filter"), half, start, path.parent, report)
         )
-    plain = {"key": key, **{name: dict(each) for name, each in _settings_by_task(tuned).items()}, "tried": tuned.tried}
-    kept.write_text(json.dumps(plain) + "\n", encoding="utf-8")
+    stored = {"key": key, **{name: dict(each) for name, each in _settings_by_task(tuned).items()}, "tried": tuned.tried}
+    kept.write_text(json.dumps(stored) + "\n", encoding="utf-8")
     return path, card, tuned
 
 
@@ -188,19 +190,19 @@ def _settings_by_task(tuned: TunedSettings) -> dict[str, ParameterValues]:
     return {ODOMETRY: tuned.odometry, LASER: tuned.laser, "finding": tuned.finding}
 
 
-def stretches(plain: StretchJob, half: int, count: int, job: RealLogJob, *, odometry: bool) -> list[StretchJob]:
+def stretches(template: StretchJob, half: int, count: int, job: RealLogJob, *, odometry: bool) -> list[StretchJob]:
     """The trials of one estimator, the longest first."""
     length = min(QUICK_SCANS, count - half) if job.quick else count - half
-    whole = [replace(plain, task=task, count=length) for task in ((ODOMETRY, LASER) if odometry else (LASER,))]
+    whole = [replace(template, task=task, count=length) for task in ((ODOMETRY, LASER) if odometry else (LASER,))]
     starts = list(range(half, count - MAX_SEARCH_SCANS, job.every * (4 if job.quick else 1)))
     kidnappings = [
-        replace(plain, task=KIDNAPPED, first=first, to=to)
+        replace(template, task=KIDNAPPED, first=first, to=to)
         for first in starts
         if (to := half + (first - half + (count - half) // 2) % (count - half - MAX_SEARCH_SCANS))
         > first + SCANS_BEFORE_KIDNAPPING
         or to + MAX_SEARCH_SCANS <= first
     ]
-    return [*whole, *(replace(plain, task=GLOBAL, first=first) for first in starts), *kidnappings]
+    return [*whole, *(replace(template, task=GLOBAL, first=first) for first in starts), *kidnappings]
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -1,1 +1,1 @@
-"""The commands: arguments in, calls to the packages below."""
+"""The commands of `presage`: they parse arguments and call the other packages."""

@@ -83,7 +83,7 @@ def train(
     folder, seed = out or training_folder(), seed or 0
     tuning = load_section(TrainSettings, config, "train")
     if drive is not None:
-        make_folder(folder, "--out")
+        make_folder(folder)
         reading = load_section(LogSettings, config, "log", mount=mount).reading()
         recipe = Recipe(tuning.resolution or 0.05, seed=seed)
         train_from_drive(
@@ -93,7 +93,7 @@ def train(
     simulator = arguments(config=config, scanner=scanner, mount=mount, beams=beams)
     settings = load_settings(SimulatorSettings, simulator)
     world, chosen, link = world or settings.world, settings.build_scanner(), link_of(settings.connect, settings.robot)
-    make_folder(folder, "--out")
+    make_folder(folder)
     if preset == "precise":
         recipe = Recipe(tuning.resolution or 0.04, seed=seed)
         precise.train_precise(

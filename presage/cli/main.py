@@ -87,7 +87,7 @@ def up(
         bool, typer.Option("--mapping", help="Map an unknown building by driving through it by hand (docs/mapping.md).")
     ] = False,
     learn: Annotated[
-        bool, typer.Option("--learn", help="Improve the model while driving, and follow changes (docs/mapping.md).")
+        bool, typer.Option("--learn", help="Improve the model while driving, and follow changes (docs/refinement.md).")
     ] = False,
     port: Annotated[
         int,

@@ -33,7 +33,7 @@ def record(
     from services.recorder.service import RecorderService
     from services.recorder.settings import RecorderSettings
 
-    def make(settings: RecorderSettings) -> RecorderService:
+    def build_service(settings: RecorderSettings) -> RecorderService:
         # The live page controls the session's own recorder, not this one.
         return RecorderService(settings, remote=False)
 
@@ -41,7 +41,7 @@ def record(
     keys = None if link.security is None else link.security.folder.parent
     args = arguments(directory=out, robot=link.robot, connect=",".join(link.connect), security=keys)
     args += arguments(split_minutes=split_minutes, topics=topics)
-    serve(RecorderSettings, make, args)
+    serve(RecorderSettings, build_service, args)
 
 
 @app.command(rich_help_panel="Record", short_help="Repair an unfinished or damaged recording.")

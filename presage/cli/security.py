@@ -107,15 +107,15 @@ def show(
 
     Examples: `presage secure show keys`; `presage secure show keys --zenoh observer`.
     """
-    from common.bus.security import ROUTER, credentials, read_members
+    from common.bus.security import ROUTER, read_credentials, read_members
     from presage.session.access_tables import members_table, rights_table
 
     if zenoh:
-        of_member = credentials(folder, (zenoh,))
+        of_member = read_credentials(folder, (zenoh,))
         mode = "router" if of_member.member.role == ROUTER else "client"
         typer.echo(json.dumps(_nested({"mode": mode, **of_member.zenoh()}), indent=2))
         return
-    members, now = read_members(credentials(folder, (ROUTER,)).folder), dt.datetime.now(dt.timezone.utc)
+    members, now = read_members(read_credentials(folder, (ROUTER,)).folder), dt.datetime.now(dt.timezone.utc)
     ends = {member.name: _expiry_date(folder, member.name) for member in members if (folder / member.name).is_dir()}
     console.print(members_table(members, ends, now))
     console.print(rights_table())

@@ -1,1 +1,1 @@
-"""What is wrong, where, and what to do."""
+"""Finds problems of the installation and of a running session."""

@@ -11,7 +11,7 @@ from common.messages.topics import BELIEF, CMD_VEL, HEALTH, SCAN, Topic, expecte
 from common.runtime.liveness import RobotLiveness, ServiceLiveness, start_command
 
 LATENCY_WINDOW = 45  # number of messages whose median latency is shown: 3 s
-MIN_RATE_SHARE = 0.8  # of the nominal rate; a topic below is slow
+MIN_RATE_SHARE = 0.8  # share of the nominal rate below which a topic counts as slow
 INPUT_AND_OUTPUT = {"estimator": (SCAN, BELIEF), "controller": (BELIEF, CMD_VEL)}  # for the latency of a service
 WATCHED = (HEALTH, SCAN, BELIEF, CMD_VEL)
 

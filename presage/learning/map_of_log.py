@@ -52,7 +52,7 @@ def map_command(options: MapOptions, console: Console, progress: Console) -> Pat
     _check(options)
     rough = load_world(options.refine) if options.refine else None
     former = None if rough is None else _model_of(rough, options)
-    make_folder(options.out.parent, "--out")
+    make_folder(options.out.parent)
     scans = read_scans(options.log, reading=options.reading)
     scans.print_notes(progress)
     stamps = scans.stamps

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class TrainSettings(BaseModel):
-    """Parameters that rarely change."""
+    """Parameters of a training that have no command-line option."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

@@ -1,7 +1,7 @@
-"""Places a drive in the frame of an existing map, in which an estimator finds its key scans.
+"""Places a drive in the frame of an existing map, in which an estimator finds the poses of its key scans.
 
-In a rough map each of these poses is wrong by some centimetres, because each wall is; of the whole drive, with all the
-walls that it saw, the median is wrong by about a centimetre. In a grid, the surfaces then settle in the occupied cells.
+In a rough map, each wall and therefore each of these poses is wrong by some centimetres. The drive is placed by their
+median, which is wrong by about a centimetre. If the map is a grid, the surfaces are then moved into its occupied cells.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.world import World
 from presage.learning.train_drive import enough_scans, simulated_beams
-from services.estimator.factory import EstimatorOptions, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.precise.learning.field_learning import Recipe, learn_field
-from services.estimator.precise.learning.frame import move_into_cells
+from services.estimator.precise.learning.map_alignment import move_into_cells
 from services.estimator.shared.interface import Observation
 from services.mapper.slam.pose_graph import PoseLink, optimise
 
-MAX_KEYS = 60  # found in a rough map; for a rigid placement, more would not help
-SAME_M = 0.3  # poses found in the map that differ by less agree
+MAX_KEYS = 60  # key scans that are searched for in a rough map; more do not improve a rigid placement
+SAME_M = 0.3  # poses found in the map agree if they differ by less
 MIN_FOUND = 0.5  # share of the key scans that must agree
 # Standard deviations, m, m, rad: of the drive between two key scans, and of the poses found, because of model errors.
 DRIFT, MODEL = np.array([0.003, 0.003, 0.001]), np.array([0.002, 0.002, 0.001])
@@ -59,10 +59,10 @@ def place_drive(world: World, keys: ReferenceDrive, model: Path | None = None) -
     share = float(agreeing[best].mean())
     if share < MIN_FOUND:
         raise UserError(
-            f"only {share:.0%} of the drive were found in the map {world.name}: is it a map of the same place?"
+            f"only {share:.0%} of the drive was found in the map {world.name}: is it a map of the same place?"
         )
-    off = se2.between(origins[best], origins[agreeing[best]])
-    origin = se2.compose(origins[best], np.median(off, axis=0))
+    differences = se2.between(origins[best], origins[agreeing[best]])
+    origin = se2.compose(origins[best], np.median(differences, axis=0))
     placed = se2.compose(origin, se2.between(middle, keys.poses))
     if model is not None:
         placed = _fit_to_found_poses(placed, found, covariances)
@@ -88,7 +88,7 @@ def _localise(world: World, keys: ReferenceDrive, model: Path | None) -> tuple[A
     else:  # a learned field, because the cells of oblique walls are staircases, which would bias the headings
         beams = simulated_beams(world, keys, enough_scans(world), seed=0)
         options = EstimatorOptions(world, generative_model=FieldModel(learn_field(beams, Recipe(0.05))))
-    estimator = prepare(options)(Geometry(keys.angles, keys.mount, keys.range_max))
+    estimator = prepare_factory(options)(ScannerGeometry(keys.angles, keys.mount, keys.range_max))
     observations = [
         Observation(ranges, keys.angles, keys.range_max, float(stamp), pose)
         for ranges, stamp, pose in zip(keys.ranges, keys.stamps, keys.poses, strict=True)

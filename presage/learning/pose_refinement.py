@@ -21,7 +21,7 @@ from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.noise import estimate_noise
 from services.mapper.slam.trajectory import distribute_corrections
 
-ROUNDS = 4
+ROUNDS = 4  # of learning the field and matching the scans to it
 RECIPE = Recipe(resolution=0.05, sweeps=1)
 PERIOD_S = 0.2  # between scans that are matched to the field; the poses between them are interpolated
 PRIOR = np.array([0.01, 0.01, 0.005])  # m, m, rad: standard deviations of the corrections in one round

@@ -1,4 +1,4 @@
-"""Scans for training at chosen poses, from the running session or from a simulator started for them."""
+"""Gets scans for training at chosen poses, from the running session or from a simulator that it starts."""
 
 from __future__ import annotations
 

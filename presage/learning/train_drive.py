@@ -26,7 +26,7 @@ from common.versions import commit, versions
 from presage.learning.drive_figure import draw_learned
 from presage.logs.log import Reading
 from presage.logs.scan_files import Scans, read_scans
-from services.estimator.factory import Geometry
+from services.estimator.factory import ScannerGeometry
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.precise.learning.drive_learning import MIN_SCANS, LearningResult, learn_drive, replay_model
@@ -35,8 +35,8 @@ from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.generative_models import RayCaster
 from services.estimator.shared.model_folder import training_folder
 
-MIN_SCANS_OF_MAP, SCANS_PER_M2 = 500, 4  # simulated for a field; each of a map's cells is met by about 100 beams
-MARGIN_M = 1.0  # around the ends of the beams; the world of a drive without a map is a rectangle
+MIN_SCANS_OF_MAP, SCANS_PER_M2 = 500, 4  # scans simulated in a map: about 100 beams then meet each of its cells
+MARGIN_M = 1.0  # of the rectangular world of a drive without a map, around the ends of the beams
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ def replayed_beams(former: Path, drive: ReferenceDrive, samples: int, seed: int)
 def scanner_of(drive: ReferenceDrive, sigma: float, name: str) -> Scanner:
     """The scanner of a drive, for the model card; ``sigma`` is its range noise in m."""
     rate = float(1 / np.median(np.diff(drive.stamps)))
-    return Geometry(drive.angles, drive.mount, drive.range_max, sigma).scanner(name, rate)
+    return ScannerGeometry(drive.angles, drive.mount, drive.range_max, sigma).scanner(name, rate)
 
 
 def card_of(

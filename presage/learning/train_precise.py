@@ -36,7 +36,7 @@ from services.estimator.shared.model_folder import training_folder
 
 TEST_SAMPLES = 500
 MIN_SAMPLES, SAMPLES_PER_M2 = 5000, 10  # training scans; the error depends on the number of beams that meet a surface
-BEAMS_PER_SAMPLE = 400  # of a sweep
+BEAMS_PER_SAMPLE = 400  # minimum number of beams per training scan that a sweep of learning uses
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class TrainPreciseOptions:
 
 
 def default_samples(world: World) -> int:
-    """Number of training scans, by the free area: so many that large worlds are learned about as exactly as small."""
+    """Number of training scans, in proportion to the free area: large worlds are learned as exactly as small ones."""
     return max(MIN_SAMPLES, round(SAMPLES_PER_M2 * world.free_area))
 
 

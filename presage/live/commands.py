@@ -1,4 +1,4 @@
-"""goal, teleport, relocalise, save-map, save-model, topics, hz and echo."""
+"""The commands goal, teleport, relocalise, save-map, save-model, topics, hz and echo."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from common.messages.topics import GOAL, LOCALISE, QUERIES, SAVE_MAP, SAVE_MODEL
 from common.messages.wire import DecodeError, Message
 from presage.live.latest_messages import LatestMessages, session_bus
 
-# Measured with the stamps of the messages. A person in the way usually moves on sooner.
+# By the stamps of the messages. A person who blocks the robot usually moves on sooner.
 BLOCKED_TIMEOUT_S = 30.0
 # Without statuses from the controller: time until a note is printed, and until the command gives up.
 STATUS_WARNING_S, STATUS_TIMEOUT_S = 3.0, 30.0
@@ -153,7 +153,7 @@ def measure_rates(link: Link, topics: tuple[Topic, ...], seconds: float) -> dict
 
 
 def show_rates(link: Link, name: str | None, seconds: float, console: Console) -> int:
-    """Prints measured and nominal rates of one topic, or of all if ``name`` is None; returns 1 if nothing came."""
+    """Prints measured and nominal rates of a topic, or of all if ``name`` is None; returns 1 if no message came."""
     topics = (topic_named(name),) if name else TOPICS
     with console.status(f"measuring for {seconds:g} s"):
         times = measure_rates(link, topics, seconds)

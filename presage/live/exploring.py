@@ -59,7 +59,7 @@ def _follow(messages: LatestMessages, seq: int, console: Console) -> int:
 
 
 def _progress(status: Status, seq: int) -> Exploration | None:
-    """The progress of the exploration with this number; None if the status is about another, or none."""
+    """The progress of the exploration with this number, or None if the status describes no or another exploration."""
     return status.exploration if status.exploration is not None and status.exploration.seq == seq else None
 
 

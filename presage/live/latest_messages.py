@@ -1,4 +1,4 @@
-"""The latest message of each topic."""
+"""Receives topics and keeps the latest message of each."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from common.messages.definitions import Stamped
 from common.messages.topics import Topic
 from common.messages.wire import DecodeError
 
+CONNECT_TIMEOUT_S = 3.0
 M = TypeVar("M", bound=Stamped)
 
 
@@ -50,10 +51,10 @@ class LatestMessages:
 
 
 @contextmanager
-def session_bus(link: Link, timeout: float = 3.0) -> Iterator[Bus]:
-    """Opens the bus of a running session; raises UserError if no router answers within ``timeout`` s."""
-    with open_bus(link, connect_timeout=timeout) as bus:
-        if link.connect and not wait_until(bus.linked, timeout):
+def session_bus(link: Link) -> Iterator[Bus]:
+    """Opens the bus of a running session; raises UserError if no router answers within `CONNECT_TIMEOUT_S`."""
+    with open_bus(link, connect_timeout=CONNECT_TIMEOUT_S) as bus:
+        if link.connect and not wait_until(bus.linked, CONNECT_TIMEOUT_S):
             raise UserError(
                 f"nothing answers at {', '.join(link.connect)}: start a session with `presage up`, "
                 "or give the endpoint of a running one with `presage --connect`"

@@ -258,12 +258,12 @@ def _read_scans(
         except (ValueError, IndexError):
             log.left_out["garbled lines"] += 1
             continue
-        own = normalise_driver_ranges(line.ranges, 0.0, log.range_max)
-        ranges = _resample(first, line, own, log.angles, fixed=fixed)
+        measured = normalise_driver_ranges(line.ranges, 0.0, log.range_max)
+        ranges = _resample(first, line, measured, log.angles, fixed=fixed)
         if ranges is None:
             log.left_out["scans of other beams"] += 1
             continue
-        resampled_scans += ranges is not own
+        resampled_scans += ranges is not measured
         stamp = round((line.ipc, line.logger)[clock] * 1e9)
         reference = None
         if true is not None:

@@ -26,7 +26,7 @@ class TransformHistory:
 
     def add(self, stamp_ns: int, transform: Transform) -> None:
         """Adds a transform at a time."""
-        self.moves = self.moves or transform.apart(self.first) > FIXED_TOLERANCE
+        self.moves = self.moves or transform.difference(self.first) > FIXED_TOLERANCE
         self.track.add(stamp_ns, transform.planar())
 
 

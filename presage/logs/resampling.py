@@ -8,7 +8,9 @@ from common.geometry.se2 import Array, wrap
 from common.robot.ranges import NOT_MEASURED, is_surface
 
 ANGLE_TOLERANCE = 1e-4  # rad, below which two beams have the same angle
-MAX_SPACING_RATIO = 4.0  # of the scan to the wanted angles, as in services/estimator/paper/beam_fitting.py
+# A scan is not resampled if its beams are more than this many times as far apart as the wanted angles: most of the
+# ranges would be invented. The same value as in services/estimator/paper/beam_fitting.py.
+MAX_SPACING_RATIO = 4.0
 # Two neighbouring beams hit the same surface if their ranges differ by less than this share of the smaller one.
 SAME_SURFACE_SHARE = 0.1
 

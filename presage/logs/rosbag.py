@@ -200,12 +200,12 @@ def _read_scans(
                 log.left_out["scans without beams"] += 1
                 continue
             driver_ranges = np.asarray(scan.ranges[:: -1 if reverse else 1], np.float64)
-            own = normalise_driver_ranges(driver_ranges, log.range_min, log.range_max)
-            ranges = resample(own, angles, log.angles)
+            measured = normalise_driver_ranges(driver_ranges, log.range_min, log.range_max)
+            ranges = resample(measured, angles, log.angles)
             if ranges is None:
                 log.left_out["scans of other beams"] += 1
                 continue
-            resampled_scans += ranges is not own
+            resampled_scans += ranges is not measured
             stamp = logged_ns if by_logger else stamp_of(scan.header)
             yield LoggedScan(stamp, ranges, odom(stamp), reference(stamp))
     log.note_resampled(resampled_scans)

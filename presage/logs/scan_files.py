@@ -22,7 +22,7 @@ from presage.laser_scan import LaserScan
 from presage.logs.log import Log, Reading
 from presage.logs.opening import kind_of, open_log
 from presage.recordings.selection import entries, robot_of
-from services.estimator.factory import Geometry
+from services.estimator.factory import ScannerGeometry
 from services.recorder.reader import Recording, read_recording
 
 RECORDED_TRUTH = "the recorded truth"
@@ -33,7 +33,7 @@ Prior = Literal["motion", "odometry", "command"]
 class Scans:
     """N scans of B beams from one scanner; ``scans[k]``, and iteration, give them as LaserScan."""
 
-    geometry: Geometry
+    geometry: ScannerGeometry
     ranges: Array  # (N, B) m; +inf for no return, -inf for not measured
     stamps: Array | None = None  # (N,) s
     odom: Array | None = None  # (N, 3) base_link in odom; NaN where unknown
@@ -149,7 +149,7 @@ def scans_of_log(log: Log) -> Scans:
         raise UserError(f"{log.path}: no usable scan in it" + (f"; left out: {left_out}" if left_out else ""))
     times = [stamp for stamp in stamps if stamp is not None]
     return Scans(
-        Geometry(log.angles, log.mount, log.range_max, mount_assumed=log.mount_assumed),
+        ScannerGeometry(log.angles, log.mount, log.range_max, mount_assumed=log.mount_assumed),
         np.array(ranges),
         seconds(times) if len(times) == len(ranges) else None,
         np.array(odoms) if log.odometry else None,
@@ -199,7 +199,7 @@ def _read_recording(path: Path) -> Scans:
         raise UserError(f"{path}: the scanner changes during the recording; only one scanner per file is supported")
     world = recording.world()
     return Scans(
-        replace(Geometry.of_scan(first), mount_assumed=mount_assumed(recording)),
+        replace(ScannerGeometry.of_scan(first), mount_assumed=mount_assumed(recording)),
         np.array([ranges_for_localisation(s.ranges) for s in scans]),
         seconds([s.stamp_ns for s in scans]),
         np.array([odoms.get(key, unknown) for key in keys]) if odoms else None,

@@ -30,7 +30,7 @@ COLOURS = {
 }
 DASHED = ("paper, 10 steps a scan",)  # estimators that share a colour with another
 MEASURED, PREDICTED, GOAL, BOUND = "#0072B2", "#D55E00", "#009E73", "#444444"
-MIN_LOG_VALUE = 1e-4  # m, lower limit of bands on logarithmic axes
+MIN_LOG_VALUE = 1e-4  # m, lower limit of the bands of one standard deviation on logarithmic axes
 
 
 def figure_of(columns: int = 1, rows: int = 1, *, width: float = 7.0, height: float = 4.2) -> tuple[Figure, list[Axes]]:

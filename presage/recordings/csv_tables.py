@@ -156,7 +156,7 @@ def export_csv(
     Returns the number of rows by file name. Raises UserError if nothing can be written, or if the folder is not empty
     and ``force`` is not given.
     """
-    make_folder(folder, "--out")
+    make_folder(folder)
     refuse_to_overwrite(sorted(folder.iterdir())[:1], force=force)
     name = robot_of(recording, robot)
     keys = keys_of(recording, name)

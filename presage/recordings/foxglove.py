@@ -24,7 +24,7 @@ from common.messages.definitions import Belief, Truth
 from common.messages.topics import BELIEF, TRUTH
 from common.versions import versions
 from presage.recordings import plain_numbers as numbers
-from presage.recordings.foxglove_session import FoxgloveMessage, SessionConverter, driver_of, static_messages
+from presage.recordings.foxglove_session import FoxgloveMessage, SessionConverter, pose_source_of, static_messages
 from presage.recordings.selection import entries, keys_of, refuse_to_overwrite, robot_of, with_progress
 from services.recorder.reader import Recording
 
@@ -97,8 +97,8 @@ def export_foxglove(recording: Recording, out: Path, robot: str, console: Consol
 def _write(recording: Recording, robot: str, writer: Writer, console: Console) -> Counter[str]:
     """Writes all messages in the order of reception."""
     keys, counts = keys_of(recording, robot), recording.counts()
-    driver = driver_of({topic.name for topic in keys.values()})
-    about = {"recording": recording.path.name, "robot": robot, "base_link is driven by": driver, "times": CLOCK}
+    pose_source = pose_source_of({topic.name for topic in keys.values()})
+    about = {"recording": recording.path.name, "robot": robot, "base_link is driven by": pose_source, "times": CLOCK}
     writer.add_metadata("export", {**about, **versions()})
     for title, record in recording.metadata.items():
         writer.add_metadata(title, record)
@@ -109,7 +109,7 @@ def _write(recording: Recording, robot: str, writer: Writer, console: Console) -
     believed, true = _paths(recording, robot, console)
     for converted in static_messages(recording.world(), recording.robot(), believed, true, recording.start_ns):
         channels.write(converted)
-    converter = SessionConverter(driver)
+    converter = SessionConverter(pose_source)
     total = sum(counts[key] for key in keys)
     for topic, message, raw in with_progress(entries(recording, robot), total, "foxglove", console):
         for converted in converter.convert(topic, message, raw):

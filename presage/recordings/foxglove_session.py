@@ -5,8 +5,8 @@ or sensor time. Each stamp is therefore converted to the wall time at which the 
 with this stamp was recorded: scan, prediction, belief and transforms of the same stamp all get that time.
 
 Frames: map → odom → base_link → laser. odom → base_link is the odometry. map → odom corrects it so that base_link in
-map is the pose of the driver, a topic, at the same stamp: the belief; in a recording without beliefs the truth; without
-either the odometry itself. Without odometry, map and odom are the same frame.
+map is the pose of the same stamp in one topic, the source of poses: the belief; in a recording without beliefs the
+truth; without either the odometry itself. Without odometry, map and odom are the same frame.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class WallClock:
         return int(known[0]) if known is not None else default_ns
 
 
-def driver_of(names: set[str]) -> str:
+def pose_source_of(names: set[str]) -> str:
     """The topic, of those in ``names``, whose pose moves base_link in map."""
     return next((name for name in ("belief", "truth", "odom") if name in names), "odom")
 
@@ -106,14 +106,14 @@ def driver_of(names: set[str]) -> str:
 class SessionConverter:
     """Converts messages of presage to Foxglove messages."""
 
-    def __init__(self, driver: str) -> None:
-        """``driver`` is belief, truth or odom; see the docstring of the module."""
-        self.driver = driver
+    def __init__(self, pose_source: str) -> None:
+        """``pose_source`` is belief, truth or odom; see the docstring of the module."""
+        self.pose_source = pose_source
         self.left_out: Counter[str] = Counter()  # messages of unsupported topics, by topic
         self._clock = WallClock()
         self._odoms, self._truths = RecentValues(), RecentValues()
         self._chain: dict[str, tuple[str, Array, int]] = {}  # child: (parent, pose, ns)
-        self._driver_pose: tuple[int, Array] = (-1, np.zeros(3))  # last stamp and pose of the driver
+        self._source_pose: tuple[int, Array] = (-1, np.zeros(3))  # the source's last stamp and pose
         self._goal: Array | None = None
         self._last_log: dict[str, str] = {}  # key of the last log line, by topic and name
         self._converters: dict[type[Stamped], Callable[[Any, int, int], Iterator[tuple[str, Any]]]] = {
@@ -160,11 +160,11 @@ class SessionConverter:
     def _odom(self, odom: Odom, ns: int, _: int) -> Iterator[tuple[str, Any]]:
         pose = odom.pose.array()
         self._odoms.keep(odom.stamp_ns, pose)
-        if self.driver == "odom" and "odom" not in self._chain:
+        if self.pose_source == "odom" and "odom" not in self._chain:
             self._chain["odom"] = ("map", np.zeros(3), ns)
-        stamp, driver_pose = self._driver_pose
-        if stamp == odom.stamp_ns:  # the driver's pose of this stamp came before the odometry
-            self._chain["odom"] = ("map", compose(driver_pose, between(pose, np.zeros(3))), ns)
+        stamp, source_pose = self._source_pose
+        if stamp == odom.stamp_ns:  # the source's pose of this stamp came before the odometry
+            self._chain["odom"] = ("map", compose(source_pose, between(pose, np.zeros(3))), ns)
         yield self._transforms("odom", "base_link", pose, ns)
         yield "/odom", shapes.pose_in("odom", pose, ns)
 
@@ -172,7 +172,7 @@ class SessionConverter:
         self._truths.keep(truth.stamp_ns, truth.pose.array())
         yield "/truth", shapes.pose_in("map", truth.pose.array(), ns)
         yield "/truth/numbers", numbers.of_truth(truth)
-        if self.driver == "truth":
+        if self.pose_source == "truth":
             yield self._correction(truth.pose.array(), truth.stamp_ns, ns)
 
     def _belief(self, belief: Belief, ns: int, logged: int) -> Iterator[tuple[str, Any]]:
@@ -251,7 +251,7 @@ class SessionConverter:
 
     def _correction(self, pose: Array, stamp: int, ns: int) -> tuple[str, FrameTransforms]:
         """Sets map → odom so that base_link has ``pose`` (3,) in map with the odometry of the same stamp."""
-        self._driver_pose = (stamp, pose)
+        self._source_pose = (stamp, pose)
         odom = self._odoms.get(stamp)
         if odom is None:
             odom = next(reversed(self._odoms.values()), None)

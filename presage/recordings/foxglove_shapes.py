@@ -34,13 +34,14 @@ from common.geometry import occupancy_grid
 from common.geometry import rasterize as raster
 from common.geometry.se2 import Array
 from common.geometry.world import World
-from common.messages.definitions import Belief, Hypothesis, Map, Plan, Prediction, Preference, Scan
+from common.messages.definitions import Belief, BeliefHypothesis, Map, Plan, Prediction, Preference, Scan
 from common.robot.ranges import is_surface
 
 TRUTH, BELIEF, GOAL = (0.0, 0.0, 0.0), (0.84, 0.37, 0.0), (0.0, 0.62, 0.45)  # RGB, as in `presage plot`
 WALL, FURNITURE = (0.55, 0.55, 0.55), (0.78, 0.78, 0.78)
 WALL_HEIGHT, WALL_THICKNESS = 0.5, 0.06  # m, as drawn
 ELLIPSE_SCALE_95 = 2.447746830680816  # of standard deviations; square root of the 0.95 quantile of chi² with 2 degrees
+ELLIPSE_SIDES = 48  # of the polygon that is drawn
 POINT_FIELDS = (("x", 0), ("y", 4))  # name and offset in bytes of the float32 values of a point
 FREE, OCCUPIED = (245, 245, 245, 255), (70, 70, 70, 255)  # RGBA; unknown cells are transparent
 
@@ -117,17 +118,17 @@ def line(
     )
 
 
-def ellipse(mean: Array, covariance: Array, sides: int = 48) -> Array:
-    """Points (sides, 2) m on the 95 % ellipse of x and y, from a mean (3,) and a covariance (3, 3)."""
+def ellipse(mean: Array, covariance: Array) -> Array:
+    """Points (ELLIPSE_SIDES, 2) m on the 95 % ellipse of x and y, from a mean (3,) and a covariance (3, 3)."""
     values, axes = np.linalg.eigh(np.asarray(covariance, float)[:2, :2])
-    angles = np.linspace(0, 2 * np.pi, sides, endpoint=False)
+    angles = np.linspace(0, 2 * np.pi, ELLIPSE_SIDES, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles)])
     return np.asarray((axes * np.sqrt(np.maximum(values, 0.0)) @ circle).T * ELLIPSE_SCALE_95 + mean[:2], float)
 
 
-def hypotheses(belief: Belief) -> list[Hypothesis]:
+def hypotheses(belief: Belief) -> list[BeliefHypothesis]:
     """The hypotheses of a belief; if it has none, its pose with weight 1."""
-    return belief.hypotheses or [Hypothesis(pose=belief.pose, covariance=belief.covariance, weight=1.0)]
+    return belief.hypotheses or [BeliefHypothesis(pose=belief.pose, covariance=belief.covariance, weight=1.0)]
 
 
 def belief_entity(belief: Belief, ns: int) -> SceneEntity:

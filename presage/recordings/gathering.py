@@ -43,12 +43,12 @@ class StampedRows:
         self._rows.extend(row)
         return True
 
-    def moved(self, frame: Array) -> StampedRows:
-        """The same poses seen from another frame: ``frame`` (3,) is that of the poses in the new one."""
+    def in_frame(self, old_in_new: Array) -> StampedRows:
+        """The same poses in another frame, in which the present frame has the pose ``old_in_new`` (3,)."""
         result = StampedRows(self.width)
         result._stamps, result._logged = self._stamps, self._logged
         rows = self.rows
-        rows[:, :3] = se2.compose(frame, rows[:, :3])
+        rows[:, :3] = se2.compose(old_in_new, rows[:, :3])
         result._rows = array("d", rows.ravel())
         return result
 
@@ -149,7 +149,7 @@ def gather_session(recording: Recording) -> RecordedSession:
         # The mapper's map has a frame of its own. In it, the first belief is true by definition.
         first = known[0]
         frame = se2.compose(session.true_poses[first], se2.inverse(session.belief.poses[first]))
-        session.truth = session.truth.moved(se2.inverse(frame))
+        session.truth = session.truth.in_frame(se2.inverse(frame))
         session.true_poses = np.asarray(se2.between(frame, session.true_poses))
     session.warning = recording.warning  # damage is only found while reading
     session.undecodable = sum(recording.undecodable.values())

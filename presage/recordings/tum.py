@@ -71,7 +71,7 @@ def export_tum(
     keys = keys_of(recording, name, *TOPICS)
     if not keys:
         raise UserError(f"{recording.path}: neither belief nor truth nor odom in it, so there is no trajectory")
-    make_folder(folder, "--out")
+    make_folder(folder)
     refuse_to_overwrite(sorted(folder.iterdir())[:1], force=force)
     counts = recording.counts()
     with ExitStack() as stack:

@@ -113,7 +113,7 @@ class ReplayOutcome:
     commands: MessagePairs = field(default_factory=MessagePairs)
     scans: int = 0  # in the recording
     numbers: SequenceNumbers = field(default_factory=SequenceNumbers)  # sequence numbers of all recorded scans
-    given: int = 0  # scans sent to the services
+    sent: int = 0  # scans sent to the services
     left_out: int = 0  # scans without a recorded belief, which were not sent
     unanswered: int = 0  # scans sent, but without a new belief
     goals_placed: bool = True  # whether each goal was sent after the same belief as in the session
@@ -131,7 +131,7 @@ class ReplayOutcome:
         if self.damaged:
             return False
         if self.imported:
-            return self.given > self.unanswered == 0
+            return self.sent > self.unanswered == 0
         if self.lockstep:
             commands_agree = self.commands.compared == self.commands.equal or not self.goals_placed
             return 0 < pairs.compared == pairs.equal and not left and commands_agree

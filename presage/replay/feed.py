@@ -63,8 +63,8 @@ class ScanFeed:
         for raw in raws:
             self._process(raw, answered_stamps)
         outcome = self.outcome
-        outcome.unanswered = max(0, outcome.given - self._answers)
-        if outcome.unanswered == outcome.given > 0:
+        outcome.unanswered = max(0, outcome.sent - self._answers)
+        if outcome.unanswered == outcome.sent > 0:
             raise UserError(f"the estimator answered no scan: {self.services.notes or 'the log above says why'}")
 
     def _process(self, raw: RawMessage, answered_stamps: Counter[int]) -> None:
@@ -88,7 +88,7 @@ class ScanFeed:
             self._add(self.services.send(topic, raw.payload))
 
     def _send_scan(self, scan: Scan, payload: bytes) -> None:
-        self.outcome.given += 1
+        self.outcome.sent += 1
         self._add(self.services.send(SCAN, payload))
         for field in self._fields.pop(scan.stamp_ns, ()):  # used for the scans after it
             self._add(self.services.send(FIELD, field))

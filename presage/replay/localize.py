@@ -29,7 +29,7 @@ from presage.logs.opening import kind_of
 from presage.logs.scan_files import Prior, Scans, read_scans
 from presage.terminal.output import check_file
 from presage.terminal.progress import progress, working
-from services.estimator.factory import EstimatorOptions, Name, check_start
+from services.estimator.factory import EstimatorOptions, EstimatorPreset, check_start
 from services.estimator.shared.interface import Posterior
 from services.recorder.reader import read_recording
 from services.recorder.replaying.player import span
@@ -111,8 +111,8 @@ def build_estimator_options(
 
     Raises UserError if the estimator is unknown or there is no world.
     """
-    if estimator not in get_args(Name):
-        raise UserError(f"no estimator {estimator!r}: choose one of {', '.join(get_args(Name))}")
+    if estimator not in get_args(EstimatorPreset):
+        raise UserError(f"no estimator {estimator!r}: choose one of {', '.join(get_args(EstimatorPreset))}")
     pose = start_of_text(initial_pose, "--initial-pose") if initial_pose else None
     if not world:
         if kind_of(file) != "recording":
@@ -132,7 +132,7 @@ class TimedBelief:
     update_ms: float
 
 
-def run(
+def run_estimator(
     estimator: Estimator, scans: Iterable[LaserScan], *, fresh: bool = False, start: Array | None = None
 ) -> Iterator[TimedBelief]:
     """Yields the belief after each scan, from ``start`` (3,) or (2,), or from an unknown pose.
@@ -149,7 +149,7 @@ def run(
         yield TimedBelief(posterior, (time.perf_counter() - began) * 1e3)
 
 
-def prepare(estimator_options: EstimatorOptions, console: Console) -> Estimator:
+def prepare_estimator(estimator_options: EstimatorOptions, console: Console) -> Estimator:
     """The chosen estimator, without its initial pose."""
     with working(f"preparing {estimator_options.estimator} for {estimator_options.world_argument}", console):
         return Estimator(
@@ -175,7 +175,7 @@ def localize(options: LocalizeOptions, console: Console) -> list[dict[str, Any]]
         world = options.estimator_options.world
         check_start(options.estimator_options, load_world(world) if isinstance(world, str) else world)
     laser, kind = options.frame == "laser", kind_of(options.file)
-    estimator = prepare(options.estimator_options, console)
+    estimator = prepare_estimator(options.estimator_options, console)
     with working(f"reading {options.file.name}", console):
         # With frame laser, the poses in an .npz file are those of the laser, as if its mount were zero. For other
         # files, base_link is localised and the result transformed.
@@ -187,7 +187,7 @@ def localize(options: LocalizeOptions, console: Console) -> list[dict[str, Any]]
     estimator.check(scans[0])
     rows: list[dict[str, Any]] = []
     try:
-        found = run(estimator, scans, fresh=options.fresh, start=start)
+        found = run_estimator(estimator, scans, fresh=options.fresh, start=start)
         with _output(options, count) as write, closing(_with_progress(options, found, count, console)) as localised:
             for k, one in enumerate(localised):
                 row = _row(scans, k, one, laser=laser)

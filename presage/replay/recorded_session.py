@@ -94,12 +94,12 @@ def estimator_settings(
 def check_recorded_mount(recording: Recording, settings: EstimatorSettings) -> None:
     """Raises UserError if the recording's mount is only assumed and the weights were trained with another mount."""
     from presage.logs.scan_files import mount_assumed  # slow import of numba
-    from services.estimator.factory import Geometry
-    from services.estimator.service import Models
+    from services.estimator.factory import ScannerGeometry
+    from services.estimator.service import SharedModels
 
     if mount_assumed(recording):
         scan = next(message for _, message, _ in recording.messages(SCAN) if isinstance(message, Scan))
-        Models(settings).factory(replace(Geometry.of_scan(scan), mount_assumed=True))
+        SharedModels(settings).factory(replace(ScannerGeometry.of_scan(scan), mount_assumed=True))
 
 
 def world_file(recording: Recording, folder: Path) -> Path | None:

@@ -166,7 +166,7 @@ class Comparison:
         }
 
 
-def table(comparison: Comparison) -> Table:
+def comparison_table(comparison: Comparison) -> Table:
     """The comparison as a table for the terminal."""
     numbers = comparison.as_dict()
     old, new, difference = numbers["recorded"], numbers["new"], numbers["difference"]
@@ -194,7 +194,7 @@ def table(comparison: Comparison) -> Table:
     return result
 
 
-def draw(comparison: Comparison, out: Path) -> list[Path]:
+def draw_comparison(comparison: Comparison, out: Path) -> list[Path]:
     """Writes the errors over time beside the recording ``out``, as PNG, PDF and CSV; returns the files.
 
     Raises UserError if they cannot be written.

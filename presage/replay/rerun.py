@@ -31,9 +31,9 @@ from common.messages.wire import DecodeError
 from common.versions import commit, versions
 from presage.logs.scan_files import Scans, read_scans
 from presage.recordings.selection import robot_of
-from presage.replay.localize import TimedBelief, prepare, run
+from presage.replay.localize import TimedBelief, prepare_estimator, run_estimator
 from presage.replay.recorded_session import estimator_settings, recorded_settings, settings_with
-from presage.replay.report import BeliefSeries, compare, draw, table
+from presage.replay.report import BeliefSeries, compare, comparison_table, draw_comparison
 from presage.terminal.output import check_file, write_json
 from presage.terminal.progress import progress
 from services.estimator.service import belief_message, estimator_options, prediction_message
@@ -78,14 +78,14 @@ def rerun_command(options: RerunOptions, json_file: Path | None, console: Consol
         for beside in (".png", ".pdf", ".csv"):
             check_file(out.with_suffix(beside), "--out")
         scans, chosen = read_scans(options.file).with_prior(settings.prior), estimator_options(settings)
-        localised = run(prepare(chosen, console), scans, start=chosen.initial_pose)
+        localised = run_estimator(prepare_estimator(chosen, console), scans, start=chosen.initial_pose)
         with closing(progress(localised, "localising", len(scans), console)) as shown:
             old, new = write_recording(recording, robot, settings, scans, shown, out)
     if foreign := sum(count for key, count in recording.counts().items() if topic_of(key) is None):
         console.print(f"{foreign} messages on keys that do not belong to presage are not copied")
     comparison = compare(old, new, scans.truth)
-    console.print(table(comparison))
-    for path in (out, *draw(comparison, out)):
+    console.print(comparison_table(comparison))
+    for path in (out, *draw_comparison(comparison, out)):
         console.print(f"wrote {path}", highlight=False, soft_wrap=True)
     about = {"file": str(options.file), "out": str(out), "robot": robot, "settings": settings.effective()}
     meta = {"commit": commit(), "versions": versions(), "arguments": sys.argv[1:]}

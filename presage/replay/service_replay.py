@@ -99,7 +99,7 @@ def run_service_replay(options: ServiceReplayOptions, console: Console) -> Repla
             f"{lost} scans are missing in the recording, as their sequence numbers show: results may differ after them"
         )
     if not outcome.agrees:
-        outcome.notes += differences(recording, names)
+        outcome.notes += version_differences(recording, names)
     return outcome
 
 
@@ -157,7 +157,7 @@ def recorded_pace(recording: Recording) -> str:
         return ""
 
 
-def differences(recording: Recording, names: tuple[str, ...]) -> list[str]:
+def version_differences(recording: Recording, names: tuple[str, ...]) -> list[str]:
     """Notes on differences between the software versions of the recording and those here."""
     found: dict[str, tuple[str, str]] = {}
     for name in names:
@@ -170,7 +170,7 @@ def differences(recording: Recording, names: tuple[str, ...]) -> list[str]:
 def describe(outcome: ReplayOutcome) -> list[str]:
     """The result of the comparison, as lines with rich markup."""
     pairs, numbers = outcome.beliefs, outcome.beliefs.as_dict()
-    lines = [f"scans: {outcome.given} of {outcome.scans} sent"]
+    lines = [f"scans: {outcome.sent} of {outcome.scans} sent"]
     if outcome.left_out:
         lines[0] += f"; {outcome.left_out} left out, which the live estimator did not answer (--every-scan sends them)"
     if outcome.unanswered:
@@ -201,7 +201,7 @@ def _verdict(outcome: ReplayOutcome) -> str:
     if outcome.damaged:
         return f"[bold red]the recording is damaged ({outcome.damaged}): what comes after that was not compared[/]"
     if outcome.imported:
-        tracking = f"{outcome.beliefs.new_tracking} beliefs of {outcome.given} scans are in state tracking"
+        tracking = f"{outcome.beliefs.new_tracking} beliefs of {outcome.sent} scans are in state tracking"
         return f"{tracking}; the log has no beliefs to compare with (`presage rerun` stores the new ones)"
     if outcome.lockstep and outcome.agrees:
         return "[bold green]the session ran in lockstep, and the results are identical[/]"

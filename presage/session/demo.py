@@ -60,7 +60,7 @@ def run_demo(demo: DemoOptions, stack: Stack, console: Console) -> tuple[Path, b
     """
     plan = plan_session(demo.config, demo.world, "", arguments(seed=demo.seed), arguments(estimator=demo.estimator))
     goal = _choose_goal(demo, load_world(plan.estimator_settings.world))
-    make_folder(demo.out, "--out")
+    make_folder(demo.out)
     recording = new_recording(demo.out, stack.robot)
     simulator = list(plan.simulator)
     if plan.simulator_settings.beams is None:

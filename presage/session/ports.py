@@ -14,7 +14,7 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def accepts(port: int) -> bool:
+def accepts_connections(port: int) -> bool:
     """Whether a connection to the loopback port succeeds."""
     with socket.socket() as probe:
         probe.settimeout(0.5)

@@ -14,7 +14,7 @@ from pathlib import Path
 import psutil
 
 from common.bus.bus import DEFAULT_ENDPOINT, Link
-from common.bus.security import Credentials, credentials
+from common.bus.security import Credentials, read_credentials
 from common.errors import UserError
 from common.runtime.config import split_endpoints
 
@@ -109,4 +109,4 @@ def credentials_for(robot: str, roles: Sequence[str] = OPERATOR, *, folder: str 
     """
     folder = os.environ.get("PRESAGE_SECURITY") or folder
     role = os.environ.get("PRESAGE_ROLE")
-    return credentials(Path(folder), (role,) if role else roles, robot) if folder else None
+    return read_credentials(Path(folder), (role,) if role else roles, robot) if folder else None

@@ -22,10 +22,12 @@ from common.bus.security import Credentials
 from common.errors import UserError
 from common.processes import end_with_this_process
 from presage.interrupts import ignoring_interrupts
-from presage.session.ports import accepts, check_port, free_port
+from presage.session.ports import accepts_connections, check_port, free_port
 
 COLOURS = {"router": 37, "simulator": 36, "estimator": 35, "mapper": 35, "controller": 33, "recorder": 32, "viewer": 34}
 SECURITY_VARIABLES = {"PRESAGE_SECURITY", "PRESAGE_ROLE"}  # choose this process's credentials, not the children's
+ALIVE_TIMEOUT_S = 60.0  # for all services to start; the estimator may have to compile
+LINE_TIMEOUT_S = 30.0  # for a line of output
 TERMINATION_TIMEOUT_S = 5.0  # between SIGTERM and SIGKILL
 # The controller stops the robot first; the recorder ends late, to record how the others stop.
 SHUTDOWN_ORDER = ("controller", "estimator", "mapper", "simulator", "viewer", "recorder", "router")
@@ -104,7 +106,7 @@ class Stack:
         check_port(self.port)
         self._spawn("router", ["-m", "common.router", "--listen", self.router_endpoints()])
         deadline = time.monotonic() + 20
-        while not accepts(self.port):
+        while not accepts_connections(self.port):
             self.check()
             if time.monotonic() > deadline:
                 raise UserError(f"the router did not start to listen on {self.endpoint} within 20 s")
@@ -123,17 +125,17 @@ class Stack:
         """Starts a child that runs the given Python code, with the environment of a service."""
         self._spawn(name, ["-c", code])
 
-    def wait_alive(self, bus: Bus, timeout: float = 60.0) -> None:
+    def wait_alive(self, bus: Bus) -> None:
         """Waits until every started service has its liveliness token.
 
         Raises UserError with the names of the missing services, or if a service has ended.
         """
-        deadline = time.monotonic() + timeout
+        deadline = time.monotonic() + ALIVE_TIMEOUT_S
         while missing := self._missing(bus):
             self.check()
             if time.monotonic() > deadline:
                 raise UserError(
-                    f"not alive within {timeout:g} s: {', '.join(sorted(missing))}; see their log lines above"
+                    f"not alive within {ALIVE_TIMEOUT_S:g} s: {', '.join(sorted(missing))}; see their log lines above"
                 )
             time.sleep(0.05)
 
@@ -146,19 +148,21 @@ class Stack:
             if name != "router" and (process.service or name) not in alive[process.robot or self.robot]
         }
 
-    def wait_for_line(self, name: str, beginning: str, timeout: float = 30.0) -> str:
+    def wait_for_line(self, name: str, beginning: str) -> str:
         """Waits for an output line of the child ``name`` that starts with ``beginning``; returns the rest of the line.
 
-        Raises UserError if the line does not come within ``timeout`` s, or if a child ends.
+        Raises UserError if the line does not come within `LINE_TIMEOUT_S`, or if a child ends.
         """
-        deadline = time.monotonic() + timeout
+        deadline = time.monotonic() + LINE_TIMEOUT_S
         while True:
             for line in self.processes[name].lines:
                 if (text := _log_text(line)).startswith(beginning):
                     return text.removeprefix(beginning)
             self.check()
             if time.monotonic() > deadline:
-                raise UserError(f"{name} did not print {beginning!r} within {timeout:g} s; see its log lines above")
+                raise UserError(
+                    f"{name} did not print {beginning!r} within {LINE_TIMEOUT_S:g} s; see its log lines above"
+                )
             time.sleep(0.02)
 
     def ended(self) -> list[str]:

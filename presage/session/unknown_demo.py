@@ -36,16 +36,16 @@ from presage.terminal.options import arguments
 from presage.terminal.output import check_file, make_folder, write_json
 
 DEFAULT_WORLD = "office"  # unless the options, the environment or the settings file name another
-# In the map when the robot is kidnapped. The map is the larger part of the drive, so it must be larger than what the
-# robot sees until it is localised again, which takes about 20 key scans.
-CARRIED_AT_KEY_SCANS = 40
-CARRIED_M = 5.0  # at least
-FOUND_M = 0.2  # error of a belief below which the robot counts as localised
-STANDING_M_S = 0.01
+# The robot is kidnapped when the map has this number of key scans. It must be clearly more than the key scans that are
+# taken until the robot is localised again, about 20.
+KIDNAP_AT_KEY_SCANS = 40
+MIN_KIDNAPPING_M = 5.0  # distance to the place to which the robot is teleported
+LOCALISED_ERROR_M = 0.2  # error of a belief below which the robot counts as localised
+MAX_STANDING_SPEED_M_S = 0.01
 EXPLORATION_SEQ, GOAL_SEQ = 1, 2  # numbers of the two requests
-KEPT_TRUTHS = 256  # a belief arrives later than the truth of its stamp
+MAX_KEPT_TRUTHS = 256  # a belief arrives later than the truth of its stamp
 # Deadlines of the steps, by the wall clock. They are several times longer than a step takes on an idle machine.
-FIRST_MAP_TIMEOUT_S, CARRY_TIMEOUT_S, STEP_TIMEOUT_S, RETURN_TIMEOUT_S = 60.0, 30.0, 240.0, 600.0
+FIRST_MAP_TIMEOUT_S, KIDNAPPING_TIMEOUT_S, STEP_TIMEOUT_S, RETURN_TIMEOUT_S = 60.0, 30.0, 240.0, 600.0
 
 
 class StepError(Exception):
@@ -81,7 +81,7 @@ class SessionObserver:
     @property
     def start(self) -> Array:
         """True pose (3,) at the beginning, which is the origin of the map."""
-        assert self._start is not None  # noqa: S101 - the story begins with the first map
+        assert self._start is not None  # noqa: S101 - the demo begins with the first map, after the first truth
         return self._start.pose.array()
 
     @property
@@ -115,7 +115,7 @@ class SessionObserver:
     @property
     def standing(self) -> bool:
         """Whether the robot stands."""
-        return bool(np.hypot(self.truth.twist.vx, self.truth.twist.vy) < STANDING_M_S)
+        return bool(np.hypot(self.truth.twist.vx, self.truth.twist.vy) < MAX_STANDING_SPEED_M_S)
 
     def wait(self, doing: str, condition: Callable[[], bool], limit_s: float) -> None:
         """Takes messages until a condition is true.
@@ -154,7 +154,7 @@ class SessionObserver:
                 self._start = message
                 self._area = points_in(reachable_area(self.world, MIN_PASSAGE_M / 2, message.pose.array()))
             self._truths[message.stamp_ns] = message
-            if len(self._truths) > KEPT_TRUTHS:
+            if len(self._truths) > MAX_KEPT_TRUTHS:
                 del self._truths[next(iter(self._truths))]
             self.contacts += message.contact
         elif isinstance(message, Belief):
@@ -165,79 +165,87 @@ class SessionObserver:
             self.key_scans, self.mapped_share = message.poses, mapped_share(message.grid, self._area, self.start)
 
 
-def play(bus: Bus, seen: SessionObserver) -> None:
+def run_steps(bus: Bus, observer: SessionObserver) -> None:
     """Runs the steps of the demo; raises StepError if one fails."""
-    seen.wait("making the first map", lambda: len(seen.key_scans) > 0, FIRST_MAP_TIMEOUT_S)
+    observer.wait("making the first map", lambda: len(observer.key_scans) > 0, FIRST_MAP_TIMEOUT_S)
     bus.put(GOAL, Goal(stamp_ns=0, seq=EXPLORATION_SEQ, pose=Pose(x=0.0, y=0.0), explore=True).encode())
-    explore(seen)
-    kidnap(bus, seen)
-    drive_to_goal(bus, seen)
-    return_to_start(seen)
+    explore(observer)
+    kidnap(bus, observer)
+    drive_to_goal(bus, observer)
+    return_to_start(observer)
 
 
-def explore(seen: SessionObserver) -> None:
+def explore(observer: SessionObserver) -> None:
     """Waits until enough is mapped to kidnap the robot to a mapped place."""
 
     def enough() -> bool:
-        if seen.exploration == "finished":
+        if observer.exploration == "finished":
             raise StepError("exploring: all was mapped before the robot could be carried off; choose a larger --world")
-        mapped = len(seen.key_scans) >= CARRIED_AT_KEY_SCANS and np.isfinite(seen.belief_error_m)
-        return bool(mapped and distance(farthest_key_scan(seen), seen.pose) >= CARRIED_M)
+        mapped = len(observer.key_scans) >= KIDNAP_AT_KEY_SCANS and np.isfinite(observer.belief_error_m)
+        return bool(mapped and distance(farthest_key_scan(observer), observer.pose) >= MIN_KIDNAPPING_M)
 
-    seen.wait("exploring", enough, STEP_TIMEOUT_S)
-    error_m = seen.belief_error_m
-    seen.end_step(f"explored a building that it has never seen, its belief {mm(error_m)} from the truth", error_m)
+    observer.wait("exploring", enough, STEP_TIMEOUT_S)
+    error_m = observer.belief_error_m
+    observer.end_step(f"explored a building that it has never seen, its belief {mm(error_m)} from the truth", error_m)
 
 
-def kidnap(bus: Bus, seen: SessionObserver) -> None:
+def kidnap(bus: Bus, observer: SessionObserver) -> None:
     """Teleports the robot to a mapped place, and waits until it is localised there."""
-    before, place = seen.pose, farthest_key_scan(seen)
+    before, place = observer.pose, farthest_key_scan(observer)
     place = se2.compose(place, [0.0, 0.0, np.pi])  # with a view that is not the one in the map
-    reply = bus.query(TELEPORT, PoseRequest(pose=Pose.of(se2.compose(seen.start, place))), Reply)
+    reply = bus.query(TELEPORT, PoseRequest(pose=Pose.of(se2.compose(observer.start, place))), Reply)
     if not reply.ok:
         raise StepError(f"the simulator refuses to carry the robot off: {reply.reason}")
-    way_m = distance(place, before)
-    seen.wait("carrying the robot off", lambda: distance(seen.pose, before) > way_m / 2, CARRY_TIMEOUT_S)
-    carried_ns, carried_s = seen.truth.stamp_ns, seen.seconds
+    distance_m = distance(place, before)
+    observer.wait(
+        "carrying the robot off", lambda: distance(observer.pose, before) > distance_m / 2, KIDNAPPING_TIMEOUT_S
+    )
+    carried_ns, carried_s = observer.truth.stamp_ns, observer.seconds
 
     def found() -> bool:
-        return seen.belief is not None and seen.belief.stamp_ns > carried_ns and seen.belief_error_m < FOUND_M
+        return (
+            observer.belief is not None
+            and observer.belief.stamp_ns > carried_ns
+            and observer.belief_error_m < LOCALISED_ERROR_M
+        )
 
-    seen.wait("finding itself", found, STEP_TIMEOUT_S)
-    error_m, took_s = seen.belief_error_m, seen.seconds - carried_s
+    observer.wait("finding itself", found, STEP_TIMEOUT_S)
+    error_m, took_s = observer.belief_error_m, observer.seconds - carried_s
     where = f"{mm(error_m)} from the truth"
-    seen.end_step(
-        f"was carried off by {way_m:.1f} m and found itself in its map after {took_s:.0f} s, {where}", error_m
+    observer.end_step(
+        f"was carried off by {distance_m:.1f} m and found itself in its map after {took_s:.0f} s, {where}", error_m
     )
 
 
-def drive_to_goal(bus: Bus, seen: SessionObserver) -> None:
+def drive_to_goal(bus: Bus, observer: SessionObserver) -> None:
     """Sends a goal, which takes precedence over the exploration, and waits until the robot stands there."""
-    before, place = seen.pose, farthest_key_scan(seen)
-    goal = Goal(stamp_ns=seen.truth.stamp_ns, seq=GOAL_SEQ, pose=Pose(x=place[0], y=place[1]))
+    before, place = observer.pose, farthest_key_scan(observer)
+    goal = Goal(stamp_ns=observer.truth.stamp_ns, seq=GOAL_SEQ, pose=Pose(x=place[0], y=place[1]))
     bus.put(GOAL, goal.encode())
 
     def reached() -> bool:
-        return seen.status.goal_seq == GOAL_SEQ and seen.status.state == "reached" and seen.standing
+        return observer.status.goal_seq == GOAL_SEQ and observer.status.state == "reached" and observer.standing
 
-    seen.wait("driving to a goal", reached, STEP_TIMEOUT_S)
-    error_m = distance(seen.pose, place)
-    seen.end_step(
+    observer.wait("driving to a goal", reached, STEP_TIMEOUT_S)
+    error_m = distance(observer.pose, place)
+    observer.end_step(
         f"drove to a goal given meanwhile, {distance(place, before):.1f} m away, and stood {mm(error_m)} from it",
         error_m,
     )
 
 
-def return_to_start(seen: SessionObserver) -> None:
+def return_to_start(observer: SessionObserver) -> None:
     """Waits until the rest is explored and the robot is back."""
-    seen.wait("exploring the rest", lambda: seen.exploration == "finished" and seen.standing, RETURN_TIMEOUT_S)
-    error_m = distance(seen.pose, np.zeros(3))
-    seen.end_step(f"explored the rest and returned, {mm(error_m)} from where it began", error_m)
+    observer.wait(
+        "exploring the rest", lambda: observer.exploration == "finished" and observer.standing, RETURN_TIMEOUT_S
+    )
+    error_m = distance(observer.pose, np.zeros(3))
+    observer.end_step(f"explored the rest and returned, {mm(error_m)} from where it began", error_m)
 
 
-def farthest_key_scan(seen: SessionObserver) -> Array:
+def farthest_key_scan(observer: SessionObserver) -> Array:
     """The pose (3,) in map of the key scan that is farthest from the robot."""
-    return np.asarray(seen.key_scans[np.argmax(np.hypot(*(seen.key_scans - seen.pose)[:, :2].T))])
+    return np.asarray(observer.key_scans[np.argmax(np.hypot(*(observer.key_scans - observer.pose)[:, :2].T))])
 
 
 def distance(first: Array, second: Array) -> float:
@@ -259,11 +267,11 @@ def run_unknown_demo(demo: DemoOptions, stack: Stack, console: Console) -> tuple
     plan = plan_session(demo.config, demo.world, "", arguments(seed=demo.seed), mapping=True)
     if "world" not in plan.simulator_settings.model_fields_set:
         plan = plan_session(demo.config, DEFAULT_WORLD, "", arguments(seed=demo.seed), mapping=True)
-    make_folder(demo.out, "--out")
+    make_folder(demo.out)
     recording, failure = new_recording(demo.out, stack.robot), ""
     stack.start_router()
     with open_bus(stack.link()) as bus:
-        seen = SessionObserver(bus, stack, load_world(plan.simulator_settings.world), console)
+        observer = SessionObserver(bus, stack, load_world(plan.simulator_settings.world), console)
         if not demo.quiet:
             stack.start("viewer", *plan.config, *arguments(recordings=demo.out))
         stack.start("recorder", *plan.config, *arguments(directory=demo.out, file=recording.name))
@@ -277,13 +285,13 @@ def run_unknown_demo(demo: DemoOptions, stack: Stack, console: Console) -> tuple
             show_page_link(stack, console, open_it=demo.open_page)
         with announced(stack.endpoint, [stack.robot], stack.security):
             try:
-                play(bus, seen)
+                run_steps(bus, observer)
             except StepError as error:
                 failure = str(error)
         for name in ("controller", "mapper", "simulator"):
             stack.stop(name)
         check_recorded(recording, stack.stop("recorder"))
-    return recording, seen, failure
+    return recording, observer, failure
 
 
 def unknown_demo_command(demo: DemoOptions, json_file: Path | None) -> int:
@@ -293,13 +301,13 @@ def unknown_demo_command(demo: DemoOptions, json_file: Path | None) -> int:
     check_file(json_file, "--json")
     console = Console(width=None if sys.stdout.isatty() else 150)
     with Stack("robot", quiet=demo.quiet, security=credentials_for("robot")) as stack:
-        recording, seen, failure = run_unknown_demo(demo, stack, console)
-    console.print(f"contacts: {seen.contacts}; recording: {recording}", soft_wrap=True, highlight=False)
+        recording, observer, failure = run_unknown_demo(demo, stack, console)
+    console.print(f"contacts: {observer.contacts}; recording: {recording}", soft_wrap=True, highlight=False)
     numbers = {
-        "world": seen.world.name,
-        "steps": [asdict(step) for step in seen.steps],
+        "world": observer.world.name,
+        "steps": [asdict(step) for step in observer.steps],
         "failure": failure,
-        "contacts": seen.contacts,
+        "contacts": observer.contacts,
         "recording": str(recording),
         "seed": demo.seed,
         "commit": commit(),

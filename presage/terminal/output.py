@@ -24,7 +24,7 @@ def check_file(file: Path | None, option: str) -> None:
         file.unlink()
 
 
-def make_folder(folder: Path, option: str) -> None:
+def make_folder(folder: Path) -> None:
     """Creates ``folder`` with its parents; raises UserError if it cannot be created or written into."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -32,7 +32,7 @@ def make_folder(folder: Path, option: str) -> None:
             pass
     except OSError as error:
         raise UserError(
-            f"{folder}: cannot be written to ({error.strerror}); choose another folder with {option}"
+            f"{folder}: cannot be written to ({error.strerror}); choose another folder with --out"
         ) from None
 
 

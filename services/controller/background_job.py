@@ -1,4 +1,4 @@
-"""Work that takes longer than the period of the scans, in a thread."""
+"""Runs jobs that take longer than a scan period in a background thread."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ R = TypeVar("R")
 
 
 class BackgroundJob(Generic[R]):
-    """Runs one job at a time. Of those that are submitted meanwhile, only the newest runs next."""
+    """Runs one job at a time. Of the jobs that are submitted meanwhile, only the newest is kept, and runs next."""
 
     def __init__(self, wake: Callable[[], None]) -> None:
         """``wake`` is called from the thread when a result is ready."""
@@ -20,7 +20,7 @@ class BackgroundJob(Generic[R]):
         self._pool = ThreadPoolExecutor(1, "background")
 
     def submit(self, job: Callable[[], R]) -> None:
-        """Run a job now or next."""
+        """Starts a job, or keeps it until the running one is done."""
         self._waiting = job
         self._start()
 
@@ -36,12 +36,12 @@ class BackgroundJob(Generic[R]):
         return self._running is not None and self._running.done()
 
     def take(self) -> R:
-        """The result of the job that is done; starts the next one. Raises what the job raised."""
-        assert self._running is not None  # noqa: S101 - as `ready` says
+        """Returns the result of the finished job and starts the waiting one; raises the job's exception."""
+        assert self._running is not None  # noqa: S101 - only called when `ready`
         done, self._running = self._running, None
         self._start()
         return done.result()
 
     def close(self) -> None:
-        """Wait for the present job."""
+        """Waits for the running job, and drops the waiting one."""
         self._pool.shutdown(cancel_futures=True)

@@ -26,14 +26,15 @@ if TYPE_CHECKING:
     from common.messages.definitions import Goal
     from common.robot.base import Robot
 
-LINE_LENGTH_M = 0.6
+LINE_LENGTH_M = 0.6  # of the straight approach, which the robot drives exactly
 LINE_SPEED = 0.2  # m/s
-SETTLING_TIME_S = 0.3  # time constant of the arrival; longer than a scan period, the latency and the braking together
+SETTLING_TIME_S = 0.3  # time constant of the arrival; longer than scan period, latency and braking time together
 CONVERGENCE_M = 0.1  # a differential base corrects its lateral error over a few times this distance
-MAX_LATERAL_ERROR_M = 0.1  # farther from the line, the robot starts again
-ALIGNED_RAD = 0.03  # of the goal's heading, before the line
-STANDING_TIME_S = 1.0  # at rest before it counts as arrived, because the belief lags behind a slow creep
-TARGET_SHARE = 0.33  # of the tolerance, at which the robot stops correcting, so that noise does not keep it moving
+MAX_LATERAL_ERROR_M = 0.1  # if the robot is farther from the line, it drives to the line's start again
+MAX_ALIGN_ERROR_RAD = 0.03  # heading error with which the robot may start to follow the line
+STANDING_TIME_S = 1.0  # time at rest before the robot counts as arrived, because the belief lags behind slow motion
+# The robot stops correcting an error below this share of the tolerance, so that noise does not keep it moving.
+TARGET_SHARE = 0.33
 
 
 class DockingPhase(Enum):
@@ -48,7 +49,7 @@ class Docking:
     """Drives to a goal that has an approach direction; the policy drives in phase DRIVE."""
 
     def __init__(self, goal: Goal, robot: Robot) -> None:
-        assert goal.approach is not None  # noqa: S101 - it is why this docking exists
+        assert goal.approach is not None  # noqa: S101 - only such a goal is docked at
         self.robot, self.phase = robot, DockingPhase.DRIVE
         self.position, self.direction = goal.pose.array()[:2], goal.approach  # m, m and rad in map
         self.tolerance, self.yaw_tolerance = goal.tolerance, goal.yaw_tolerance
@@ -63,17 +64,18 @@ class Docking:
 
     def refusal(self) -> str | None:
         """Why this base cannot approach the goal like this, or None if it can."""
-        off = float(se2.wrap(2 * (self.heading - self.direction))) / 2  # from the line, forwards or backwards
-        if self.robot.drive == "differential" and abs(off) > (self.yaw_tolerance or np.inf):
+        # Angle between heading and line; the robot may also follow the line backwards.
+        angle = float(se2.wrap(2 * (self.heading - self.direction))) / 2
+        if self.robot.drive == "differential" and abs(angle) > (self.yaw_tolerance or np.inf):
             return "goal refused: a differential base moves along its heading, and cannot approach the goal across it"
         return None
 
     def interrupt(self) -> None:
-        """Start again: the robot was driven by hand, stopped, or lost its pose."""
+        """Starts again: the robot was driven by hand, stopped, or lost its pose."""
         self.phase = DockingPhase.DRIVE
 
     def errors(self, pose: Array) -> tuple[float, float, float]:
-        """What remains from a pose (3,) to the goal: m along and across the line, and rad of heading.
+        """Errors of a pose (3,) relative to the goal: m along the line, m across it, and rad of heading.
 
         The heading error is 0 for a holonomic base if the goal accepts any heading.
         """
@@ -95,7 +97,7 @@ class Docking:
         if self.phase is DockingPhase.DRIVE and np.hypot(along - LINE_LENGTH_M, across) <= GOAL_TOLERANCE_M:
             self.phase = DockingPhase.ALIGN
         if self.phase is DockingPhase.ALIGN:
-            if abs(turn) > ALIGNED_RAD:
+            if abs(turn) > MAX_ALIGN_ERROR_RAD:
                 return np.array([0.0, 0.0, turn_rate(turn, self.robot)])
             self.phase = DockingPhase.LINE
         if not -MAX_LATERAL_ERROR_M < along < LINE_LENGTH_M + MAX_LATERAL_ERROR_M or abs(across) > MAX_LATERAL_ERROR_M:
@@ -109,7 +111,7 @@ class Docking:
         if speed > 0:  # yaw'' = -2 yaw' / C - y / C^2 over the distance: critically damped
             final_turn = speed * (across / CONVERGENCE_M + 2 * turn) / CONVERGENCE_M
         elif speed == 0 and final_turn == 0 and not self.arrived(pose):
-            self.phase = DockingPhase.DRIVE  # it stands beside the goal
+            self.phase = DockingPhase.DRIVE  # the robot stands beside the goal
             return None
         return np.array([-speed if self.backwards else speed, 0.0, final_turn])
 
@@ -119,7 +121,7 @@ class Docking:
         return target / max(float(np.hypot(*target)), 1e-9) * self._speed(float(np.hypot(along, across)))
 
     def _speed(self, distance: float) -> float:
-        """Speed in m/s, with the sign of ``distance`` m to go; 0 near enough to the target."""
+        """Speed in m/s for ``distance`` m to go, with its sign; 0 within the share `TARGET_SHARE` of the tolerance."""
         if abs(distance) <= TARGET_SHARE * self.tolerance:
             return 0.0
         return float(np.copysign(min(LINE_SPEED, braking_speed(abs(distance), self.robot, SETTLING_TIME_S)), distance))

@@ -1,4 +1,4 @@
-"""Exploration of an unknown building: which goal comes next, until nothing is left to see and the robot is back.
+"""Explores an unknown building: chooses viewpoints until nothing is left to see, and then drives back to the start.
 
 | from | event | to |
 |---|---|---|
@@ -31,37 +31,37 @@ if TYPE_CHECKING:
     from services.controller.growing_map import PlannedMap
     from services.controller.policies.exploration import ExplorationState, FieldOfView, Viewpoint
 
-PAUSE_NS = 2_000_000_000  # for which the robot stands at a goal of a user
-STALLED_NS = 8_000_000_000  # without a motion of `STALLED_M`, after which the goal counts as unreachable
+PAUSE_NS = 2_000_000_000  # how long the robot stands at a goal of a user before it goes on exploring
+STALLED_NS = 8_000_000_000  # after this time without a motion of `STALLED_M`, the goal counts as unreachable
 STALLED_M = 0.2
 VIEWPOINT_TOLERANCE_M = 0.1
-HOME_TOLERANCE_M = 0.005
-RETURNED_M = 0.02  # a robot that stopped late and stands farther away tries again
-SAME_PLACE_M = 0.1  # a viewpoint this close to the present goal is the same
+HOME_TOLERANCE_M = 0.005  # of the goal at the start; below `RETURNED_M`, so that a robot that reaches it has returned
+RETURNED_M = 0.02  # if the robot stopped late and stands farther than this from the start, it tries again
+SAME_PLACE_M = 0.1  # a new viewpoint this close to the present goal does not replace it
 
 
 class Explorer:
     """One exploration: chooses the robot's goals."""
 
     def __init__(self, seq: int, pose: Array, planned: PlannedMap) -> None:
-        """Begin at a pose (3,) in a map; ``seq`` is the number of the request."""
+        """Begins at a pose (3,) in a map; ``seq`` is the number of the request."""
         self.seq, self.map = seq, planned
         self.phase: Literal["exploring", "returning", "finished", "failed"] = "exploring"
         self.goal: Goal | None = None  # of the exploration, not of a user
-        self.paused = False  # the goal of a user takes precedence
+        self.paused = False  # whether a goal of a user takes precedence
         self.path_m = 0.0
         self._pose, self._located = pose, True
-        # Relative to the last key scan, so that it moves with the map when a loop closes.
+        # The start is stored relative to the last key scan, so that it moves with the map when a loop closes.
         self._home_key = len(planned.message.poses) - 1
         self._home = se2.between(planned.message.poses[self._home_key], pose)
-        self._arrivals = np.zeros((0, 3))
-        self._unreachable = np.zeros((0, 2))
+        self._arrivals = np.zeros((0, 3))  # poses at which the robot arrived at viewpoints
+        self._unreachable = np.zeros((0, 2))  # viewpoints that were given up
         self._user_goal_over_since_ns: int | None = None
         self._last_moved = pose, 0  # pose and stamp in ns; the stamp is 0 before the first step towards a goal
 
     @property
     def active(self) -> bool:
-        """Whether the exploration still has a goal: a viewpoint, or the way back."""
+        """Whether the exploration goes on: the robot still has to explore, or to return."""
         return self.phase in {"exploring", "returning"}
 
     @property
@@ -80,7 +80,7 @@ class Explorer:
         self.goal, self.paused, self._user_goal_over_since_ns = None, True, None
 
     def move(self, pose: Array, *, located: bool) -> None:
-        """Updates the robot's pose (3,), which is in the map if it is ``located``, else in its own frame."""
+        """Updates the robot's pose (3,), which is in the map only if the robot is ``located`` in it."""
         if located == self._located:
             self.path_m += float(np.hypot(*(pose - self._pose)[:2]))
         self._pose, self._located = pose, located
@@ -100,7 +100,7 @@ class Explorer:
     def update(self, state: GoalState, stamp_ns: int, *, moving: bool) -> bool:
         """Processes the state of the robot's goal after a scan. Returns whether a viewpoint must be chosen now.
 
-        ``moving`` is by the command: a robot may stop late, beyond the goal that it has reached.
+        ``moving``: the latest command is a motion. A robot may stop late, beyond the goal that it has reached.
         """
         if not self.active or not (self.paused or self.goal is not None):
             return False
@@ -134,7 +134,7 @@ class Explorer:
             self._last_moved = self._pose, stamp_ns
 
     def _update_return(self, state: GoalState, *, stalled: bool, moving: bool) -> bool:
-        """Ends the exploration if the robot is back, or cannot get back; returns whether to try once more."""
+        """Ends the exploration if the robot is back, or cannot get back; returns whether it must try again."""
         reached = state.phase is Phase.REACHED
         if state.active or (reached and moving):
             return False
@@ -142,10 +142,10 @@ class Explorer:
             self.phase = "finished"
         elif stalled:
             self.phase = "finished" if reached else "failed"
-        return self.active  # it was refused: from a narrow place, the next attempt may find another path
+        return self.active  # a refused return is tried again, because the next attempt may find another path
 
     def _update_viewpoint(self, goal: Goal, state: GoalState, *, stalled: bool) -> bool:
-        """Notes whether the viewpoint was reached or cannot be; returns whether either is so."""
+        """Notes that the viewpoint was reached, or is given up; returns whether either is the case."""
         if state.active and not stalled:
             return False
         if state.phase is Phase.REACHED:
@@ -156,7 +156,7 @@ class Explorer:
         return True
 
     def next_goal(self, viewpoint: Viewpoint | None, half_field_of_view: float, *, under_way: bool) -> Goal | None:
-        """The goal of the viewpoint that was chosen, or the way back if there is none; None if the goal stays the same.
+        """The goal for a viewpoint, or for the way back if it is None; returns None if the present goal is kept.
 
         The scanner sees ``half_field_of_view`` rad to either side. ``under_way``: the robot drives to the last goal.
         """
@@ -173,13 +173,13 @@ class Explorer:
         self.goal = goal
         return goal
 
-    def explain(self, status: Status) -> Status:
-        """The controller's status, with the progress of the exploration."""
+    def add_progress(self, status: Status) -> Status:
+        """The controller's status with the progress of the exploration."""
         progress = Exploration(phase=self.phase, seq=self.seq, area=self.map.free_area_m2, path=self.path_m)
         status = status.model_copy(update={"exploration": progress})
         if not self.drives or not self._located or status.state in {"lost", "manual"}:
             return status
         if status.state == "blocked" and not status.refused:
             return status
-        reason = "returning to the start" if self.phase == "returning" else "going where a scan tells most"
+        reason = "returning to the start" if self.phase == "returning" else "driving to a viewpoint"
         return status.model_copy(update={"state": "exploring", "reason": reason, "refused": False})

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 BLOCKED_AFTER_S = 2.0  # time without motion before an obstacle after which the phase becomes BLOCKED
 
-Shown = Literal["idle", "navigating", "reached", "blocked", "lost", "exploring"]
+StatusState = Literal["idle", "navigating", "reached", "blocked", "lost", "exploring"]  # of the message Status
 
 
 class Phase(Enum):
@@ -40,7 +40,7 @@ class Phase(Enum):
     REFUSED = auto()  # the goal cannot be reached: it is inside a wall, or in another room
 
 
-SHOWN: dict[Phase, Shown] = {
+STATUS_OF_PHASE: dict[Phase, StatusState] = {
     Phase.IDLE: "idle",
     Phase.NAVIGATING: "navigating",
     Phase.BLOCKED: "blocked",
@@ -54,12 +54,13 @@ class GoalState:
 
     def __init__(self) -> None:
         self.goal: Goal | None = None
-        self._activity: Shown = "lost"  # shown while UNLOCALISED
+        self._activity: StatusState = "lost"  # the published state while UNLOCALISED
         self._enter(Phase.IDLE)
 
     def _enter(self, phase: Phase, reason: str = "") -> None:
         self.phase, self.reason = phase, reason
-        self._standing_since_ns: int | None = None  # before an obstacle; None while the robot makes progress
+        # Stamp since which the robot has stood before an obstacle; None while it makes progress.
+        self._standing_since_ns: int | None = None
 
     @property
     def active(self) -> bool:
@@ -67,40 +68,40 @@ class GoalState:
         return self.phase in {Phase.NAVIGATING, Phase.BLOCKED, Phase.UNLOCALISED}
 
     def start(self, goal: Goal, refusal: str | None) -> None:
-        """Replace the goal. If ``refusal`` is not None, it is the reason to refuse the new one."""
+        """Replaces the goal, and refuses the new one if ``refusal`` gives a reason."""
         self.goal = goal
         self._enter(Phase.NAVIGATING if refusal is None else Phase.REFUSED, refusal or "")
 
     def cancel(self) -> None:
-        """Forget the goal."""
+        """Forgets the goal."""
         self.goal = None
         self._enter(Phase.IDLE, "cancelled")
 
     def refuse(self, reason: str) -> None:
-        """Refuse the goal, because it has turned out to be unreachable."""
+        """Refuses the goal, because it has turned out to be unreachable."""
         self._enter(Phase.REFUSED, reason)
 
     def reach(self, reason: str) -> None:
-        """The robot has arrived."""
+        """Ends the goal: the robot has arrived."""
         self._enter(Phase.REACHED, reason)
 
-    def lose_pose(self, activity: Shown, reason: str) -> None:
-        """The belief cannot be used for navigation; ``activity`` is what the robot does meanwhile."""
+    def lose_pose(self, activity: StatusState, reason: str) -> None:
+        """Notes that the belief cannot be used for navigation; ``activity`` is what the robot does meanwhile."""
         if self.active:
             self._activity = activity
             self._enter(Phase.UNLOCALISED, reason)
 
     def lose_belief(self, reason: str) -> None:
-        """Beliefs no longer arrive."""
+        """Notes that beliefs no longer arrive."""
         self.lose_pose("lost", reason)
 
     def find_pose(self) -> None:
-        """The belief can be used for navigation."""
+        """Notes that the belief can be used for navigation."""
         if self.phase is Phase.UNLOCALISED:
             self._enter(Phase.NAVIGATING)
 
     def suspend(self) -> None:
-        """The robot is driven by hand. The goal is kept for afterwards, unless it was reached."""
+        """Interrupts the goal while the robot is driven by hand; forgets it if it was reached."""
         if self.active:
             self._enter(Phase.NAVIGATING)
         elif self.phase is not Phase.REFUSED:
@@ -108,7 +109,7 @@ class GoalState:
             self._enter(Phase.IDLE)
 
     def update_progress(self, stamp_ns: int, decision: Decision, *, moving: bool, limited_by_scan: bool) -> None:
-        """The policy decided on a velocity; ``limited_by_scan``: obstacles in the scan reduced it."""
+        """Processes a decision of the policy; ``limited_by_scan``: obstacles in the scan reduced its velocity."""
         if self.phase not in {Phase.NAVIGATING, Phase.BLOCKED}:
             return
         self.reason = decision.reason or ("slowed by the scan" if limited_by_scan else "")
@@ -123,10 +124,10 @@ class GoalState:
                 self.phase, self.reason = Phase.BLOCKED, decision.reason or "the scan shows something in the way"
 
     def status(self, stamp_ns: int, distance: float | None) -> Status:
-        """The published status; ``distance`` to the goal in m."""
+        """The status to publish, with the ``distance`` m to the goal if it is known."""
         return Status(
             stamp_ns=stamp_ns,
-            state=SHOWN.get(self.phase, self._activity),
+            state=STATUS_OF_PHASE.get(self.phase, self._activity),
             reason=self.reason,
             refused=self.phase is Phase.REFUSED,
             goal=self.goal.pose if self.goal is not None else None,

@@ -14,7 +14,9 @@ from services.controller.policies.geodesic_field import FreeSpaceGraph
 if TYPE_CHECKING:
     from common.messages.definitions import Map
 
-JUMP_M = 0.05  # a key scan that moved farther moved with a loop closure, and obstacles seen before are elsewhere
+# A key scan that moved farther than this between two versions was moved by a loop closure. Obstacles that were seen
+# before are then at other places of the map.
+JUMP_M = 0.05
 
 
 @dataclass(frozen=True)
@@ -27,12 +29,12 @@ class PlannedMap:
 
     @classmethod
     def of(cls, message: Map, radius: float) -> PlannedMap:
-        """Prepare a map for a robot of ``radius`` m."""
+        """Prepares a map for planning with a robot of ``radius`` m."""
         free_area_m2 = float(np.count_nonzero(message.grid.values == FREE)) * message.grid.resolution**2
         return cls(message, FreeSpaceGraph(FreeSpace.of_map(message.grid), radius), free_area_m2)
 
     def jumped_from(self, before: PlannedMap) -> bool:
-        """Whether a place of the version ``before`` has moved in this one."""
+        """Whether a key scan of the version ``before`` has moved by more than `JUMP_M` in this one."""
         old, new = before.message.poses, self.message.poses
         if len(new) < len(old):
             return True  # mapping started again

@@ -10,7 +10,8 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.messages.definitions import Drive
 
-MANUAL_TIMEOUT_NS = 500_000_000  # age at which a drive message expires, and time for which zero velocity is held
+# Age at which a drive message expires. A commanded velocity of zero holds up the goal for as long at most.
+MANUAL_TIMEOUT_NS = 500_000_000
 
 
 class ManualDrive:
@@ -25,7 +26,7 @@ class ManualDrive:
         self._zero_since_ns: int | None = None  # first of the latest uninterrupted messages that command zero velocity
 
     def update(self, drive: Drive, now_ns: int) -> None:
-        """Store a drive message that arrived at ``now_ns``, the stamp of the latest scan or command."""
+        """Stores a drive message that arrived at ``now_ns``, the stamp of the latest scan or command."""
         self._twist = drive.twist.array()
         if self._twist.any():
             self._zero_since_ns = None

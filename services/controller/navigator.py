@@ -31,15 +31,18 @@ if TYPE_CHECKING:
 
 @dataclass
 class Navigator:
-    """Turns beliefs into commands and statuses. A policy chooses the velocity. Uses stamps only, never a clock."""
+    """Turns beliefs into commands and statuses. A policy chooses the velocity.
+
+    All times are stamps of messages, never those of a clock.
+    """
 
     robot: Robot = field(default_factory=Robot)
     parameters: ActionParameters = field(default_factory=ActionParameters)  # of preset `paper`
     world: World | None = None  # lets preset `paper` refuse goals inside walls; without it any goal is accepted
-    preset: Policy | None = None  # the policy; defaults to preset `paper`
+    chosen_policy: Policy | None = None  # defaults to the straight-line policy, preset `paper`
 
     def __post_init__(self) -> None:
-        self.policy: Policy = self.preset or StraightLinePolicy(self.robot, self.parameters, self.world)
+        self.policy: Policy = self.chosen_policy or StraightLinePolicy(self.robot, self.parameters, self.world)
         self.decision = Decision()  # what the policy decided on the latest belief
         self.goal_state = GoalState()
         self._command = VelocityCommand(self.robot)
@@ -48,24 +51,24 @@ class Navigator:
         self._map: PlannedMap | None = None  # the mapper's, if there is one
         self._pose: Array | None = None  # (3,) base_link in map, of the latest belief that tracks
         self.explorer: Explorer | None = None  # the last exploration, unless it was cancelled
-        self._requested: Goal | None = None  # request to explore, which waits for the first map and a pose in it
+        self._exploration_request: Goal | None = None  # waits for the first map and a pose in it
         self._viewpoint_due = False  # whether the exploration has to choose a viewpoint
         self._scan: Scan | None = None
         self._scan_points = np.zeros((0, 2))  # m in base_link
 
     def on_scan(self, scan: Scan) -> None:
-        """Keep the scan, corrected for the robot's motion, for the obstacle limits and for the policy."""
+        """Keeps the scan, corrected for the robot's motion, for the obstacle limits and for the policy."""
         self._scan = correct_scan(scan, self._command.velocity)
         self._scan_points = safety.scan_points(self._scan)
         self.policy.prepare(self._scan)
 
     def on_drive(self, drive: Drive) -> None:
-        """Store a manual velocity command, which has priority over the goal."""
+        """Stores a manual velocity command, which has priority over the goal."""
         self._manual.update(drive, max(self.scan_stamp or 0, self._command.stamp_ns or 0))
 
     def on_goal(self, goal: Goal) -> None:
-        """Replace, cancel or refuse the goal, or begin to explore. A goal known to be unreachable is refused."""
-        self._requested = None
+        """Replaces, cancels or refuses the goal, or begins to explore. A goal known to be unreachable is refused."""
+        self._exploration_request = None
         if goal.cancel or goal.explore or self.explorer is None or not self.explorer.active:
             self.explorer = None
         else:
@@ -77,28 +80,32 @@ class Navigator:
 
     def _explore(self, request: Goal) -> None:
         self.policy.set_goal(None)
-        if self.preset is None or self.world is not None:
+        if self.chosen_policy is None or self.world is not None:
             reason = "cannot explore in a known world: start with `presage up --mapping`"
             self.goal_state.start(request, reason)
             return
         self.goal_state.cancel()
-        self._requested = request
+        self._exploration_request = request
         self._begin_exploration()
 
     def _begin_exploration(self) -> None:
-        if self._requested is not None and self._map is not None and self._pose is not None:
-            self.explorer = Explorer(self._requested.seq, self._pose, self._map)
-            self._requested, self._viewpoint_due = None, True
+        """Begins the requested exploration when there is a map and a pose in it."""
+        if self._exploration_request is not None and self._map is not None and self._pose is not None:
+            self.explorer = Explorer(self._exploration_request.seq, self._pose, self._map)
+            self._exploration_request, self._viewpoint_due = None, True
 
     def on_map(self, planned: PlannedMap) -> None:
-        """Explore in a new version of the mapper's map; the policy gets it from the caller."""
+        """Uses a new version of the mapper's map for exploration; the caller passes it to the policy."""
         self._map = planned
         if self.explorer is not None:
             self.explorer.map = planned
             self._viewpoint_due = self.explorer.drives
 
     def take_exploration_state(self) -> ExplorationState | None:
-        """Returns the input for the choice of a viewpoint if one is due, else None; then call `use_viewpoint`."""
+        """Returns the input for the choice of a viewpoint, or None if no choice is due.
+
+        The caller passes the viewpoint that was chosen to `use_viewpoint`.
+        """
         if self.goal_state.phase is Phase.UNLOCALISED:
             return None  # the robot first has to be localised
         due, self._viewpoint_due = self._viewpoint_due, False
@@ -109,7 +116,7 @@ class Navigator:
         return self.explorer.exploration_state(FieldOfView.of(self._scan, self._map.message.grid.resolution))
 
     def use_viewpoint(self, viewpoint: Viewpoint | None, exploration_state: ExplorationState) -> None:
-        """Drive to the viewpoint that was chosen, or back to the start if there is none."""
+        """Drives to the viewpoint that was chosen, or back to the start if there is none."""
         if self.explorer is not None and self.explorer.drives:
             goal = self.explorer.next_goal(
                 viewpoint, exploration_state.field_of_view.sector.half, under_way=self.goal_state.active
@@ -129,7 +136,7 @@ class Navigator:
     def _refusal(self, goal: Goal) -> str | None:
         if self._docking is None:
             place = goal.pose.array()[:2]
-            # Where the robot stands already, it has room, whatever the map says about the walls.
+            # A goal at which the robot stands already is never refused, whatever the map says about walls.
             at_goal = self._pose is not None and np.hypot(*(self._pose[:2] - place)) <= goal.tolerance
             return None if at_goal else self.policy.refusal(place)
         if (reason := self._docking.refusal()) is not None:
@@ -143,7 +150,7 @@ class Navigator:
         return None if self._scan is None else self._scan.stamp_ns
 
     def step(self, belief: Belief) -> tuple[CmdVel, Status]:
-        """Command and status for a belief, both with its stamp."""
+        """Returns command and status for a belief, both with its stamp."""
         pose, manual_twist = belief.pose.array(), self._manual.twist(belief.stamp_ns)
         self._resume_after_pause(belief.stamp_ns)
         self.decision = Decision()
@@ -160,7 +167,7 @@ class Navigator:
         distance = None if goal is None else float(np.hypot(*(goal.pose.array() - pose)[:2]))
         if manual_twist is not None:
             command, _ = self._command.limit(belief.stamp_ns, manual_twist, self._scan_points)
-            return command, self._explained(self._manual_status(belief.stamp_ns, distance))
+            return command, self._add_exploration(self._manual_status(belief.stamp_ns, distance))
         desired = np.zeros(3)
         if goal is not None and distance is not None and self.goal_state.active:
             desired = self._goal_velocity(belief, pose, goal, distance)
@@ -169,13 +176,13 @@ class Navigator:
         self.goal_state.update_progress(belief.stamp_ns, self.decision, moving=moving, limited_by_scan=limited_by_scan)
         if self.explorer is not None and self.explorer.update(self.goal_state, belief.stamp_ns, moving=moving):
             self._viewpoint_due = True
-        status = self._explained(self.goal_state.status(belief.stamp_ns, distance))
+        status = self._add_exploration(self.goal_state.status(belief.stamp_ns, distance))
         if (terms := self.decision.terms) is not None:
             status = status.model_copy(update={"energy": PolicyEnergy(**terms)})
         return command, status
 
     def step_without_belief(self, stamp_ns: int) -> tuple[CmdVel, Status] | None:
-        """Command and status for a scan while no estimator runs, so that manual driving still works.
+        """Returns command and status for a scan while no estimator runs, so that manual driving still works.
 
         Returns None if the robot stands and is not driven by hand.
         """
@@ -186,13 +193,16 @@ class Navigator:
         if manual_twist is not None:
             self._suspend_goal()
             command, _ = self._command.limit(stamp_ns, manual_twist, self._scan_points)
-            return command, self._explained(self._manual_status(stamp_ns, None))
+            return command, self._add_exploration(self._manual_status(stamp_ns, None))
         self.goal_state.lose_belief("no belief: is the estimator running?")
         command, _ = self._command.limit(stamp_ns, np.zeros(3), self._scan_points)
         return command, self.status(stamp_ns)
 
     def stop_without_belief(self, stamp_ns: int, reason: str) -> tuple[CmdVel, Status]:
-        """Zero command and its status, if no belief came in time. Keeps the goal, to resume it with the next belief."""
+        """Returns the command to stop and its status, for when no belief came in time.
+
+        The goal is kept, and resumed with the next belief.
+        """
         # If every scan was answered, the simulation may be paused; otherwise the estimator is late.
         paused = self._scan is not None and self._scan.stamp_ns == self._command.stamp_ns
         command = self._command.stop(stamp_ns, paused=paused)
@@ -220,14 +230,15 @@ class Navigator:
 
     def status(self, stamp_ns: int) -> Status:
         """The status between two beliefs."""
-        return self._explained(self.goal_state.status(stamp_ns, None))
+        return self._add_exploration(self.goal_state.status(stamp_ns, None))
 
-    def _explained(self, status: Status) -> Status:
-        if self._requested is not None:
-            progress = Exploration(phase="exploring", seq=self._requested.seq, area=0.0, path=0.0)
+    def _add_exploration(self, status: Status) -> Status:
+        """The status with the progress of the exploration, if there is one."""
+        if self._exploration_request is not None:
+            progress = Exploration(phase="exploring", seq=self._exploration_request.seq, area=0.0, path=0.0)
             reason = "waiting for the mapper's first map"
             return status.model_copy(update={"exploration": progress, "state": "exploring", "reason": reason})
-        return status if self.explorer is None else self.explorer.explain(status)
+        return status if self.explorer is None else self.explorer.add_progress(status)
 
     def _goal_velocity(self, belief: Belief, pose: Array, goal: Goal, distance: float) -> Array:
         """Velocity (3,) in base_link that the policy chooses, before any limit; updates the state of the goal."""
@@ -247,7 +258,7 @@ class Navigator:
             if turn is None:
                 self.goal_state.reach(_arrival(belief, goal))
                 return np.zeros(3)
-            self.decision = Decision(turn, "there: turning into the goal's heading")
+            self.decision = Decision(turn, "at the goal: turning into its heading")
             return turn
         self.decision = self.policy.decide(belief, self._command.velocity)
         if self.decision.refused:
@@ -263,8 +274,8 @@ class Navigator:
             return None
         self.policy.interrupt()
         self.decision = Decision(velocity)
-        lately = self._command.motion_until_effect(belief.stamp_ns, delay + STANDING_TIME_S)
-        if not (lately.any() or velocity.any() or self._command.velocity.any()) and docking.arrived(pose):
+        recent_motion = self._command.motion_until_effect(belief.stamp_ns, delay + STANDING_TIME_S)
+        if not (recent_motion.any() or velocity.any() or self._command.velocity.any()) and docking.arrived(pose):
             self.goal_state.reach(_arrival(belief, goal))
         return velocity
 
@@ -273,7 +284,7 @@ class Navigator:
             self._docking.interrupt()
 
     def _turn_to_goal_heading(self, pose: Array, goal: Goal) -> Array | None:
-        """Turn (3,) in base_link towards the goal's heading; None if the heading is within tolerance or free."""
+        """Velocity (3,) of a turn towards the goal's heading; None if any heading will do, or it is reached."""
         if goal.yaw_tolerance is None:
             return None
         error = float(se2.wrap(goal.pose.yaw - pose[2]))
@@ -283,11 +294,9 @@ class Navigator:
 
 
 def _arrival(belief: Belief, goal: Goal) -> str:
-    """Status text on arrival, which says so if the belief is not accurate enough to be sure of it."""
+    """Status text on arrival, with the uncertainty of the position if that is larger than the tolerance."""
     reason = f"within {goal.tolerance:g} m of the goal"
     if belief.covariance is None:
         return reason
-    uncertainty = 2 * float(np.sqrt(np.linalg.eigvalsh(belief.covariance[:2, :2])[-1]))
-    return (
-        reason if uncertainty <= goal.tolerance else f"{reason} by a belief that is only certain to {uncertainty:.2g} m"
-    )
+    uncertainty = 2 * float(np.sqrt(np.linalg.eigvalsh(belief.covariance[:2, :2])[-1]))  # 2 sigma
+    return reason if uncertainty <= goal.tolerance else f"{reason}, but the pose is only known to {uncertainty:.2g} m"

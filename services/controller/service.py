@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from services.controller.policies.geodesic_field import CostField
     from services.controller.policies.planner import GeodesicPolicy
 
-PREDICTED_BEAMS = 61  # beams of a predicted scan
+PREDICTED_BEAMS = 61  # beams of a predicted scan: enough to tell places apart, and a short reply
 FIELD_PERIOD_NS = 5_000_000_000  # an unchanged cost field is published again after this time
 SCAN_TIMEOUT_S = 0.2  # how long a belief waits for its scan
 PREDICTION_TIMEOUT_S = 0.3  # how long a belief waits for predictions, which are requested once a second at most
@@ -92,7 +92,7 @@ class ControllerService(Service):
         self._plan_shown = False  # whether the last published plan has content
 
     def open(self) -> None:
-        """Load the map and create the navigator."""
+        """Loads the map and creates the navigator."""
         settings = self.settings
         settings.check()
         robot = settings.build_robot()
@@ -113,7 +113,7 @@ class ControllerService(Service):
             self.loop.bus.publisher(topic, self.name)
 
     def on_restored(self, last: dict[Topic, Stamped]) -> None:
-        """Resume the goal of the previous controller instance, if it was still under way."""
+        """Resumes the goal of the previous controller instance, if it was still under way."""
         goal, status = last.get(GOAL), last.get(STATUS)
         if not isinstance(goal, Goal) or not isinstance(status, Status) or goal.cancel or goal.explore:
             return
@@ -125,7 +125,7 @@ class ControllerService(Service):
             self.log.warning("resuming the goal of the previous controller instance", x=goal.pose.x, y=goal.pose.y)
 
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
-        """Answer a belief by a command with its stamp, and a goal by a status at once."""
+        """Answers a belief by a command with its stamp, and a goal by a status at once."""
         if isinstance(message, Scan):
             self._on_scan(message)
         elif isinstance(message, Drive):
@@ -144,7 +144,7 @@ class ControllerService(Service):
             self._map_job.submit(lambda: PlannedMap.of(message, radius))
 
     def close(self) -> None:
-        """Wait for the threads."""
+        """Waits for the background threads."""
         self._map_job.close()
         self._viewpoint_job.close()
 
@@ -179,12 +179,12 @@ class ControllerService(Service):
         self._wait = AwaitsScan(belief, self._belief_received_s + SCAN_TIMEOUT_S)
 
     def _process(self, belief: Belief) -> None:
-        """Answer a belief, or request predictions first if the policy needs them."""
+        """Answers a belief, or requests predictions first if the policy needs them."""
         self._wait = Answered()  # set first, so that a belief whose step raises an exception is not processed again
-        began, motions = time.thread_time_ns(), None
+        start_ns, motions = time.thread_time_ns(), None
         if self.geodesic is not None and self.navigator.goal_state.active:
             motions = self.geodesic.prediction_request(belief)
-        cpu_ns = time.thread_time_ns() - began
+        cpu_ns = time.thread_time_ns() - start_ns
         if motions is None:
             self._step(belief, cpu_ns)
             return
@@ -193,7 +193,7 @@ class ControllerService(Service):
         self._wait = AwaitsPredictions(belief, cpu_ns)
 
     def on_reply(self, query: Query, number: int, reply: Reply) -> None:  # noqa: ARG002 - PREDICT is the only query
-        """Pass predictions to the policy, and answer the belief that waits for them, even if the request failed."""
+        """Passes predictions to the policy, and answers the belief that waits for them, even if the request failed."""
         if number != self._latest_request or self.geodesic is None:
             return
         if isinstance(reply, PredictReply) and reply.ok:
@@ -204,12 +204,12 @@ class ControllerService(Service):
             self._step(self._wait.belief, self._wait.cpu_ns)
 
     def _step(self, belief: Belief, cpu_ns: int) -> None:
-        """Answer a belief by a command; ``cpu_ns`` is the CPU time that this thread has spent on it so far."""
+        """Answers a belief by a command; ``cpu_ns`` is the CPU time that this thread has spent on it so far."""
         self._wait = Answered()
-        began = time.thread_time_ns()
+        start_ns = time.thread_time_ns()
         answer = self.navigator.step(belief)
         self._choose_viewpoint()
-        took_us = (time.thread_time_ns() - began + cpu_ns) // 1000
+        took_us = (time.thread_time_ns() - start_ns + cpu_ns) // 1000
         self.counters["steps"] += 1
         self.counters["step_us"] += took_us
         self.counters["step_us_max"] = max(self.counters["step_us_max"], took_us)
@@ -236,7 +236,7 @@ class ControllerService(Service):
         return deadline_s - time.monotonic()
 
     def on_timer(self) -> None:
-        """Use the result of a job; at a deadline, process the belief that waits for its scan, or stop the robot."""
+        """Uses the result of a job; at a deadline, processes the belief that waits for its scan, or stops the robot."""
         if self._map_job.ready:
             self._use_map(self._map_job.take())
             return
@@ -261,7 +261,7 @@ class ControllerService(Service):
         self._choose_viewpoint()
 
     def _choose_viewpoint(self) -> None:
-        """If the exploration is to choose a viewpoint, do so in a thread."""
+        """Starts to choose a viewpoint in a thread, if the exploration needs one."""
         if (exploration_state := self.navigator.take_exploration_state()) is not None:
             from services.controller.policies.exploration import choose_viewpoint
 
@@ -272,7 +272,7 @@ class ControllerService(Service):
         self.publish(CMD_VEL, command)
 
     def _publish_plan(self, stamp_ns: int) -> None:
-        """Publish path, predicted motion, obstacles and cost field for the page and for recordings."""
+        """Publishes path, predicted motion, obstacles and cost field for the page and for recordings."""
         if self.geodesic is None:
             return
         decision, obstacles = self.navigator.decision, self.geodesic.obstacles.points().astype(np.float32)

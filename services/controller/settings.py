@@ -48,7 +48,7 @@ class ControllerSettings(SelfFilterSettings):
     ] = 0.5
 
     def check(self) -> None:
-        """Raise UserError if settings contradict each other."""
+        """Raises UserError if settings contradict each other."""
         self.build_robot()
         self.build_self_filter()
         if self.preset == "paper" and self.drive != "holonomic":

@@ -28,7 +28,7 @@ class VelocityCommand:
         self._sent: deque[tuple[int, Array]] = deque(maxlen=100)  # stamps in ns and velocities of the last commands
 
     def limit(self, stamp_ns: int, desired: Array, points: Array) -> tuple[CmdVel, bool]:
-        """The command for a desired velocity (3,), and whether the obstacle ``points`` (K, 2) m reduced it."""
+        """Returns the command for a desired velocity (3,), and whether obstacle ``points`` (K, 2) m reduced it."""
         period_s = 0.0 if self.stamp_ns is None else max(0.0, (stamp_ns - self.stamp_ns) * 1e-9)
         self.stamp_ns = stamp_ns
         possible = self._in_pulses(safety.clip_twist(desired, self.robot))
@@ -41,7 +41,7 @@ class VelocityCommand:
     def motion_until_effect(self, stamp_ns: int, delay_s: float) -> Array:
         """Motion (3,) in base_link from a stamp until a command with that stamp takes effect, ``delay_s`` later.
 
-        Until then the earlier commands apply, each as much later than its stamp.
+        Until then the earlier commands apply, each of which also takes effect ``delay_s`` after its stamp.
         """
         motion, end_ns, first_ns = np.zeros(3), stamp_ns, stamp_ns - round(delay_s * 1e9)
         for sent_ns, velocity in reversed(self._sent):
@@ -51,7 +51,7 @@ class VelocityCommand:
         return motion
 
     def _in_pulses(self, desired: Array) -> Array:
-        """The desired velocity (3,), but in pulses of the dead band's size where the base would not move.
+        """The desired velocity (3,); where the base's dead band would swallow it, pulses just above the dead band.
 
         The sum of the pulses follows that of the desired velocities, as in a sigma-delta modulator.
         """
@@ -67,7 +67,7 @@ class VelocityCommand:
         return np.where(too_low, pulse, desired)
 
     def stop(self, stamp_ns: int, *, paused: bool) -> CmdVel:
-        """The command to stand. If the simulation may be ``paused``, `resume` can undo it."""
+        """Returns the command to stop. If the simulation may be ``paused``, `resume` can undo it."""
         if paused:
             self._before_pause = self.velocity
         self.velocity = np.zeros(3)
@@ -75,7 +75,7 @@ class VelocityCommand:
         return CmdVel(stamp_ns=stamp_ns, twist=Twist())
 
     def resume(self, stamp_ns: int) -> bool:
-        """Restore the velocity from before a pause, if the stamps show that no simulated time has passed.
+        """Restores the velocity from before a pause, if the stamps show that no simulated time has passed.
 
         Returns whether it was restored.
         """

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from common.runtime.service import Service
 
 
-def make(settings: EstimatorSettings) -> Service:
+def build_service(settings: EstimatorSettings) -> Service:
     """Builds the service; imports torch only here, so that --help is fast."""
     if settings.robots:
         from services.estimator.multi_robot import FleetService
@@ -27,4 +27,4 @@ def make(settings: EstimatorSettings) -> Service:
 
 
 if __name__ == "__main__":
-    main(EstimatorSettings, make)
+    main(EstimatorSettings, build_service)

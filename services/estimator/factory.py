@@ -1,4 +1,4 @@
-"""Builds an estimator and its model from their names; opens the files."""
+"""Builds an estimator and its model from their names, and opens the files of the model."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from services.estimator.shared.model_folder import find_folder
 DEFAULT_SIGMA_M = 0.02  # noise of a scanner whose scans state none
 MOUNT_TOLERANCE = 1e-3  # m and rad
 MIN_SIGMA_M = 1e-3  # lower limit of the noise that scans state, because no surface is known more exactly
-Name = Literal["precise", "paper", "particle-filter", "amcl-defaults"]
+EstimatorPreset = Literal["precise", "paper", "particle-filter", "amcl-defaults"]
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class EstimatorOptions:
     """Selects an estimator, its model and its parameters."""
 
     world: str | World = "corridor"  # name of a shipped world, path of a file, or the world itself
-    estimator: Name = "precise"
+    estimator: EstimatorPreset = "precise"
     model: str = "learned"  # for precise: learned, exact, or a file of weights
     models: Path | None = None  # folder of weights; defaults to the shipped ones
     sigma: float | None = None  # m, the scanner's noise; defaults to what the scans state, else DEFAULT_SIGMA_M
@@ -63,7 +63,7 @@ class EstimatorOptions:
 
 
 @dataclass(frozen=True)
-class Geometry:
+class ScannerGeometry:
     """Beams, mount and noise of a scanner's scans."""
 
     angles: Array  # (B,) rad in laser
@@ -71,24 +71,24 @@ class Geometry:
     range_max: float  # m
     sigma: float = 0.0  # m, the scanner's noise
     sigma_relative: float = 0.0  # the part that grows with the range, as a share of it; both 0 if not stated
-    mount_assumed: bool = False  # neither the scans nor the user state the mount
+    mount_assumed: bool = False  # whether the mount is a guess, because neither the scans nor the user state it
 
     @classmethod
-    def of(cls, scanner: Scanner) -> Geometry:
+    def of(cls, scanner: Scanner) -> ScannerGeometry:
         """The geometry of a scanner's scans."""
         mount = np.array(scanner.mount)
         return cls(scanner.angles(), mount, scanner.range_max, scanner.sigma, scanner.sigma_relative)
 
     @classmethod
-    def of_scan(cls, scan: Scan) -> Geometry:
+    def of_scan(cls, scan: Scan) -> ScannerGeometry:
         """The geometry of a scan message."""
         return cls(scan.angles(), scan.mount.array(), scan.range_max, scan.sigma, scan.sigma_relative)
 
-    def same(self, other: Geometry, *, bound_to_beams: bool) -> bool:
-        """Whether an estimator made for this geometry can process scans of the other one.
+    def same(self, other: ScannerGeometry, *, bound_to_beams: bool) -> bool:
+        """Whether an estimator that was built for this geometry can process scans of the ``other`` one.
 
-        One that is ``bound_to_beams`` needs the same angles. Others do not: with some scanners the number of beams
-        varies a little from turn to turn.
+        An estimator that is ``bound_to_beams`` needs the same angles. Others do not, because some scanners measure a
+        slightly different number of beams in each turn.
         """
         noise = (self.sigma, self.sigma_relative) == (other.sigma, other.sigma_relative)
         if not noise or not np.allclose(self.mount, other.mount, atol=1e-4):
@@ -97,7 +97,7 @@ class Geometry:
             return True
         return len(self.angles) == len(other.angles) and np.allclose(self.angles, other.angles, atol=1e-4)
 
-    def upside_down(self) -> Geometry:
+    def upside_down(self) -> ScannerGeometry:
         """The geometry of the scanner mounted upside down (a roll of 180 deg), which reverses the order of beams."""
         return replace(self, angles=-self.angles)
 
@@ -128,27 +128,31 @@ class Geometry:
         return Likelihood(max(self.sigma, MIN_SIGMA_M), relative=self.sigma_relative)
 
 
-Factory = Callable[[Geometry], PoseEstimator]
+EstimatorFactory = Callable[[ScannerGeometry], PoseEstimator]
 
 
-def prepare(options: EstimatorOptions) -> Factory:
+def prepare_factory(options: EstimatorOptions) -> EstimatorFactory:
     """Loads the world and the weights, and returns a factory of estimators for the geometry of the first scan.
 
     Raises UserError now, and not at the first scan, if something is missing or wrong.
     """
-    if options.estimator not in get_args(Name):
-        raise UserError(f"no estimator {options.estimator!r}: choose one of {', '.join(get_args(Name))}")
+    if options.estimator not in get_args(EstimatorPreset):
+        raise UserError(f"no estimator {options.estimator!r}: choose one of {', '.join(get_args(EstimatorPreset))}")
     world = options.world if isinstance(options.world, World) else load_world(options.world)
     check_start(options, world)
     if options.estimator == "paper":
-        return _paper(options, world)
+        return _prepare_paper(options, world)
     if options.estimator == "precise":
-        return _precise(options, world)
+        return _prepare_precise(options, world)
+    return _prepare_particle_filter(options, world)
+
+
+def _prepare_particle_filter(options: EstimatorOptions, world: World) -> EstimatorFactory:
     tuned = options.estimator == "particle-filter"
     RayCaster(world).expect(np.zeros((1, 3)), np.zeros(1))  # compile now, so that no request has to wait
     sensor = functools.cache(functools.partial(Sensor, world))  # all filters share one field
 
-    def make(geometry: Geometry) -> PoseEstimator:
+    def make(geometry: ScannerGeometry) -> PoseEstimator:
         settings = ParticleFilterSettings.tuned() if tuned else ParticleFilterSettings()
         if tuned:
             settings = replace(settings, robot_model_type="omni")  # this model also covers a differential base
@@ -162,7 +166,7 @@ def prepare(options: EstimatorOptions) -> Factory:
     return make
 
 
-def _precise(options: EstimatorOptions, world: World) -> Factory:
+def _prepare_precise(options: EstimatorOptions, world: World) -> EstimatorFactory:
     model, seeds, card = load_model(options, world)
     calibration = card.calibration if card else None
     settings = calibration.settings() if calibration else PreciseSettings(inflation=card.inflation if card else 1.0)
@@ -170,7 +174,7 @@ def _precise(options: EstimatorOptions, world: World) -> Factory:
     bounds = (card.world if card else world).bounds
     _compile(model, seeds)
 
-    def make(geometry: Geometry) -> PoseEstimator:
+    def make(geometry: ScannerGeometry) -> PoseEstimator:
         if card:
             check_mount(geometry, card.scanner)
         if options.likelihood is not None:
@@ -208,13 +212,14 @@ def field_path(options: EstimatorOptions, world: World) -> Path:
     if not path.exists():
         command = weights.train_command(options.world_argument, path.parent)
         raise UserError(
-            f"--model {path}: there is no such file. Train it with: {command}; or use --model exact, which needs none"
+            f"--model {path}: there is no such file. Train it with: {command}; or use --model exact, which needs no "
+            "weights"
         )
     return path
 
 
 def check_options(options: EstimatorOptions, world: World) -> None:
-    """Raises UserError if a model is missing, as `prepare` does, but without compiling anything."""
+    """Raises UserError if a model is missing, as `prepare_factory` does, but without compiling anything."""
     check_start(options, world)
     if options.estimator == "precise" and options.model != "exact":
         weights.load(field_path(options, world))
@@ -237,14 +242,14 @@ def check_start(options: EstimatorOptions, world: World) -> None:
         )
 
 
-def check_mount(geometry: Geometry, trained: Scanner) -> None:
+def check_mount(geometry: ScannerGeometry, trained: Scanner) -> None:
     """Raises UserError if the mount is only assumed, and the weights were ``trained`` with another mount.
 
     A mount that is stated may differ, because a distance field predicts scans for any mount.
     """
-    off = geometry.mount - np.array(trained.mount)
-    off[2] = se2.wrap(off[2])
-    if geometry.mount_assumed and np.abs(off).max() > MOUNT_TOLERANCE:
+    difference = geometry.mount - np.array(trained.mount)
+    difference[2] = se2.wrap(difference[2])
+    if geometry.mount_assumed and np.abs(difference).max() > MOUNT_TOLERANCE:
         assumed, stated = (f"{x:g},{y:g},{np.rad2deg(yaw):g}" for x, y, yaw in (geometry.mount, trained.mount))
         raise UserError(
             f"the scans do not state where the laser sits in base_link: {assumed} was assumed, but the weights were "
@@ -254,17 +259,17 @@ def check_mount(geometry: Geometry, trained: Scanner) -> None:
 
 
 def _compile(model: GenerativeModel, seeds: Seeds) -> None:
-    """Lets an estimator search and track, so that every loop is compiled and no scan has to wait for compilation."""
+    """Runs an estimator on a few scans, so that all numba functions are compiled before the first real scan."""
     estimator = PreciseEstimator(model, Seeds(seeds.places[:4], seeds.panoramas[:4]), np.zeros(3))
     angles, beam = np.linspace(-1, 1, 32), np.arange(32)
     ranges = estimator.predict(np.array([[*seeds.places[0], 0.0]]), angles).ranges[0]
     ranges[7] = np.inf
-    for stamp, moved in enumerate((0.0, 0.01, 1.0)):  # in the last scan, something stands in the way
+    for stamp, moved in enumerate((0.0, 0.01, 1.0)):  # in the last scan, an obstacle is 1 m before the walls
         estimator.update(Observation(ranges - moved * (beam % 16 < 5), angles, 25.0, 0.07 * stamp))
 
 
 @explain_missing_packages()
-def _paper(options: EstimatorOptions, world: World) -> Factory:
+def _prepare_paper(options: EstimatorOptions, world: World) -> EstimatorFactory:
     # Imported only here, because torch takes a second to import and the other estimators do not need it.
     from services.estimator.paper import weights as paper_weights
     from services.estimator.paper.beam_fitting import fit
@@ -284,8 +289,8 @@ def _paper(options: EstimatorOptions, world: World) -> Factory:
         model.predict(np.array([*card.world.center(), card.heading]))
     load = functools.cache(paper_weights.load)  # all estimators share one network
 
-    def make(geometry: Geometry) -> PoseEstimator:
-        model, card = load(paper_weights.nearest(folder, world.name, "paper", len(geometry.angles)))
+    def make(geometry: ScannerGeometry) -> PoseEstimator:
+        model, card = load(paper_weights.nearest(folder, world.name, len(geometry.angles)))
         check_mount(geometry, card.scanner)
         converted = fit(card.scanner, geometry.angles, geometry.mount, f"{train_command} {_train_options(geometry)}")
         return PaperEstimator(model, card, options.descent, options.initial_pose, converted)
@@ -312,7 +317,7 @@ def _paper_weights(options: EstimatorOptions, world: World) -> tuple[Path, dict[
     return folder, files, remedy
 
 
-def _train_options(geometry: Geometry) -> str:
+def _train_options(geometry: ScannerGeometry) -> str:
     """Options of `presage train` for the scanner of these scans."""
     beams, (x, y, yaw) = len(geometry.angles), geometry.mount
     matching = (

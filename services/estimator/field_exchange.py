@@ -1,4 +1,4 @@
-"""Messages of the field that was learned while driving: split into parts, and joined again."""
+"""Splits a field that was learned while driving into messages, and joins the messages again."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def split_into_messages(data: bytes, version: int, base: str, stamp_ns: int) -> 
 
 
 class FieldAssembler:
-    """Joins the parts of one version after another."""
+    """Joins the parts of a version; the parts of the next version replace them."""
 
     def __init__(self) -> None:
         self._parts: list[LearnedField] = []
 
     def add(self, message: LearnedField) -> bytes | None:
-        """Returns the encoded field if the message is its last part, and none is missing."""
+        """Adds a part; returns the encoded field if this was its last part and none is missing, else None."""
         if message.part == 0:
             self._parts = []
         self._parts.append(message)

@@ -1,4 +1,4 @@
-"""Learns the field while driving, in a process of its own, so that tracking is not slowed."""
+"""Learns the field while driving, in a separate process, so that learning does not slow down tracking."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from services.estimator.precise.learning.live_learning import ModelVersion, lear
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
-    from services.estimator.factory import Geometry
+    from services.estimator.factory import ScannerGeometry
     from services.estimator.precise.estimator import PreciseEstimator
     from services.estimator.precise.learning.calibration import ReferenceDrive
     from services.estimator.shared.generative_models import GenerativeModel
     from services.estimator.shared.interface import Observation, Posterior
 
-NICENESS = 10  # of the process that learns: the other services come first, but it never starves
+NICENESS = 10  # of the learning process: other services get the processor first, but learning still goes on
 
 
 @dataclass(frozen=True)
 class EncodedVersion:
-    """A version of the model, and the bytes from which another process decodes the same."""
+    """A version of the model, and its encoding, from which another process decodes the same model."""
 
     version: ModelVersion
     data: bytes
@@ -37,7 +37,7 @@ class EncodedVersion:
 class Learner:
     """Collects key scans, and learns a version of the model whenever enough of them are new."""
 
-    def __init__(self, estimator: PreciseEstimator, geometry: Geometry) -> None:
+    def __init__(self, estimator: PreciseEstimator, geometry: ScannerGeometry) -> None:
         """The model of the ``estimator`` is the original one."""
         self.keys = KeyScanCollector(geometry.angles, geometry.mount, geometry.range_max)
         self._original, self._places = estimator.model, estimator.seeds.places
@@ -53,14 +53,14 @@ class Learner:
             self._running = self._pool.submit(self._learn, present, drive)
 
     def take(self) -> EncodedVersion | None:
-        """The version that was learned since the last call, if any; raises RuntimeError if learning failed."""
+        """Returns the version that was learned since the last call, or None; raises RuntimeError if learning failed."""
         if self._running is None or not self._running.done():
             return None
         done, self._running = self._running, None
         return done.result()
 
     def close(self) -> None:
-        """Ends the process."""
+        """Terminates the learning process."""
         self._closed = True
         self._pool.shutdown(wait=False, cancel_futures=True)
         if (process := self._process) is not None:

@@ -14,7 +14,7 @@ from common.errors import UserError
 from common.geometry.world import World, load_world
 from common.messages.requests import FILE_NAME, ModelReply
 from common.versions import commit, versions
-from services.estimator.factory import EstimatorOptions, Geometry, field_path
+from services.estimator.factory import EstimatorOptions, ScannerGeometry, field_path
 from services.estimator.precise.learning import weights as precise_weights
 from services.estimator.precise.learning.drive_learning import HELD_OUT_EVERY
 from services.estimator.precise.learning.live_learning import RECIPE, ModelVersion
@@ -68,12 +68,14 @@ def model_in_use(options: EstimatorOptions, beams: int | None) -> ModelInUse:
         # Imported only here, because torch takes a second to import and the other estimators do not need it.
         from services.estimator.paper import weights as paper_weights
 
-        path = paper_weights.nearest(options.models or find_folder(world.name, "paper"), world.name, "paper", beams)
+        path = paper_weights.nearest(options.models or find_folder(world.name, "paper"), world.name, beams)
         return _learned(options.estimator, world, path, path.name)
     return ModelInUse(options.estimator, world)
 
 
-def save_learned(folder: Path, name: str, original: ModelInUse, version: ModelVersion, geometry: Geometry) -> Path:
+def save_learned(
+    folder: Path, name: str, original: ModelInUse, version: ModelVersion, geometry: ScannerGeometry
+) -> Path:
     """Writes a version of the model that was learned while driving; returns its path. Raises UserError if that fails.
 
     Its calibration is that of the original model, if that has one.

@@ -18,7 +18,7 @@ from common.messages.topics import SCAN
 from common.runtime.runnable import Runnable
 from common.runtime.service import Service
 from common.runtime.service_loop import Loop
-from services.estimator.service import EstimatorService, Models
+from services.estimator.service import EstimatorService, SharedModels
 from services.estimator.settings import ROBOT_NAME, EstimatorSettings
 from services.estimator.shared.interface import SearchingEstimator
 
@@ -31,9 +31,8 @@ DISCOVERY_PERIOD_S = 0.5  # between two checks for new and absent robots
 HEALTH_CHECK_PERIOD_S = 0.05  # between two checks for due health messages
 MAX_MESSAGES_PER_TURN = 20  # handled for one robot before the next one
 INBOX_MESSAGES, INBOX_BYTES = 1000, 1 << 24  # of one robot
-THREAD_SWITCH_INTERVAL_S = (
-    5e-4  # a tenth of Python's default, because tracking waits up to this time for the search thread
-)
+# A tenth of Python's default, because tracking may wait this long for the search thread.
+THREAD_SWITCH_INTERVAL_S = 5e-4
 StartSearch = Callable[[Callable[[], "Posterior"]], "Future[Posterior]"]
 
 
@@ -41,7 +40,7 @@ class FleetRobot(EstimatorService):
     """The estimator of one of several robots; its searches run in another thread."""
 
     def __init__(
-        self, settings: EstimatorSettings, robot: str, models: Models, start_search: StartSearch, *, named: bool
+        self, settings: EstimatorSettings, robot: str, models: SharedModels, start_search: StartSearch, *, named: bool
     ) -> None:
         """``settings`` are those of the process; ``start_search`` runs a function in the thread for searches.
 
@@ -50,8 +49,8 @@ class FleetRobot(EstimatorService):
         super().__init__(settings.model_copy(update={"robot": robot, "robots": ""}), models)
         self.robot, self.named = robot, named
         self.active = False  # if false, another process serves this robot, and this one stands by
-        self.last_seen = time.monotonic()
-        self.scans = 0  # received when it was last seen
+        self.last_seen = time.monotonic()  # when scans or a simulator of this robot were last seen
+        self.scans_at_last_check = 0  # number of scans received until the last check
         self.log = logger(self.name).bind(robot=robot)
         self.search: Future[Posterior] | None = None  # while it exists, no further message is handled
         self._start_search = start_search
@@ -100,14 +99,14 @@ class FleetService(Service):
             raise UserError("--initial-pose is for one robot: with --robots, set each pose with `presage relocalise`")
 
     def make_loop(self, bus: Bus) -> Runnable:
-        """See Service."""
+        """Creates the loop that serves all robots; see Service."""
         return FleetLoop(self.settings, bus)
 
 
 def key_expression(pattern: str) -> str:
-    """Zenoh's expression for a pattern of names; it matches the same names or more."""
-    written = re.sub(r"[*?]+", "$*", pattern)
-    return "*" if written == "$*" else written
+    """Zenoh's key expression for a pattern of names; it matches at least the names that the pattern matches."""
+    expression = re.sub(r"[*?]+", "$*", pattern)
+    return "*" if expression == "$*" else expression
 
 
 class FleetLoop:
@@ -134,7 +133,7 @@ class FleetLoop:
     def run(self) -> None:
         """Runs until `stop` is called."""
         sys.setswitchinterval(THREAD_SWITCH_INTERVAL_S)
-        self.models = Models(self.settings)
+        self.models = SharedModels(self.settings)
         for name in self.names:
             self._add(name, named=True)
         self.bus.watch_robots(self._note_liveliness)
@@ -160,7 +159,7 @@ class FleetLoop:
             self._next_health_check = now + HEALTH_CHECK_PERIOD_S
             for robot in self._robots.values():
                 if robot.active:
-                    robot.loop.pulse()
+                    robot.loop.publish_health_if_due()
         if now >= self._next_discovery:
             self._next_discovery = now + DISCOVERY_PERIOD_S
             self._add_found_robots()
@@ -176,7 +175,7 @@ class FleetLoop:
                 if not robot.has_work():
                     return
                 if robot.search is not None:
-                    robot.loop.guard(robot.publish_search)
+                    robot.loop.run_guarded(robot.publish_search)
                 else:
                     robot.loop.handle(robot.loop.inbox.get(0))
         except UserError as error:  # concerns this robot only
@@ -222,8 +221,8 @@ class FleetLoop:
             if not robot.active:
                 robot.active = robot.loop.try_start()
             scans = robot.loop.inbox.received[SCAN.key(name)]
-            if scans != robot.scans or (name, "simulator") in self._alive:
-                robot.scans, robot.last_seen = scans, now
+            if scans != robot.scans_at_last_check or (name, "simulator") in self._alive:
+                robot.scans_at_last_check, robot.last_seen = scans, now
             elif now - robot.last_seen > self.settings.forget:
                 if robot.estimator is not None or not robot.named:
                     self.log.info("robot forgotten", robot=name, seconds=self.settings.forget)

@@ -10,9 +10,9 @@ from common.errors import UserError
 from common.geometry.pose_text import start_of_text
 from common.messages.definitions import (
     Belief,
+    BeliefHypothesis,
     CmdVel,
     Goal,
-    Hypothesis,
     LearnedField,
     Odom,
     Pose,
@@ -49,7 +49,7 @@ from common.messages.topics import (
 from common.robot.ranges import ranges_for_localisation
 from common.runtime.odometry_sync import OdometrySync, ScanWithOdometry
 from common.runtime.service import Service
-from services.estimator.factory import EstimatorOptions, Factory, Geometry, prepare
+from services.estimator.factory import EstimatorFactory, EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.field_exchange import FieldAssembler, split_into_messages
 from services.estimator.learner import EncodedVersion, Learner
 from services.estimator.model_card import ModelInUse, model_in_use, save_learned
@@ -61,7 +61,9 @@ from services.estimator.prediction_query import answer_prediction
 from services.estimator.settings import EstimatorSettings
 from services.estimator.shared.interface import Observation, PoseEstimator, Posterior
 
-FIELD_PERIOD_NS = 30_000_000_000  # after which the learned field is published again, for recordings that begin later
+FIELD_PERIOD_NS = (
+    30_000_000_000  # the learned field is published again after this time, for recordings that begin later
+)
 
 
 def estimator_options(settings: EstimatorSettings) -> EstimatorOptions:
@@ -78,17 +80,17 @@ def estimator_options(settings: EstimatorSettings) -> EstimatorOptions:
     )
 
 
-class Models:
-    """World and weights, loaded once for all robots of a process."""
+class SharedModels:
+    """World and weights, which are loaded once for all robots of a process."""
 
     def __init__(self, settings: EstimatorSettings) -> None:
         """Raises UserError if there are no weights for the world."""
         self.options = estimator_options(settings)
-        self.factory: Factory = prepare(self.options)
+        self.factory: EstimatorFactory = prepare_factory(self.options)
         self._described: dict[int | None, ModelInUse | str] = {}
 
     def describe(self, beams: int | None) -> ModelInUse | str:
-        """Describes the model for scans of ``beams`` beams, or returns the reason why it is unknown. Cached."""
+        """Returns the description of the model for scans of ``beams`` beams, or the reason why it is unknown."""
         if beams not in self._described:
             try:
                 self._described[beams] = model_in_use(self.options, beams)
@@ -107,17 +109,17 @@ class EstimatorService(Service):
     inputs: ClassVar[tuple[Topic, ...]] = (SCAN, GOAL)
     queries: ClassVar[tuple[Query, ...]] = (LOCALISE, MODEL, PREDICT, SAVE_MODEL)
 
-    def __init__(self, settings: EstimatorSettings, models: Models | None = None) -> None:
+    def __init__(self, settings: EstimatorSettings, models: SharedModels | None = None) -> None:
         """``models`` are shared by several robots; by default they are loaded in `open`.
 
         The estimator is built at the first scan, for the geometry of that scan.
         """
         super().__init__(settings)
         motion_inputs = {"odometry": (ODOM,), "command": (CMD_VEL,)}.get(settings.prior, ())
-        followed = (FIELD,) if settings.learn == "follow" else ()
-        self.inputs = (SCAN, GOAL, *motion_inputs, *followed)  # type: ignore[misc]
+        field_inputs = (FIELD,) if settings.learn == "follow" else ()
+        self.inputs = (SCAN, GOAL, *motion_inputs, *field_inputs)  # type: ignore[misc]
         self.models = models
-        self.geometry: Geometry | None = None
+        self.geometry: ScannerGeometry | None = None
         self.estimator: PoseEstimator | None = None
         self.model: ModelInUse | str = "no scan has come yet"  # or the reason why it is unknown
         self.goal: Goal | None = None
@@ -126,8 +128,8 @@ class EstimatorService(Service):
         self.last: tuple[int, Belief, Prediction] | None = None  # stamp in ns and results of the latest scan
         self.field_version = 0  # of the field learned while driving; 0 is the original model
         self._learner: Learner | None = None
-        self._learned: EncodedVersion | None = None  # in use
-        self._field_ns = 0  # stamp with which it was published last
+        self._learned: EncodedVersion | None = None  # the learned version in use
+        self._field_published_ns = 0  # stamp with which the learned version was published last
         self._assembler = FieldAssembler()
 
     def open(self) -> None:
@@ -137,7 +139,7 @@ class EstimatorService(Service):
             raise UserError(f"--learn {settings.learn}: only estimator precise learns, not {settings.estimator}")
         if self.models is None:
             self.log.info("loading the world", world=settings.world)
-            self.models = Models(settings)
+            self.models = SharedModels(settings)
         self.model = self.models.describe(None)
         self.log.info("estimator", name=settings.estimator, world=settings.world, prior=settings.prior)
 
@@ -192,15 +194,15 @@ class EstimatorService(Service):
         if self._learner is not None and isinstance(estimator, PreciseEstimator):
             self._learner.add(posterior, observation, estimator.model)
             if posterior.state == "tracking":
-                self._use_what_was_learned(self._learner, estimator, scan.stamp_ns)
-            if self._learned is not None and not 0 <= scan.stamp_ns - self._field_ns < FIELD_PERIOD_NS:
+                self._use_learned_version(self._learner, estimator, scan.stamp_ns)
+            if self._learned is not None and not 0 <= scan.stamp_ns - self._field_published_ns < FIELD_PERIOD_NS:
                 self._publish_field(self._learned, scan.stamp_ns)
             self.counters["field_version"] = self.field_version
             self.counters["key_scans"] = len(self._learner.keys)
             self.counters["key_scans_dropped"] = self._learner.keys.dropped_total
 
-    def _use_what_was_learned(self, learner: Learner, estimator: PreciseEstimator, stamp_ns: int) -> None:
-        """Uses a version that was learned from now on, and publishes it."""
+    def _use_learned_version(self, learner: Learner, estimator: PreciseEstimator, stamp_ns: int) -> None:
+        """Switches to a newly learned version of the model, if there is one, and publishes it."""
         if (learned := learner.take()) is None:
             return
         estimator.use_model(learned.version.model, learned.version.seeds)
@@ -215,7 +217,7 @@ class EstimatorService(Service):
         self._publish_field(learned, stamp_ns)
 
     def _publish_field(self, learned: EncodedVersion, stamp_ns: int) -> None:
-        self._field_ns = stamp_ns
+        self._field_published_ns = stamp_ns
         for message in split_into_messages(learned.data, self.field_version, self._base(), stamp_ns):
             self.publish(FIELD, message)
 
@@ -263,7 +265,7 @@ class EstimatorService(Service):
         If there is no model for the scanner, logs the reason, puts it into the health note, and returns None.
         """
         assert self.models is not None  # noqa: S101 - set in open
-        geometry = Geometry.of_scan(scan)
+        geometry = ScannerGeometry.of_scan(scan)
         try:
             paper = self.settings.estimator == "paper"
             if self.geometry is None or not self.geometry.same(geometry, bound_to_beams=paper):
@@ -283,7 +285,7 @@ class EstimatorService(Service):
         self.note = ""
         return self.estimator
 
-    def _start_learning(self, geometry: Geometry) -> None:
+    def _start_learning(self, geometry: ScannerGeometry) -> None:
         """Starts to learn with the original model, if the settings say so."""
         self.close()
         self.field_version, self._learned = 0, None
@@ -315,7 +317,7 @@ def belief_message(scan: Scan, posterior: Posterior, estimator: str, field_versi
         pose=Pose.of(posterior.pose),
         covariance=posterior.covariance,
         hypotheses=[
-            Hypothesis(pose=Pose.of(each.pose), covariance=each.covariance, weight=each.weight)
+            BeliefHypothesis(pose=Pose.of(each.pose), covariance=each.covariance, weight=each.weight)
             for each in posterior.hypotheses
         ],
         xi=posterior.xi.astype(np.float32),

@@ -21,10 +21,10 @@ class EstimatorSettings(ServiceSettings):
     Examples:
       python -m services.estimator                                    preset precise in the corridor
       python -m services.estimator --estimator particle-filter        another estimator, on the same topics
-      python -m services.estimator --world office --model exact       cast rays in the world itself, without learning
+      python -m services.estimator --world office --model exact       casts rays in the world itself, without learning
       python -m services.estimator --world my.yaml --models trained   your world, with weights from folder trained
-      python -m services.estimator --world my.yaml --learn refine     improve them while driving
-      python -m services.estimator --initial-pose 3,1.5,90            start from a known pose (m, m, deg)
+      python -m services.estimator --world my.yaml --learn refine     improves these weights while driving
+      python -m services.estimator --initial-pose 3,1.5,90            starts from a known pose (m, m, deg)
       python -m services.estimator --robots robot-1,robot-2           one process for several robots
       python -m services.estimator --robots 'robot-*' --max-robots 20 one process for every such robot, at most 20
       PRESAGE_ESTIMATOR=paper python -m services.estimator --print-config

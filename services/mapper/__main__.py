@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from common.runtime.service import Service
 
 
-def make(settings: MapperSettings) -> Service:
+def build_service(settings: MapperSettings) -> Service:
     """Builds the service; imports numba only here, so that --help is fast."""
     from services.mapper.service import MapperService
 
@@ -23,4 +23,4 @@ def make(settings: MapperSettings) -> Service:
 
 
 if __name__ == "__main__":
-    main(MapperSettings, make)
+    main(MapperSettings, build_service)

@@ -13,7 +13,7 @@ from common.errors import UserError
 from common.geometry.ros_map_writer import write_grid
 from common.geometry.tum import write_tum
 from common.geometry.world import known_worlds
-from common.messages.definitions import Belief, Hypothesis, Map, Odom, Pose, Scan, Stamped
+from common.messages.definitions import Belief, BeliefHypothesis, Map, Odom, Pose, Scan, Stamped
 from common.messages.requests import FILE_NAME, Reply, Request, SaveMapReply, SaveMapRequest
 from common.messages.topics import BELIEF, MAP, ODOM, SAVE_MAP, SCAN, Query, Topic
 from common.robot.motion_distortion import evenly_spaced
@@ -29,7 +29,7 @@ from services.mapper.slam.mapper import Mapper, MapSnapshot
 from services.mapper.slam.search import search
 
 UPDATE_PERIOD_NS = 1_000_000_000  # between the beginnings of two updates of the map, which leaves time for the scans
-REPEAT_PERIOD_NS = 5_000_000_000  # an unchanged map is published again after this time, for subscribers that came later
+REPEAT_PERIOD_NS = 5_000_000_000  # an unchanged map is published again after this time, for later subscribers
 
 
 class MapperService(Service):
@@ -61,7 +61,7 @@ class MapperService(Service):
         search(wall, wall, np.zeros(3), np.full(3, 0.1))
 
     def close(self) -> None:
-        """Waits for the present update."""
+        """Waits for the running update."""
         self._pool.shutdown(cancel_futures=True)
 
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
@@ -115,7 +115,7 @@ class MapperService(Service):
         return 0.0 if self._update is not None and self._update.done() else None
 
     def on_timer(self) -> None:
-        """Takes the updated map into use, and publishes it."""
+        """Replaces the map by the updated one, and publishes it."""
         self._finish_update()
 
     def _finish_update(self) -> None:
@@ -172,7 +172,7 @@ def belief_message(scan: Scan, scan_pose: ScanPose) -> Belief:
         state="tracking" if scan_pose.matched else "lost",
         pose=pose,
         covariance=covariance,
-        hypotheses=[Hypothesis(pose=pose, covariance=covariance, weight=1.0)],
+        hypotheses=[BeliefHypothesis(pose=pose, covariance=covariance, weight=1.0)],
         estimator="mapper",
     )
 

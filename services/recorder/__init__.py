@@ -1,1 +1,1 @@
-"""Every message into MCAP, and back onto the bus."""
+"""Records all messages in MCAP files, and replays them."""

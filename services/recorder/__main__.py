@@ -11,12 +11,12 @@ if TYPE_CHECKING:
     from common.runtime.service import Service
 
 
-def make(settings: RecorderSettings) -> Service:
-    """Returns the service. Imports mcap only here, so that --help answers at once."""
+def build_service(settings: RecorderSettings) -> Service:
+    """Builds the service; imports mcap only here, so that --help is fast."""
     from services.recorder.service import RecorderService
 
     return RecorderService(settings)
 
 
 if __name__ == "__main__":
-    main(RecorderSettings, make)
+    main(RecorderSettings, build_service)

@@ -87,7 +87,9 @@ class Recording:
         """
         try:
             with self.path.open("rb") as stream:
-                for channel, message in (self._indexed if self.indexed else self._torn)(stream, keys, start_ns, end_ns):
+                for channel, message in (self._read_indexed if self.indexed else self._read_unindexed)(
+                    stream, keys, start_ns, end_ns
+                ):
                     yield RawMessage(channel.topic, message.data, message.publish_time, message.log_time)
         except OSError as error:
             raise _unreadable(self.path, error) from None
@@ -152,7 +154,7 @@ class Recording:
                 for _ in _records(self, stream, chunks=False):
                     pass
 
-    def _indexed(
+    def _read_indexed(
         self, stream: BinaryIO, keys: Collection[str] | None, start_ns: int | None, end_ns: int | None
     ) -> Iterator[tuple[Channel, McapMessage]]:
         try:
@@ -163,7 +165,7 @@ class Recording:
         except Exception as error:  # noqa: BLE001 - each decompressor raises its own error types
             self.problem = f"damaged: {error}"
 
-    def _torn(
+    def _read_unindexed(
         self, stream: BinaryIO, keys: Collection[str] | None, start_ns: int | None, end_ns: int | None
     ) -> Iterator[tuple[Channel, McapMessage]]:
         channels: dict[int, Channel] = {}

@@ -35,7 +35,7 @@ class OpenRecording:
         The metadata known so far is written first, so that it is readable even in a file that is never finished.
         """
         self.message_counts = MessageCounts()
-        self._inbox, self._before, self._began = inbox, inbox.tally(), time.monotonic()
+        self._inbox, self._before, self._began = inbox, inbox.handled_counts(), time.monotonic()
         self._logged_ns = 0  # log time of the last message
         limits = PartLimits(int(options.split_size * 1e6), options.split_minutes * 60)
         writer = self.writer = PartsWriter(parts_of(options, numbered=numbered), limits, self._counters)
@@ -69,7 +69,7 @@ class OpenRecording:
 
     def lost(self) -> int:
         """Upper bound of the messages that were queued but are not in the file, after writing failed."""
-        arrived, dropped, oversized = (sum(counts.values()) for counts in self._since(self._inbox.arrivals()))
+        arrived, dropped, oversized = (sum(counts.values()) for counts in self._since(self._inbox.received_counts()))
         return arrived - dropped - oversized - self.writer.saved
 
     def dropped(self) -> int:
@@ -77,7 +77,7 @@ class OpenRecording:
         return sum(count.dropped for count in self._counts().values())
 
     def _counts(self) -> dict[str, KeyCounts]:
-        received, dropped, oversized = self._since(self._inbox.tally())
+        received, dropped, oversized = self._since(self._inbox.handled_counts())
         return self.message_counts.counts(received, dropped, oversized)
 
     def _since(self, now: tuple[Counter[str], ...]) -> list[dict[str, int]]:

@@ -62,7 +62,7 @@ class RecorderService(Service):
         """Writes the sample if a recording is open."""
         if self.recording is None:
             return
-        if self.loop.inbox.counted_as(sample.key) != sample.key:  # there are already MAX_KEYS other keys
+        if self.loop.inbox.counter_name(sample.key) != sample.key:  # there are already MAX_KEYS other keys
             self.loop.inbox.dropped[OTHERS] += 1
             self.counters["turned_away"] += 1
             return

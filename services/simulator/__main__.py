@@ -11,12 +11,12 @@ if TYPE_CHECKING:
     from common.runtime.service import Service
 
 
-def make(settings: SimulatorSettings) -> Service:
-    """Create the service. Imports pybullet only now, so that --help is fast."""
+def build_service(settings: SimulatorSettings) -> Service:
+    """Builds the service; imports pybullet only here, so that --help is fast."""
     from services.simulator.service import SimulatorService
 
     return SimulatorService(settings)
 
 
 if __name__ == "__main__":
-    main(SimulatorSettings, make)
+    main(SimulatorSettings, build_service)

@@ -1,4 +1,4 @@
-"""From commands to the motion of a real base: latency, dead band and wheel slip."""
+"""Actuator model of a base: latency, acceleration limits, dead band and wheel slip."""
 
 from __future__ import annotations
 
@@ -14,29 +14,32 @@ if TYPE_CHECKING:
 
 
 class Actuator:
-    """The motors and wheels. An ideal base, the default, follows every command at once and exactly."""
+    """Motors and wheels. By default the base is ideal: it follows every command at once and exactly."""
 
     def __init__(self, robot: Robot, slip: float, rng: np.random.Generator) -> None:
         """``slip`` is the mean share of its motion that a wheel loses."""
         self.robot, self.slip, self._rng = robot, slip, rng
-        self.velocity = np.zeros(3)  # set at the motors, within the acceleration limits
+        self.velocity = np.zeros(3)  # (3,) set at the motors, within the acceleration limits
         self._target = np.zeros(3)
         self._waiting: list[tuple[float, Array]] = []  # time in s until a target takes effect, and the target
         self._grip = np.ones(3)  # share of its motion that each wheel, or each direction of a holonomic base, keeps
 
     def stop(self) -> None:
-        """The base stands, and forgets all targets."""
+        """Stops the base at once, and discards all targets."""
         self.velocity, self._target, self._waiting = np.zeros(3), np.zeros(3), []
 
     def set_target(self, target: Array, *, at_once: bool) -> None:
-        """Set the target velocity (3,), which takes effect after the latency or ``at_once``. Draws new slip."""
+        """Sets the target velocity (3,), which takes effect after the latency or ``at_once``. Draws new slip."""
         self._waiting = [] if at_once else self._waiting
         self._waiting.append((0.0 if at_once else self.robot.latency, target))
         if self.slip:
             self._grip = 1 - self._rng.uniform(0, 2 * self.slip, 3)
 
     def step(self, dt: float, *, hard: bool = False) -> tuple[Array, Array]:
-        """Velocities (3,) of the wheels and of the base over the next ``dt`` s. With ``hard``, brakes hard."""
+        """Returns the velocities (3,) of the wheels and of the base over the next ``dt`` s.
+
+        With ``hard``, brakes as hard as the base can.
+        """
         while self._waiting and self._waiting[0][0] < dt / 2:
             self._target = self._waiting.pop(0)[1]
         self._waiting = [(wait - dt, target) for wait, target in self._waiting]
@@ -54,6 +57,8 @@ class Actuator:
         """Velocity (3,) of a base whose wheels roll with ``wheels`` (3,) and slip."""
         if self.robot.drive == "holonomic":
             return wheels * self._grip
-        to_wheel = self.robot.radius  # m from the centre to each of the two wheels, at least that on a real base
+        to_wheel = (
+            self.robot.radius
+        )  # m from the centre to each of the two wheels: they are assumed at the edge of the body
         left, right = (wheels[0] + np.array([-1, 1]) * to_wheel * wheels[2]) * self._grip[:2]
         return np.array([(left + right) / 2, 0.0, (right - left) / (2 * to_wheel)])

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Kinematics:
-    """See Physics. The wheels reach every velocity within the limits at once, and do not slip.
+    """Physics without an engine: the wheels reach every velocity within the limits at once, and do not slip.
 
     A step that would bring the robot's body nearer than its radius to a wall, a piece of furniture or a person is not
     taken, but the robot may turn. pybullet's robot slides along the wall instead.

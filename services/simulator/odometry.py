@@ -32,7 +32,7 @@ class Odometer:
         self.pose, self.covariance = np.zeros(3), np.zeros((3, 3))
 
     def move(self, before: Array, after: Array) -> None:
-        """Add the motion between two true poses (3,), with noise."""
+        """Adds the motion between two true poses (3,), with noise."""
         step = se2.between(before, after)
         path, turn = float(np.hypot(step[0], step[1])), abs(float(step[2]))
         drift = self.drift

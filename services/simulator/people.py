@@ -1,6 +1,6 @@
 """Walking people as moving discs.
 
-The model. A person is a disc that walks at a given speed along a shortest path over free space (`WalkableGrid`) to a
+Model. A person is a disc that walks at a given speed along a shortest path over free space (`WalkableGrid`) to a
 random place, then to the next one. A person always knows the positions of all others, also behind walls. The rules:
 
 - A person takes no step that brings them closer to another person than ``PERSON_GAP_M`` between the two bodies.
@@ -15,9 +15,8 @@ each other for ever: each waits for a random time, and a jam ends with the first
 
 Limits. People start and stop within one step, do not talk, sit or form groups, and do not swerve around a person who
 comes towards them: they stop first. The robot's motion is predicted as straight, so a robot in a curve may come closer.
-A robot that drives backwards without seeing is trusted as much as one that sees. A passage narrower than the body,
-margins and the spacing of `WalkableGrid` together is closed to people, and no person starts in an area of less than one
-square metre.
+People do not take into account which way the robot's scanner looks. A passage narrower than the body, margins and the
+spacing of `WalkableGrid` together is closed to people, and no person starts in an area of less than one square metre.
 """
 
 from __future__ import annotations
@@ -34,8 +33,8 @@ from services.simulator.walkable_grid import WalkableGrid, distance_to_segment
 PERSON_RADIUS_M = 0.25
 PERSON_GAP_M = 0.1  # between two people
 ROBOT_GAP_M = 0.1  # between a person who passes and the robot
-LOOK_AHEAD_M = 0.4  # of the path; with ROBOT_GAP_M, people stop half a metre before a robot that stands in their way
-ROBOT_FORESIGHT_S = 1.0  # the robot brakes from 1 m/s within 0.65 m
+LOOK_AHEAD_M = 0.4  # length of the path that must be clear; with ROBOT_GAP_M, people stop 0.5 m before a robot
+ROBOT_FORESIGHT_S = 1.0  # people expect the robot to keep its velocity this long; it brakes from 1 m/s within 0.65 m
 WAIT_RANGE_S = (1.5, 4.0)  # waiting times are drawn from this interval
 MIN_START_DISTANCE_M = 1.5  # between the robot and a place where a person is put
 _LOOK_AHEAD_STEPS = np.linspace(0.0, LOOK_AHEAD_M, 5)
@@ -81,7 +80,7 @@ class People:
         robot_radius: float,
         radius: float = PERSON_RADIUS_M,
     ) -> None:
-        """Put ``count`` people at random free places.
+        """Puts ``count`` people at random free places.
 
         ``speed`` is in m/s, ``robot`` (2,) m its position. Raises UserError if the world has no room for them.
         """
@@ -92,7 +91,7 @@ class People:
         self._walks = [self._standing_at(place) for place in self.places]
 
     def step(self, seconds: float, robot: Array, velocity: Array) -> None:
-        """Move all people, one after another; ``robot`` (2,) m and its ``velocity`` (2,) m/s are in map."""
+        """Moves all people, one after another; ``robot`` (2,) m and its ``velocity`` (2,) m/s are in map."""
         robot_segment = robot, robot + velocity * ROBOT_FORESIGHT_S
         for number in range(len(self.places)):
             self._step(number, seconds, robot_segment)
@@ -141,7 +140,7 @@ class People:
         return _Walk(np.stack([place, place]), max_wait=float(self._rng.uniform(*WAIT_RANGE_S)))
 
     def _start_walk(self, number: int, robot: Array | None) -> _Walk:
-        """Start a new walk if there is a path; returns the walk in effect.
+        """Starts a new walk if there is a path; returns the walk in effect.
 
         With ``robot`` (2,) the path leads around all people and the robot.
         """
@@ -159,7 +158,7 @@ class People:
         return walk
 
     def make_room(self, robot: Array, world: World | None = None) -> None:
-        """Move people who are in the way after the robot was put at ``robot`` (2,) m, or after furniture changed.
+        """Moves people who are in the way after the robot was put at ``robot`` (2,) m, or after furniture changed.
 
         ``world`` is the world with the changed furniture. Raises UserError if there is no room; nothing has changed
         then.

@@ -1,4 +1,4 @@
-"""What the simulation needs from a physics engine, and the choice of one."""
+"""Interface of a physics engine, and the choice of one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.geometry.world import Obstacle
 
-SUBSTEP_S = 1 / 240
+SUBSTEP_S = 1 / 240  # time step of the physics: pybullet's default
 
 Engine = Literal["pybullet", "kinematic"]
 
@@ -24,19 +24,19 @@ class Physics(Protocol):
         """Free what the engine holds."""
 
     def add(self, name: str, obstacle: Obstacle) -> None:
-        """Add a piece of furniture."""
+        """Adds a piece of furniture."""
 
     def remove(self, name: str) -> None:
-        """Remove a piece of furniture."""
+        """Removes a piece of furniture."""
 
     def add_people(self, places: Array, radius: float) -> None:
-        """Add people at ``places`` (K, 2) m as round bodies, which collide with the robot only."""
+        """Adds people at ``places`` (K, 2) m as round bodies, which collide with the robot only."""
 
     def move_people(self, places: Array) -> None:
-        """Put the people at ``places`` (K, 2) m."""
+        """Puts the people at ``places`` (K, 2) m."""
 
     def place(self, pose: Array) -> None:
-        """Put the robot at a pose (3,), with zero velocity."""
+        """Puts the robot at a pose (3,), with zero velocity."""
 
     def pose(self) -> Array:
         """The robot's pose (3,)."""
@@ -47,7 +47,7 @@ class Physics(Protocol):
         ...
 
     def drive(self, twist: Array) -> bool:
-        """Simulate a substep with the motors set to ``twist`` (3,) in base_link; returns whether there was contact."""
+        """Simulates a substep with the motors set to ``twist`` (3,) in base_link; returns whether there was contact."""
         ...
 
     def ranges(self, lasers: Array, angles: Array, reach: float, *, people: bool = True) -> Array:

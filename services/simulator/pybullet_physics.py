@@ -32,10 +32,10 @@ WORLD_GROUP, ROBOT_GROUP, PEOPLE_GROUP = 1, 2, 4
 
 
 class PybulletPhysics:
-    """See Physics. The world's walls, furniture and people are pybullet bodies."""
+    """Physics by pybullet. The world's walls, furniture and people are pybullet bodies."""
 
     def __init__(self, world: World, robot: Robot, pose: Array) -> None:
-        """Build the world and put the robot at ``pose`` (3,). Call `close` at the end."""
+        """Builds the world and puts the robot at ``pose`` (3,). Call `close` at the end."""
         self.client = pybullet.connect(pybullet.DIRECT)
         self.robot = robot
         p = pybullet
@@ -92,11 +92,11 @@ class PybulletPhysics:
             pybullet.resetBasePositionAndOrientation(body, [x, y, 0.0], [0, 0, 0, 1], physicsClientId=self.client)
 
     def _add_ring(self, name: str, ring: Array) -> None:
-        """Add walls along a closed ring (V, 2) m."""
+        """Adds walls along a closed ring (V, 2) m."""
         self.shapes[name] = self._body(self._shape(ring))
 
     def _add_walls(self, segments: Array) -> None:
-        """Add walls along segments (S, 4) x0, y0, x1, y1 m, as a few bodies of walls that are near each other."""
+        """Adds walls along segments (S, 4) x0, y0, x1, y1 m, as a few bodies of walls that are near each other."""
         pieces = _split_ends(segments)
         tile = np.floor((pieces[:, :2] + pieces[:, 2:]) / 2 / TILE_M)
         pieces = pieces[np.lexsort((tile[:, 0], tile[:, 1]))]

@@ -1,4 +1,4 @@
-"""Where the robot was during the last scan period: its states at every substep, interpolated."""
+"""States of the robot during the last scan period, interpolated between the substeps of the physics."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ class RecentMotion:
     """The states of the last ``substeps`` substeps of ``substep_s`` s."""
 
     def __init__(self, pose: Array, substeps: int, substep_s: float) -> None:
-        """The robot stands at ``pose`` (3,)."""
+        """Begins with a robot that has always stood at ``pose`` (3,)."""
         self._ages = substep_s * np.arange(-substeps, 1)
         self._states: deque[Array] = deque(maxlen=substeps + 1)
         self.place(pose)
 
     def place(self, pose: Array) -> None:
-        """The robot was put at ``pose`` (3,), as if it had always stood there."""
+        """Replaces all states by a robot that has always stood at ``pose`` (3,)."""
         self._states.extend([np.concatenate([pose, pose, np.zeros(3)])] * len(self._ages))
 
     def add(self, pose: Array, wheels: Array, twist: Array) -> None:
-        """Add the state (3,), (3,), (3,) after one more substep."""
+        """Adds pose, wheel pose and twist, (3,) each, after one more substep."""
         self._states.append(np.concatenate([pose, wheels, twist]))
 
     @property

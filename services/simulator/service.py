@@ -47,7 +47,7 @@ from services.simulator.settings import SimulatorSettings
 from services.simulator.simulation import Simulation, SimulationSetup
 
 MAX_SAMPLE_RANGES = 4_000_000  # in one reply, 16 MB
-MAX_LAG_S = 1.0  # a simulation farther behind real time does not catch up
+MAX_LAG_S = 1.0  # a simulation that is farther behind real time goes on from there, without catching up
 
 
 class SimulatorService(Service):
@@ -86,7 +86,7 @@ class SimulatorService(Service):
         return self.simulation.period_ns * 1e-9 / self.speed
 
     def open(self) -> None:
-        """Build the world and the robot. Time begins when the required services are running."""
+        """Builds the world and the robot. Time begins when the required services are running."""
         settings = self.settings
         robot = settings.build_robot()
         self.log.info("loading the world", world=settings.world)
@@ -121,7 +121,7 @@ class SimulatorService(Service):
         self._update_clock_factor()
 
     def _update_clock_factor(self) -> None:
-        """Make the command timeout longer if simulated time runs faster than the controller's clock.
+        """Makes the command timeout longer if simulated time runs faster than the controller's clock.
 
         At pace fast, the timeout is as long as the age up to which commands are accepted.
         """
@@ -136,7 +136,7 @@ class SimulatorService(Service):
             self._alive.discard(service)
 
     def close(self) -> None:
-        """End the simulation."""
+        """Ends the simulation."""
         self.simulation.close()
 
     def due(self) -> float | None:
@@ -148,7 +148,7 @@ class SimulatorService(Service):
         return 0.0 if self.settings.pace == "fast" else self._next_step_s - time.monotonic()
 
     def on_timer(self) -> None:
-        """Publish the first scan, or the next one; in lockstep the same scan again."""
+        """Publishes the first scan, or the next one; in lockstep the same scan again."""
         if self._required_services:
             self._required_services = set()
             self._update_note()
@@ -168,7 +168,7 @@ class SimulatorService(Service):
             self._observe()
 
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
-        """Store a command. In lockstep, time advances if it answers the present scan."""
+        """Stores a command. In lockstep, time advances if it answers the present scan."""
         if not isinstance(message, CmdVel):
             return
         if self.lockstep and message.stamp_ns != self.simulation.stamp_ns:
@@ -190,7 +190,7 @@ class SimulatorService(Service):
         self._publish()
 
     def _publish(self) -> None:
-        """Publish odometry and truth before the scan, so that services have them when the scan arrives."""
+        """Publishes odometry and truth before the scan, so that services have them when the scan arrives."""
         assert self._published is not None  # noqa: S101 - set by all callers
         for topic, message in zip((ODOM, TRUTH, SCAN), self._published, strict=True):
             self.publish(topic, message)
@@ -236,14 +236,14 @@ class SimulatorService(Service):
         self._next_step_s = time.monotonic()
 
     def _update_note(self) -> None:
-        """Set the note shown in health: whether and how fast time runs."""
+        """Sets the note shown in health: whether and how fast time runs."""
         waits = f"waits for {', '.join(sorted(self._required_services))}" if self._required_services else ""
         speed = f"runs at {self.speed:g} x real time" if self.speed != 1 else ""
         self.note = "paused" if self.paused else waits or speed
         self.idle = self.paused or bool(waits)
 
     def _step(self) -> Reply:
-        """Advance by one scan while paused. In lockstep the present scan must have its command first."""
+        """Advances by one scan while paused. In lockstep, the present scan must have been answered by a command."""
         if not self.paused:
             return Reply(ok=False, reason="time runs: pause first, then step")
         if self._required_services:
@@ -258,7 +258,7 @@ class SimulatorService(Service):
         return Reply()
 
     def _set_speed(self, factor: float) -> Reply:
-        """Set the speed relative to real time."""
+        """Sets the speed relative to real time."""
         if self.settings.pace != "realtime":
             reason = "each scan waits for its command" if self.lockstep else "it goes as fast as it can"
             return Reply(ok=False, reason=f"the pace is {self.settings.pace}: {reason}; a speed needs --pace realtime")

@@ -31,7 +31,7 @@ SAMPLE_BLOCK_POSES = 200  # poses whose scans are simulated together
 
 @dataclass(frozen=True)
 class SimulationSetup:
-    """Everything that a run depends on, besides the commands."""
+    """Parameters of a simulation. Together with the commands they determine a run."""
 
     world: World
     scanner: Scanner
@@ -48,14 +48,14 @@ class SimulationSetup:
 
 
 class Simulation:
-    """The simulated robot. The same setup and commands give the same bytes.
+    """The simulated robot. The same setup and commands give exactly the same measurements.
 
     With `SimulationSetup.sweep`, a scan is published when its last beam has been measured, with the stamp of its first
     beam: the physics is ahead of the stamp by the time of a sweep, and a command takes effect as much later.
     """
 
     def __init__(self, setup: SimulationSetup) -> None:
-        """Begin at time 0. Raises UserError if the robot would stand in a wall, or the people have no room."""
+        """Begins at time 0. Raises UserError if the robot would stand in a wall, or the people have no room."""
         self.setup, self.world = setup, _name_obstacles(setup.world)
         robot, scanner = setup.robot, setup.scanner
         pose = np.array(setup.start) if setup.start is not None else self.world.start_pose(robot.radius)
@@ -111,7 +111,7 @@ class Simulation:
         return self._command is not None and self._command[0] == self.stamp_ns
 
     def command(self, stamp_ns: int, twist: Twist) -> bool:
-        """Store a command. Returns False if its stamp is in the future, too old, or older than the latest command's."""
+        """Stores a command; returns False if its stamp is in the future, too old, or older than that of the latest."""
         age_ns, latest_ns = self.stamp_ns - stamp_ns, -1 if self._command is None else self._command[0]
         if age_ns < 0 or age_ns > self.setup.robot.command_age * 1e9 or stamp_ns < latest_ns:
             return False
@@ -121,7 +121,7 @@ class Simulation:
         return True
 
     def advance(self) -> None:
-        """Simulate one scan period."""
+        """Simulates one scan period."""
         silence_s = (self.steps - self._last_command_step) * self.period_ns * 1e-9
         timed_out = silence_s >= self.setup.robot.command_timeout * self.clock_factor
         target = np.zeros(3) if timed_out else self._target_velocity()
@@ -146,7 +146,7 @@ class Simulation:
         return MotionState(state.pose[0], state.wheels[0], state.twist[0])
 
     def _move_people(self, pose: Array) -> None:
-        """Move the people by one scan period; the robot is at ``pose`` (3,)."""
+        """Moves the people by one scan period; the robot is at ``pose`` (3,)."""
         if self.people is not None:
             velocity = se2.rotate(float(pose[2]), self.physics.twist()[:2])
             self.people.step(self.period_ns * 1e-9, pose[:2], velocity)
@@ -256,7 +256,7 @@ class Simulation:
         return self.world.placement_error(pose, self.setup.robot.radius)
 
     def teleport(self, pose: Array) -> None:
-        """Put the robot at a pose (3,), at rest. Odometry does not change, and people make room.
+        """Puts the robot at a pose (3,), at rest. Odometry does not change, and people make room.
 
         Raises UserError if the robot cannot stand there.
         """
@@ -278,7 +278,7 @@ class Simulation:
             self.physics.move_people(self.people.places)
 
     def change_obstacle(self, action: str, name: str, obstacle: Obstacle | None) -> None:
-        """Add, move or remove a piece of furniture. Raises UserError if that is not possible."""
+        """Adds, moves or removes a piece of furniture. Raises UserError if that is not possible."""
         known = {o.name: o for o in self.world.obstacles}
         if (name in known) == (action == "add"):
             there = ", ".join(known) or "none"
@@ -316,7 +316,7 @@ def _reach(scanner: Scanner) -> float:
 
 
 def _create_physics(engine: Engine, world: World, robot: Robot, pose: Array) -> Physics:
-    """Build the boundary or the map of ``world`` without its furniture, and put the robot at ``pose`` (3,)."""
+    """Builds the boundary or the map of ``world`` without its furniture, and puts the robot at ``pose`` (3,)."""
     if engine == "kinematic":
         from services.simulator.kinematics import Kinematics  # slow: numba
 

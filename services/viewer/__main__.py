@@ -11,12 +11,12 @@ if TYPE_CHECKING:
     from common.runtime.service import Service
 
 
-def make(settings: ViewerSettings) -> Service:
-    """Returns the service. Imports the web server only here, so that --help answers at once."""
+def build_service(settings: ViewerSettings) -> Service:
+    """Builds the service; imports the web server only here, so that --help is fast."""
     from services.viewer.service import ViewerService
 
     return ViewerService(settings)
 
 
 if __name__ == "__main__":
-    main(ViewerSettings, make)
+    main(ViewerSettings, build_service)

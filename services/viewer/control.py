@@ -1,7 +1,7 @@
 """Goals, teleports, obstacles and driving over the bus.
 
 Every action returns an `ActionResult`. An action that cannot be carried out raises UserError with the reason, which
-`RobotControl.do` turns into a result.
+`RobotControl.carry_out` turns into a result.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class RobotControl:
             requests.SaveMap: self._save_map,
         }
 
-    def do(self, robot: str, action: requests.Action) -> ActionResult:
+    def carry_out(self, robot: str, action: requests.Action) -> ActionResult:
         """Carries out an action. Returns the reason if that fails; does not raise UserError."""
         if "replay" in self._roster.services(robot):
             return ActionResult(ok=False, reason="this is a recording: choose the live robot to act on it")
@@ -122,14 +122,14 @@ class RobotControl:
             start = start_command(service, robot, self._connect)
             raise UserError(f"the {service} is not running; start it with: {start}")
 
-    def _check_subscriber(self, robot: str, topic: Topic, service: str) -> None:
-        """Waits until the service has subscribed to the topic. Raises UserError if it does not."""
-        self._check_running(robot, service)
+    def _check_controller(self, robot: str, topic: Topic) -> None:
+        """Waits until the controller has subscribed to the topic. Raises UserError if it does not."""
+        self._check_running(robot, "controller")
         if not self._bus.wait_matching(topic, SUBSCRIBER_TIMEOUT_S, key=topic.key(robot)):
-            raise UserError(f"the {service} does not listen to {topic.name}: is it of this version?")
+            raise UserError(f"the controller does not listen to {topic.name}: is it of this version?")
 
     def _goal(self, robot: str, action: requests.GoTo) -> ActionResult:
-        self._check_subscriber(robot, GOAL, "controller")
+        self._check_controller(robot, GOAL)
         # Numbered by the time, so that the controller's status can be matched to this goal among those of others.
         goal = Goal(
             stamp_ns=self._lookup.stamp_ns(robot),
@@ -147,7 +147,7 @@ class RobotControl:
         return ActionResult(ok=True, reason=f"going to ({action.x:.2f}, {action.y:.2f})")
 
     def _explore(self, robot: str, _action: requests.Explore) -> ActionResult:
-        self._check_subscriber(robot, GOAL, "controller")
+        self._check_controller(robot, GOAL)
         stamp_ns, seq = self._lookup.stamp_ns(robot), time.time_ns()
         goal = Goal(stamp_ns=stamp_ns, seq=seq, pose=Pose(x=0.0, y=0.0), explore=True)
         self._bus.put(GOAL, goal.encode(), key=GOAL.key(robot))
@@ -161,7 +161,7 @@ class RobotControl:
         return ActionResult(ok=True, reason="exploring until nothing is left to see; goals take precedence")
 
     def _cancel(self, robot: str, _action: requests.Cancel) -> ActionResult:
-        self._check_subscriber(robot, GOAL, "controller")
+        self._check_controller(robot, GOAL)
         goal = Goal(stamp_ns=self._lookup.stamp_ns(robot), seq=time.time_ns(), pose=Pose(x=0.0, y=0.0), cancel=True)
         self._bus.put(GOAL, goal.encode(), key=GOAL.key(robot))
         if self._wait_for_status(robot, lambda status: status.goal is None and status.exploration is None) is None:
@@ -220,7 +220,7 @@ class RobotControl:
     def _drive(self, robot: str, action: requests.DriveByHand) -> ActionResult:
         key = DRIVE.key(robot)
         if robot not in self._numbers:
-            self._check_subscriber(robot, DRIVE, "controller")
+            self._check_controller(robot, DRIVE)
         else:
             self._check_running(robot, "controller")
         twist = Twist(vx=action.vx, vy=action.vy, wz=action.wz)

@@ -91,7 +91,7 @@ class RequestHandler:
             return ActionResult(ok=False, reason=str(error))
 
     async def _on_robot(self, robot: str, action: requests.Action) -> ActionResult:
-        answer = await self._in_thread(self.context.control.do, robot, action)
+        answer = await self._in_thread(self.context.control.carry_out, robot, action)
         if answer.ok and isinstance(action, requests.EditObstacle | requests.Reset):
             self.refresh_world(robot)
         return answer

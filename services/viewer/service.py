@@ -133,27 +133,27 @@ class ViewerService(Service):
             return
         view = followed.view
         self._show(robot, view, view.add(sample.topic, message, now, sample.published_ns))
-        self._tell_changes(robot, view)
+        self._send_changes(robot, view)
 
-    def _tell_changes(self, robot: str, view: RobotView) -> None:
+    def _send_changes(self, robot: str, view: RobotView) -> None:
         if view.map_changed:
             view.map_changed = False
-            self._tell(robot, "map", view.map or NO_MAP)
+            self._send_text(robot, "map", view.map or NO_MAP)
         if view.time_restarted:
             view.time_restarted = False
-            self._tell(robot, "history", _history(view))
+            self._send_text(robot, "history", _history(view))
         if view.journal_changed:
             view.journal_changed = False
-            self._tell(robot, "journal", _journal(view))
+            self._send_text(robot, "journal", _journal(view))
 
     def _show(self, robot: str, view: RobotView, frame: bytes | None) -> None:
         if (field := view.fields.change(view.stamp_ns, live=view.live)) is not None:
-            self._tell(robot, "field", field)
+            self._send_text(robot, "field", field)
         if frame is not None and robot in self.hub.watched:
             self.counters["frames"] += 1
             self.hub.call_soon(partial(self.hub.queue_frame, robot, frame))
 
-    def _tell(self, robot: str, kind: str, text: str | bytes) -> None:
+    def _send_text(self, robot: str, kind: str, text: str | bytes) -> None:
         if robot in self.hub.watched:
             self.hub.call_soon(partial(self.hub.queue_text, robot, kind, text))
 
@@ -185,7 +185,7 @@ class ViewerService(Service):
         while self._ended_mappers:
             if (followed := self.robots.get(robot := self._ended_mappers.popleft())) is not None and followed.view.live:
                 followed.view.end_mapping()
-                self._tell_changes(robot, followed.view)
+                self._send_changes(robot, followed.view)
         while self.hub.newcomers:
             self._welcome(*self.hub.newcomers.popleft())
         for robot, followed in self.robots.items():
@@ -231,7 +231,7 @@ class ViewerService(Service):
         for robot, followed in self.robots.items():
             followed.view.live = "replay" not in self.roster.services(robot)
             if robot in watched:
-                self._tell(robot, "services", self._services(robot, followed))
+                self._send_text(robot, "services", self._services(robot, followed))
         self.counters.update({name: n - self.counters[name] for name, n in dict(self.hub.counters).items()})
         self.counters["visitors"] = len(self.hub)
         if self._web is not None and not self._web.running and not self.note:

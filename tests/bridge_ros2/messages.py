@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.messages.definitions import Belief, Hypothesis, Pose
+from common.messages.definitions import Belief, BeliefHypothesis, Pose
 
 
 def belief(state: str = "tracking", *, covariance: bool = True, stamp_ns: int = 2_000_000_000) -> Belief:
@@ -13,7 +13,7 @@ def belief(state: str = "tracking", *, covariance: bool = True, stamp_ns: int = 
     return Belief(
         stamp_ns=stamp_ns, state=state, pose=here, covariance=matrix, xi=np.zeros(3, np.float32), free_energy=1.0,
         accuracy=1.0, hypotheses=[
-            Hypothesis(pose=here, covariance=matrix, weight=0.75),
-            Hypothesis(pose=there, covariance=matrix, weight=0.25),
+            BeliefHypothesis(pose=here, covariance=matrix, weight=0.75),
+            BeliefHypothesis(pose=there, covariance=matrix, weight=0.25),
         ],
     )  # fmt: skip

@@ -14,7 +14,7 @@ from pydantic.fields import FieldInfo
 
 from common.geometry.occupancy_grid import OccupancyGrid
 from common.geometry.world import Box, Circle, Obstacle, World
-from common.messages.definitions import Belief, Hypothesis, Preference
+from common.messages.definitions import Belief, BeliefHypothesis, Preference
 from common.messages.topics import QUERIES, TOPICS
 from common.messages.wire import Binary, Message
 from common.robot.base import Robot
@@ -44,7 +44,7 @@ FIXED: dict[type, st.SearchStrategy] = {
 def message_of(cls: type[Message]) -> st.SearchStrategy:
     """Valid messages of a class."""
     rows = {name: _field(field) for name, field in cls.model_fields.items()}
-    if cls in (Belief, Hypothesis):
+    if cls in (Belief, BeliefHypothesis):
         three = st.builds(np.array, st.lists(st.floats(-1e6, 1e6, width=64), min_size=9, max_size=9))
         matrix = st.none() | three.map(lambda m: m.reshape(3, 3))
         rows["covariance"] = matrix

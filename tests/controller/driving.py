@@ -62,7 +62,10 @@ def scan(stamp_ns, pose, world, scanner=SCANNER, rng=None) -> Scan:
 
 
 def session(navigator, pose, drives, world, *, first=0, state="tracking"):
-    """Drive a perfect robot; ``drives`` has a message or None for each scan. Returns (command, status, pose) tuples."""
+    """Drives a robot that moves exactly as commanded; returns (command, status, pose) for each scan.
+
+    ``drives`` has a drive message or None for each scan.
+    """
     pose, log = np.array(pose, float), []
     for stamp, drive_message in enumerate(drives, start=first):
         navigator.on_scan(scan(stamp * PERIOD_NS, pose, world))
@@ -89,13 +92,13 @@ def drive(
     seen=None,
     state="tracking",
 ):
-    """Drive in the simulator with the true pose as belief, until the robot stands at the goal ``to``.
+    """Drives in the simulator with the true pose as belief, until the robot stands at the goal ``to``.
 
     Returns true poses (T, 3), statuses and the number of scans with contact. ``known`` is the controller's map,
     ``stop`` the simulator's obstacle stop, ``change`` a function called before each scan, and ``seen`` a function that
     changes the scan for the controller.
     """  # fmt: skip
-    navigator = Navigator(robot, preset=GeodesicPolicy(robot, known or world))
+    navigator = Navigator(robot, chosen_policy=GeodesicPolicy(robot, known or world))
     navigator.on_goal(to)
     poses, statuses, contacts = [], [], 0
     with closing(Simulation(SimulationSetup(world, scanner, robot, start, seed, obstacle_stop=stop))) as simulation:

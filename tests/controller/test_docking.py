@@ -63,7 +63,7 @@ def test_obstacle_on_the_line():
 )
 def test_refused_approaches(to, reason):
     robot = Robot(drive="differential")
-    navigator = Navigator(robot, preset=GeodesicPolicy(robot, HALL))
+    navigator = Navigator(robot, chosen_policy=GeodesicPolicy(robot, HALL))
     navigator.on_goal(to)
     assert reason in navigator.goal_state.reason
     assert not navigator.goal_state.active

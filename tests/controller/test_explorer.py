@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from common.geometry import se2
 from common.geometry.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from common.messages.definitions import Drive, Map, Twist
 from common.robot.base import Robot
@@ -24,11 +25,11 @@ def map_with(*poses) -> PlannedMap:
 
 
 class PerfectRobot:
-    """A perfect robot, whose viewpoints are chosen by the test."""
+    """A robot that moves as commanded and knows its pose; the test chooses its viewpoints."""
 
     def __init__(self, *, mapped: bool = True) -> None:
         self.policy = GeodesicPolicy(Robot(), None)
-        self.navigator = Navigator(Robot(), preset=self.policy)
+        self.navigator = Navigator(Robot(), chosen_policy=self.policy)
         self.pose, self.scans = np.array(START), 0
         if mapped:
             self.use_map(map_with(START))
@@ -39,8 +40,6 @@ class PerfectRobot:
         self.navigator.on_map(planned)
 
     def step(self, *, moves: bool = True, state: str = "tracking"):
-        from common.geometry import se2
-
         stamp = self.scans * PERIOD_NS
         self.scans += 1
         self.navigator.on_scan(scan(stamp, self.pose, HALL))
@@ -56,7 +55,7 @@ class PerfectRobot:
         raise AssertionError(status)
 
     def explore(self, *places) -> None:
-        """Begin to explore, or go on with viewpoints at these places in m."""
+        """Gives the robot viewpoints at these places in m, one after another; None ends the exploration."""
         for place in places:
             viewpoint = None if place is None else Viewpoint(np.array([*place, 0.0]), 9.0, np.array([place]))
             exploration_state = self.navigator.take_exploration_state()
@@ -64,14 +63,14 @@ class PerfectRobot:
             self.navigator.use_viewpoint(viewpoint, exploration_state)
 
 
-def begin() -> PerfectRobot:
-    drive = PerfectRobot()
-    drive.navigator.on_goal(goal(0, 0, explore=True, seq=5))
-    return drive
+def exploring_robot() -> PerfectRobot:
+    robot = PerfectRobot()
+    robot.navigator.on_goal(goal(0, 0, explore=True, seq=5))
+    return robot
 
 
 def test_no_exploration_in_a_known_world():
-    navigator = Navigator(Robot(), world=HALL, preset=GeodesicPolicy(Robot(), HALL))
+    navigator = Navigator(Robot(), world=HALL, chosen_policy=GeodesicPolicy(Robot(), HALL))
     navigator.on_goal(goal(0, 0, explore=True, seq=5))
     status = navigator.goal_state.status(0, None)
     assert status.refused
@@ -79,45 +78,45 @@ def test_no_exploration_in_a_known_world():
 
 
 def test_exploration_waits_for_the_first_map():
-    drive = PerfectRobot(mapped=False)
-    drive.navigator.on_goal(goal(0, 0, explore=True, seq=5))
-    status = drive.step()
+    robot = PerfectRobot(mapped=False)
+    robot.navigator.on_goal(goal(0, 0, explore=True, seq=5))
+    status = robot.step()
     assert (status.state, status.exploration.seq, status.reason) == (
         "exploring",
         5,
         "waiting for the mapper's first map",
     )
-    assert drive.navigator.take_exploration_state() is None
-    drive.use_map(map_with(START))
-    drive.step()
-    drive.explore((5.0, 2.5))
-    assert drive.step().goal.x == 5
-    drive.navigator.on_goal(goal(0, 0, cancel=True))
-    assert drive.step().exploration is None
+    assert robot.navigator.take_exploration_state() is None
+    robot.use_map(map_with(START))
+    robot.step()
+    robot.explore((5.0, 2.5))
+    assert robot.step().goal.x == 5
+    robot.navigator.on_goal(goal(0, 0, cancel=True))
+    assert robot.step().exploration is None
 
 
 def test_kidnapped():
-    drive = begin()
-    drive.explore((8.0, 2.5))
-    drive.until(lambda _: drive.pose[0] > 3.0)
-    driven = drive.step().exploration.path
-    drive.pose = np.array([4.0, 1.0, 0.0])
-    statuses = [drive.step(state="lost") for _ in range(10 * SCANS_PER_S)]  # longer than at a place without progress
+    robot = exploring_robot()
+    robot.explore((8.0, 2.5))
+    robot.until(lambda _: robot.pose[0] > 3.0)
+    driven = robot.step().exploration.path
+    robot.pose = np.array([4.0, 1.0, 0.0])
+    statuses = [robot.step(state="lost") for _ in range(10 * SCANS_PER_S)]  # longer than at a place without progress
     assert all(status.reason.startswith("the belief is lost") for status in statuses)
-    drive.use_map(map_with(START))
-    assert drive.navigator.take_exploration_state() is None  # where it would begin is not known
-    path, place = statuses[-1].exploration.path, drive.pose
-    drive.pose = place - [3.0, 0.0, 0.0]
-    status = drive.step()
-    assert (status.goal.x, status.reason) == (8.0, "going where a scan tells most")
+    robot.use_map(map_with(START))
+    assert robot.navigator.take_exploration_state() is None  # where it would begin is not known
+    path, place = statuses[-1].exploration.path, robot.pose
+    robot.pose = place - [3.0, 0.0, 0.0]
+    status = robot.step()
+    assert (status.goal.x, status.reason) == (8.0, "driving to a viewpoint")
     assert status.exploration.path == path > driven + 0.5
-    assert len(drive.navigator.take_exploration_state().unreachable) == 0
+    assert len(robot.navigator.take_exploration_state().unreachable) == 0
 
 
 def test_viewpoints_then_the_way_back():
-    drive = begin()
-    drive.explore((5.0, 2.5))
-    status = drive.step()
+    robot = exploring_robot()
+    robot.explore((5.0, 2.5))
+    status = robot.step()
     assert (status.state, status.goal.x, status.exploration.phase, status.exploration.seq) == (
         "exploring",
         5,
@@ -125,101 +124,101 @@ def test_viewpoints_then_the_way_back():
         5,
     )
     assert np.isclose(status.exploration.area, 50.0)
-    drive.until(lambda _: drive.navigator._viewpoint_due)
-    assert np.hypot(*(drive.pose[:2] - [5.0, 2.5])) < 0.1
-    drive.explore(None)
-    assert drive.step().exploration.phase == "returning"
-    status = drive.until(lambda status: status.exploration.phase == "finished")
-    assert np.hypot(*(drive.pose - START)[:2]) < 0.01
+    robot.until(lambda _: robot.navigator._viewpoint_due)
+    assert np.hypot(*(robot.pose[:2] - [5.0, 2.5])) < 0.1
+    robot.explore(None)
+    assert robot.step().exploration.phase == "returning"
+    status = robot.until(lambda status: status.exploration.phase == "finished")
+    assert np.hypot(*(robot.pose - START)[:2]) < 0.01
     assert 5.9 < status.exploration.path < 7.5
     assert status.state == "reached"
-    assert drive.navigator.take_exploration_state() is None
+    assert robot.navigator.take_exploration_state() is None
 
 
 def test_a_robot_that_stops_late_returns_again():
-    drive = begin()
-    drive.explore((4.0, 2.5))
-    drive.until(lambda _: drive.navigator._viewpoint_due)
-    drive.explore(None)
-    drive.until(lambda _: drive.navigator.goal_state.phase is Phase.REACHED)
-    drive.pose = drive.pose - [0.06, 0.0, 0.0]
-    drive.until(lambda _: drive.navigator._viewpoint_due)
-    drive.explore(None)
-    assert drive.step().exploration.phase == "returning"
-    drive.until(lambda status: status.exploration.phase == "finished")
-    assert np.hypot(*(drive.pose - START)[:2]) < 0.01
+    robot = exploring_robot()
+    robot.explore((4.0, 2.5))
+    robot.until(lambda _: robot.navigator._viewpoint_due)
+    robot.explore(None)
+    robot.until(lambda _: robot.navigator.goal_state.phase is Phase.REACHED)
+    robot.pose = robot.pose - [0.06, 0.0, 0.0]
+    robot.until(lambda _: robot.navigator._viewpoint_due)
+    robot.explore(None)
+    assert robot.step().exploration.phase == "returning"
+    robot.until(lambda status: status.exploration.phase == "finished")
+    assert np.hypot(*(robot.pose - START)[:2]) < 0.01
 
 
 def test_a_goal_of_a_user_takes_precedence():
-    drive = begin()
-    drive.explore((8.0, 2.5))
-    drive.until(lambda _: drive.pose[0] > 3.0)
-    drive.navigator.on_goal(goal(3.0, 1.5, seq=6))
-    drive.use_map(map_with(START, (3.0, 2.5, 0.0)))
-    assert drive.navigator.take_exploration_state() is None  # no viewpoint is chosen meanwhile
-    status = drive.until(lambda status: status.state == "reached")
+    robot = exploring_robot()
+    robot.explore((8.0, 2.5))
+    robot.until(lambda _: robot.pose[0] > 3.0)
+    robot.navigator.on_goal(goal(3.0, 1.5, seq=6))
+    robot.use_map(map_with(START, (3.0, 2.5, 0.0)))
+    assert robot.navigator.take_exploration_state() is None  # no viewpoint is chosen meanwhile
+    status = robot.until(lambda status: status.state == "reached")
     assert (status.goal_seq, status.exploration.phase) == (6, "exploring")
-    count = drive.scans
-    drive.until(lambda _: drive.navigator._viewpoint_due)
-    assert drive.scans - count >= 2 * SCANS_PER_S - 1  # whoever waits for the goal sees that it was reached
-    drive.explore((8.0, 2.5))
-    assert drive.step().state == "exploring"
+    count = robot.scans
+    robot.until(lambda _: robot.navigator._viewpoint_due)
+    assert robot.scans - count >= 2 * SCANS_PER_S - 1  # whoever waits for the goal sees that it was reached
+    robot.explore((8.0, 2.5))
+    assert robot.step().state == "exploring"
 
 
 def test_every_status_tells_the_progress():
-    drive = begin()
-    drive.explore((8.0, 2.5))
-    statuses = [drive.step(), drive.navigator.status(0), drive.navigator.stop_without_belief(0, "no belief")[1]]
-    drive.navigator.on_drive(Drive(stamp_ns=0, twist=Twist(vx=0.1)))
-    statuses += [drive.step(), drive.navigator.step_without_belief(drive.scans * PERIOD_NS)[1]]
+    robot = exploring_robot()
+    robot.explore((8.0, 2.5))
+    statuses = [robot.step(), robot.navigator.status(0), robot.navigator.stop_without_belief(0, "no belief")[1]]
+    robot.navigator.on_drive(Drive(stamp_ns=0, twist=Twist(vx=0.1)))
+    statuses += [robot.step(), robot.navigator.step_without_belief(robot.scans * PERIOD_NS)[1]]
     assert [status.state for status in statuses] == ["exploring", "exploring", "lost", "manual", "manual"]
     assert {status.exploration.seq for status in statuses} == {5}
 
 
 def test_cancelling_ends_it():
-    drive = begin()
-    drive.explore((8.0, 2.5))
-    drive.until(lambda _: drive.pose[0] > 3.0)
-    drive.navigator.on_goal(goal(0, 0, cancel=True))
-    status = drive.until(lambda _: not drive.navigator._command.velocity.any())
+    robot = exploring_robot()
+    robot.explore((8.0, 2.5))
+    robot.until(lambda _: robot.pose[0] > 3.0)
+    robot.navigator.on_goal(goal(0, 0, cancel=True))
+    status = robot.until(lambda _: not robot.navigator._command.velocity.any())
     assert (status.state, status.exploration) == ("idle", None)
 
 
 def test_a_place_without_progress_is_given_up():
-    drive = begin()
-    drive.explore((8.0, 2.5))
-    drive.until(lambda _: drive.navigator._viewpoint_due, moves=False)
-    exploration_state = drive.navigator.take_exploration_state()
+    robot = exploring_robot()
+    robot.explore((8.0, 2.5))
+    robot.until(lambda _: robot.navigator._viewpoint_due, moves=False)
+    exploration_state = robot.navigator.take_exploration_state()
     assert exploration_state.unreachable.tolist() == [[8.0, 2.5]]
     assert not len(exploration_state.arrivals)
 
 
 def test_a_way_back_that_stays_refused_fails():
-    drive = begin()
-    drive.explore((5.0, 2.5))
-    drive.until(lambda _: drive.navigator._viewpoint_due)
+    robot = exploring_robot()
+    robot.explore((5.0, 2.5))
+    robot.until(lambda _: robot.navigator._viewpoint_due)
     shut = GRID.values.copy()
     shut[:, 70:76] = OCCUPIED
     grid = OccupancyGrid.of(shut, 0.05, (0.0, 0.0, 0.0))
-    drive.use_map(PlannedMap.of(Map(stamp_ns=0, grid=grid, poses=np.array([START])), 0.27))
-    drive.explore(None)
-    count, status = drive.scans, drive.step()
+    robot.use_map(PlannedMap.of(Map(stamp_ns=0, grid=grid, poses=np.array([START])), 0.27))
+    robot.explore(None)
+    count, status = robot.scans, robot.step()
     while status.exploration.phase == "returning":
-        if drive.navigator._viewpoint_due:
-            drive.explore(None)
-        status = drive.step()
+        if robot.navigator._viewpoint_due:
+            robot.explore(None)
+        status = robot.step()
     assert status.exploration.phase == "failed"
     assert "cannot be reached" in status.reason
-    assert 7 * SCANS_PER_S < drive.scans - count < 10 * SCANS_PER_S
+    assert 7 * SCANS_PER_S < robot.scans - count < 10 * SCANS_PER_S
 
 
 def test_a_new_map_may_show_a_better_viewpoint_and_moves_the_start():
-    drive = begin()
-    drive.explore((8.0, 2.5))
-    drive.step()
-    drive.use_map(map_with((2.1, 2.5, 0.0), (3.0, 2.5, 0.0)))
-    exploration_state = drive.navigator.take_exploration_state()
+    robot = exploring_robot()
+    robot.explore((8.0, 2.5))
+    robot.step()
+    robot.use_map(map_with((2.1, 2.5, 0.0), (3.0, 2.5, 0.0)))
+    exploration_state = robot.navigator.take_exploration_state()
     assert exploration_state.target.tolist() == [8.0, 2.5]
     assert exploration_state.home.tolist() == [2.1, 2.5]
-    drive.navigator.use_viewpoint(Viewpoint(np.array([4.0, 4.0, 0.0]), 9.0, np.zeros((1, 2))), exploration_state)
-    assert drive.step().goal.y == 4.0
+    robot.navigator.use_viewpoint(Viewpoint(np.array([4.0, 4.0, 0.0]), 9.0, np.zeros((1, 2))), exploration_state)
+    assert robot.step().goal.y == 4.0

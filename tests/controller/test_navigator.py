@@ -50,7 +50,7 @@ def test_goal_in_a_wall_is_refused(x, y, reason):
 
 def test_goal_where_the_robot_stands():
     """It is accepted, although it is so near to a wall that others are refused there."""
-    navigator = Navigator(preset=GeodesicPolicy(Robot(), ROOM), world=ROOM)
+    navigator = Navigator(chosen_policy=GeodesicPolicy(Robot(), ROOM), world=ROOM)
     session(navigator, [5, 0.275, 0], [None], ROOM)
     navigator.on_goal(goal(5, 0.265))
     ((command, status, _),) = session(navigator, [5, 0.275, 0], [None], ROOM, first=1)
@@ -61,7 +61,7 @@ def test_goal_where_the_robot_stands():
 
 def test_back_near_the_goal_after_being_lost():
     """The time without a pose is no time without progress."""
-    navigator = Navigator(preset=GeodesicPolicy(Robot(), ROOM), world=ROOM)
+    navigator = Navigator(chosen_policy=GeodesicPolicy(Robot(), ROOM), world=ROOM)
     navigator.on_goal(goal(8.5, 2))
     session(navigator, [8.4, 2, 0], [None], ROOM)
     session(navigator, [8.4, 2, 0], [None] * 60, ROOM, first=1, state="lost")
@@ -72,7 +72,7 @@ def test_back_near_the_goal_after_being_lost():
 
 def test_stands_at_the_goal_of_the_best_guess():
     """Without the terms of information, a robot waits there until the belief is no longer ambiguous."""
-    navigator = Navigator(preset=GeodesicPolicy(Robot(), ROOM, epistemic=False), world=ROOM)
+    navigator = Navigator(chosen_policy=GeodesicPolicy(Robot(), ROOM, epistemic=False), world=ROOM)
     navigator.on_goal(goal(8.5, 2))
     log = session(navigator, [8.495, 2, 0], [None] * 90, ROOM, state="ambiguous")
     assert not any("refused" in status.reason for _, status, _ in log)
@@ -95,7 +95,7 @@ def test_stands_until_localised(navigator, state):
 def test_single_lost_scan():
     """The robot brakes for one scan, and drives on."""
     robot = Robot()
-    navigator = Navigator(robot, preset=GeodesicPolicy(robot, ROOM))
+    navigator = Navigator(robot, chosen_policy=GeodesicPolicy(robot, ROOM))
     navigator.on_goal(goal(8.5, 2))
     before = session(navigator, [1.5, 2, 0], [None] * 25, ROOM)[-1]
     ((lost, status, pose),) = session(navigator, before[2], [None], ROOM, first=25, state="lost")

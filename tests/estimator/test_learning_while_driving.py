@@ -15,7 +15,7 @@ from common.messages.requests import SaveModelReply, SaveModelRequest
 from common.messages.topics import BELIEF, FIELD, SAVE_MODEL, SCAN
 from common.robot.scan_geometry import Sweep
 from lab.accuracy.scenes import Scene
-from services.estimator.factory import EstimatorOptions, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.field_exchange import FieldAssembler, split_into_messages
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.key_scans import KeyScanCollector
@@ -74,7 +74,7 @@ def test_kidnapping_while_learning():
         scene.path(25.0, start=np.array([13.0, 4.0, 1.0])),
     )
     path, rate = np.concatenate([before, after]), scene.scanner.rate
-    estimator = prepare(EstimatorOptions(office, model="exact"))(Geometry.of(scene.scanner))
+    estimator = prepare_factory(EstimatorOptions(office, model="exact"))(ScannerGeometry.of(scene.scanner))
     estimator.restart(path[0])
     keys = KeyScanCollector(scene.scanner.angles(), np.array(scene.scanner.mount), scene.scanner.range_max)
     for k, clean in enumerate(scene.clean(path)):

@@ -9,7 +9,7 @@ from common.geometry import se2
 from common.geometry.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from common.geometry.world import World
 from common.robot.scanner import SCANNERS
-from services.estimator.factory import EstimatorOptions, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.particle_filter.beam_model import RangeTable
 from services.estimator.particle_filter.likelihood_field import SurfaceDistances
 from services.estimator.shared.interface import Observation
@@ -36,8 +36,8 @@ def test_particle_filter_tables(hall):
 
 def test_global_localisation(hall):
     rng = np.random.default_rng(3)
-    geometry = Geometry(SCANNER.angles(), np.array(SCANNER.mount), SCANNER.range_max)
-    make = prepare(EstimatorOptions(world=hall, model="exact"))
+    geometry = ScannerGeometry(SCANNER.angles(), np.array(SCANNER.mount), SCANNER.range_max)
+    make = prepare_factory(EstimatorOptions(world=hall, model="exact"))
     for place in hall.sample_free(3, rng, 0.4):
         pose = np.array([*place, rng.uniform(-np.pi, np.pi)])
         exact = hall.ray_distances(se2.compose(pose, geometry.mount), geometry.angles)[0]
@@ -57,8 +57,11 @@ def test_deviation_covers_cell_errors():
     values = np.full((row.max() + 4, column.max() + 4), FREE, np.uint8)
     values[row, column] = OCCUPIED
     mapped = World(name="mapped", grid=OccupancyGrid.of(values, 0.05, (float(first[0]), float(first[1]), 0.0)))
-    rng, geometry = np.random.default_rng(4), Geometry(SCANNER.angles(), np.array(SCANNER.mount), SCANNER.range_max)
-    make, misfits = prepare(EstimatorOptions(world=mapped, model="exact")), []
+    rng, geometry = (
+        np.random.default_rng(4),
+        ScannerGeometry(SCANNER.angles(), np.array(SCANNER.mount), SCANNER.range_max),
+    )
+    make, misfits = prepare_factory(EstimatorOptions(world=mapped, model="exact")), []
     for place in room.sample_free(4, rng, 0.5):
         pose = np.array([*place, rng.uniform(-np.pi, np.pi)])
         estimator = make(geometry)

@@ -15,7 +15,7 @@ from common.messages.definitions import Belief, Health, Pose, Scan
 from common.messages.requests import LocaliseRequest, Reply
 from common.messages.topics import BELIEF, HEALTH, LOCALISE, SCAN
 from services.estimator import multi_robot
-from services.estimator.factory import EstimatorOptions, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.settings import EstimatorSettings
 from services.estimator.shared.interface import Hypothesis, Observation, Posterior
 from tests.conftest import WAIT_TIMEOUT_S, received_messages
@@ -37,12 +37,12 @@ def results(posteriors):
 
 
 def test_robots_in_two_threads():
-    factory, scans = prepare(EstimatorOptions(ROOM, model="exact")), [drive(1), drive(2)]
+    factory, scans = prepare_factory(EstimatorOptions(ROOM, model="exact")), [drive(1), drive(2)]
     alone = []
     for each in scans:
-        estimator = factory(Geometry.of(SCANNER))
+        estimator = factory(ScannerGeometry.of(SCANNER))
         alone.append(results([estimator.update(scan) for scan in each]))
-    estimators, found = [factory(Geometry.of(SCANNER)) for _ in scans], [[], []]
+    estimators, found = [factory(ScannerGeometry.of(SCANNER)) for _ in scans], [[], []]
 
     def run(k):
         found[k] = [estimators[k].update(scan) for scan in scans[k]]
@@ -56,8 +56,8 @@ def test_robots_in_two_threads():
 
 
 def test_track_and_search_are_update():
-    factory, scans, searches = prepare(EstimatorOptions(ROOM, model="exact")), drive(1), []
-    one, other = factory(Geometry.of(SCANNER)), factory(Geometry.of(SCANNER))
+    factory, scans, searches = prepare_factory(EstimatorOptions(ROOM, model="exact")), drive(1), []
+    one, other = factory(ScannerGeometry.of(SCANNER)), factory(ScannerGeometry.of(SCANNER))
     with pytest.raises(RuntimeError, match="track first"):
         one.search()
     for k, scan in enumerate(scans):
@@ -127,7 +127,7 @@ def searching(loop):
 def fleet(bus, link, monkeypatch):
     """A function that runs the loop for robots, and returns it and the robots."""
     models = SimpleNamespace(factory=lambda _: SearchingStub(), describe=lambda _: "none")
-    monkeypatch.setattr(multi_robot, "Models", lambda _: models)
+    monkeypatch.setattr(multi_robot, "SharedModels", lambda _: models)
     SearchingStub.proceed.clear()
     running = []
 

@@ -12,7 +12,7 @@ from common.robot.scanner import SCANNERS, Scanner
 from lab.accuracy import bound, tasks
 from lab.accuracy.runner import quick_field
 from lab.accuracy.scenes import Scene
-from services.estimator.factory import DEFAULT_SIGMA_M, EstimatorOptions, Geometry, prepare
+from services.estimator.factory import DEFAULT_SIGMA_M, EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.gauss_newton import View, polish
@@ -37,12 +37,14 @@ LEARNED = 100_000  # number of beams to learn from
 @cache
 def learned(name: str) -> FieldModel:
     scanner = SCANNERS[name]
-    return quick_field(ROOM, Geometry.of(scanner), np.random.default_rng(0), LEARNED // scanner.beams, limited=True)
+    return quick_field(
+        ROOM, ScannerGeometry.of(scanner), np.random.default_rng(0), LEARNED // scanner.beams, limited=True
+    )
 
 
 def precise(model: FieldModel, scanner: Scanner) -> PreciseEstimator:
     places = thin_places(ROOM.sample_free(2000, np.random.default_rng(0), 0.05), SEED_SPACING_M)
-    geometry = Geometry.of(scanner)
+    geometry = ScannerGeometry.of(scanner)
     return PreciseEstimator(model, Seeds.at(model, places), geometry.mount, geometry.likelihood())
 
 
@@ -110,7 +112,7 @@ def test_field_of_another_scanner():
 @pytest.mark.parametrize("name", ["lms200", "tim571, upside down", "backwards, from 0 to 359 deg"])
 def test_particle_filter(name):
     scanner = EVERY[name]
-    made = prepare(EstimatorOptions(ROOM, "particle-filter"))(Geometry.of(scanner))
+    made = prepare_factory(EstimatorOptions(ROOM, "particle-filter"))(ScannerGeometry.of(scanner))
     scene = Scene(ROOM, scanner, np.random.default_rng(3))
     for pose, clean in zip(poses := scene.poses(3), scene.clean(poses), strict=True):
         made.restart(pose + np.array([0.05, -0.05, 0.03]))
@@ -125,10 +127,12 @@ def test_particle_filter(name):
 
 def test_stated_noise():
     scanner = SCANNERS["rplidar-a1"]
-    stated = Geometry.of(scanner).likelihood()
+    stated = ScannerGeometry.of(scanner).likelihood()
     assert stated.relative == 0.01
     assert stated.deviation(np.array([5.0, np.inf])) == pytest.approx([0.05, 1e-3], rel=1e-3)
-    assert Geometry.of(scanner).likelihood(0.03).deviation(np.array([5.0])) == 0.03
-    silent = Geometry(scanner.angles(), np.zeros(3), 12.0)
+    assert ScannerGeometry.of(scanner).likelihood(0.03).deviation(np.array([5.0])) == 0.03
+    silent = ScannerGeometry(scanner.angles(), np.zeros(3), 12.0)
     assert silent.likelihood().deviation(np.array([5.0])) == DEFAULT_SIGMA_M
-    assert not silent.same(Geometry.of(scanner.model_copy(update={"mount": (0.0, 0.0, 0.0)})), bound_to_beams=False)
+    assert not silent.same(
+        ScannerGeometry.of(scanner.model_copy(update={"mount": (0.0, 0.0, 0.0)})), bound_to_beams=False
+    )

@@ -122,9 +122,9 @@ def drive(service: Service, events: Iterable[Event]) -> list[Row]:
 
 def _feed(loop: Loop, event: Event, number: int, rows: list[Row]) -> None:
     if event.what is None:
-        loop.guard(loop.service.on_timer)
+        loop.run_guarded(loop.service.on_timer)
     elif isinstance(event.what, Topic):
-        loop.guard(lambda: loop.service.on_sample(sample(event.what, event.payload)))
+        loop.run_guarded(lambda: loop.service.on_sample(sample(event.what, event.payload)))
     else:
         query = event.what
 

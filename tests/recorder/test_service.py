@@ -114,10 +114,10 @@ def test_kill_9_keeps_what_was_flushed(recorder, bus, logs):
 IMPATIENT = """
 import sys
 from services.recorder import service
-from services.recorder.__main__ import RecorderSettings, main, make
+from services.recorder.__main__ import RecorderSettings, main, build_service
 service.LINK_WARNING_DELAY_S = 0.1
 sys.argv[0] = "recorder"
-main(RecorderSettings, make)
+main(RecorderSettings, build_service)
 """
 
 

@@ -77,7 +77,7 @@ def test_contact_with_a_standing_person(make):
 
 
 def test_obstacle_stop_before_standing_people(make):
-    """Drive at 1 m/s straight at one person after the other, head on and grazing in turn."""
+    """The robot drives at 1 m/s straight at one person after the other, head on and grazing in turn."""
     simulation = make(HALL, people=12, people_speed=0.0, seed=1)
     stopped, fastest = 0, 0.0
     for number, place in enumerate(simulation.people.places.copy()):
@@ -95,7 +95,7 @@ def test_obstacle_stop_before_standing_people(make):
 
 @pytest.mark.parametrize("kind", ["holonomic", "differential"])
 def test_obstacle_stop_among_walking_people(make, kind):
-    """Drive at 1 m/s among ten people, turning on the spot when stopped."""
+    """The robot drives at 1 m/s among ten people, turning on the spot when stopped."""
     simulation, rng = make("office", people=10, seed=1, robot=Robot(drive=kind)), np.random.default_rng(0)
     turn, driven = 0.0, 0.0
     for _ in range(15 * 15):

@@ -37,7 +37,7 @@ class Running:
         self.service, self.loop, self.bus, self.clock = service, loop, bus, clock
 
     def request(self, query, request=None):
-        """Send a request and return the reply."""
+        """Sends a request and returns the reply."""
         replies = []
         payload = (request or Request()).encode()
         self.loop._answer(
@@ -60,7 +60,7 @@ class Running:
         self.service.on_message(None, CmdVel(stamp_ns=number * PERIOD_NS, twist=Twist(vx=vx)))
 
     def run(self, seconds):
-        """Advance the clock, and call the timer when it is due."""
+        """Advances the clock, and calls the timer when it is due."""
         end = self.clock.now + seconds
         while (due := self.service.due()) is not None and self.clock.now + due <= end:
             self.clock.now += max(0.0, due)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from common.bus.bus import Link, open_bus, wait_until
-from common.bus.security import credentials
+from common.bus.security import read_credentials
 from common.messages.definitions import Belief, Scan, Status, Truth
 from common.messages.topics import BELIEF, CMD_VEL, SCAN, STATUS, TRUTH
 from presage.live.latest_messages import LatestMessages
@@ -113,7 +113,7 @@ def test_secure_mode_and_health(compose, tmp_path):
     project.do("up", "--detach")
     router = (f"tcp/127.0.0.1:{project.router}",)
     with open_bus(Link(connect=router)) as stranger:
-        with open_bus(Link(connect=router, security=credentials(keys, ("observer",)))) as known:
+        with open_bus(Link(connect=router, security=read_credentials(keys, ("observer",)))) as known:
             messages = LatestMessages(known, TRUTH, STATUS)
             assert messages.wait_for(Truth, lambda truth: truth.pose.x > 5.0, TIMEOUT_S), project.explain("goal")
             assert known.alive() >= {"simulator", "estimator", "controller", "recorder"}
@@ -127,7 +127,7 @@ def test_secure_mode_and_health(compose, tmp_path):
         project.becomes(service, "healthy")
     send_signal(project, "STOP")
     project.becomes("estimator", "unhealthy")
-    assert "no sign of life for" in project.state("estimator")["Health"]["Log"][-1]["Output"]
+    assert "no report for" in project.state("estimator")["Health"]["Log"][-1]["Output"]
     assert project.health("simulator") == "healthy"
     send_signal(project, "CONT")
     project.becomes("estimator", "healthy")

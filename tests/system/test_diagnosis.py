@@ -125,7 +125,7 @@ def test_faulty_session(process, bus, stopped_recorder, faulty_session, tmp_path
     assert find_fault(found, "protocol", f"protocol {PROTOCOL + 1}")["where"] == "estimator on far"
     assert find_fault(found, "versions", "presage")["where"] == "estimator on near"
     assert "ahead of" in find_fault(found, "clocks", "estimator on far, near: its clock is 60.0 s")["what"]
-    assert find_fault(found, "frozen", "no sign of life")["where"] == "viewer"
+    assert find_fault(found, "frozen", "no report")["where"] == "viewer"
     find_fault(found, "frozen", str(stopped_recorder.child.pid))
     assert "python -m services.controller" in find_fault(found, "missing", "controller")["advice"]
     find_fault(found, "rate", "scan: ")

@@ -15,7 +15,7 @@ import pytest
 
 from common.bus.bus import Link, open_bus, wait_until
 from common.bus.inbox import Inbox
-from common.bus.security import credentials
+from common.bus.security import read_credentials
 from common.errors import UserError
 from common.messages.definitions import CmdVel, Goal, Health, Pose, Truth, Twist
 from common.messages.requests import PoseRequest, Request, WorldReply
@@ -46,14 +46,14 @@ class SecureRouter:
 
     @contextmanager
     def session(self, name, **more):
-        link = Link(connect=(f"tcp/127.0.0.1:{self.port}",), security=credentials(self.keys, (name,)), **more)
+        link = Link(connect=(f"tcp/127.0.0.1:{self.port}",), security=read_credentials(self.keys, (name,)), **more)
         with open_bus(link, connect_timeout=WAIT_TIMEOUT_S) as bus:
             assert wait_until(bus.linked, WAIT_TIMEOUT_S)
             yield bus
 
     def settings(self, name, keys=None):
         """Settings of a plain zenoh client with the credentials of ``name``, without client-side access control."""
-        mine = credentials(keys or self.keys, (name,)).zenoh()
+        mine = read_credentials(keys or self.keys, (name,)).zenoh()
         del mine["access_control"]
         return {
             **mine, "mode": "client", "connect/endpoints": [f"tls/127.0.0.1:{self.port}"],
@@ -152,7 +152,7 @@ def test_imposter_of_the_router(secure_router, name, answered):
         INTRUDER_SCRIPT, json.dumps(settings), json.dumps(["serve", f"{KEY_PREFIX}/world", reply])
     )
     fake.wait_for("serving")
-    link = Link(connect=(f"tcp/127.0.0.1:{port}",), security=credentials(secure_router.keys, ("operator",)))
+    link = Link(connect=(f"tcp/127.0.0.1:{port}",), security=read_credentials(secure_router.keys, ("operator",)))
     with open_bus(link, connect_timeout=WAIT_TIMEOUT_S) as bus:
         assert wait_until(bus.linked, WAIT_TIMEOUT_S)
         if answered:

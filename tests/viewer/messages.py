@@ -6,8 +6,8 @@ import numpy as np
 
 from common.messages.definitions import (
     Belief,
+    BeliefHypothesis,
     CmdVel,
-    Hypothesis,
     Odom,
     Plan,
     Pose,
@@ -45,7 +45,7 @@ def at(stamp_s: float, x: float = 1.0, error: float = 0.5) -> dict:
             stamp_ns=stamp, state="tracking", pose=believed, covariance=covariance, xi=np.zeros(3, np.float32),
             free_energy=12.0, accuracy=10.0, complexity=2.0, estimator="precise",
             probability=0.75, protection=np.array([0.5, 0.25, 0.125]),
-            hypotheses=[Hypothesis(pose=believed, covariance=covariance, weight=0.75)],
+            hypotheses=[BeliefHypothesis(pose=believed, covariance=covariance, weight=0.75)],
         ),
         PREDICTION: Prediction(
             stamp_ns=stamp, angle_min=-1.0, angle_increment=0.5, ranges=np.arange(5, dtype=np.float32),

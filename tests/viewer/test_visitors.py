@@ -9,17 +9,17 @@ import pytest
 from services.viewer.visitors import MAX_QUEUED_TEXTS, Hub, TooSlowError, Visitor
 
 
-class Line:
-    """A connection that takes one message per permit if it is slow, or else everything."""
+class FakeConnection:
+    """A browser's connection; a slow one receives one message per permit, others everything at once."""
 
     def __init__(self, *, slow=False):
-        self.taken = []
+        self.received = []
         self.permits = asyncio.Semaphore(0) if slow else None
 
-    async def take(self, what):
+    async def receive(self, message):
         if self.permits is not None:
             await self.permits.acquire()
-        self.taken.append(what)
+        self.received.append(message)
 
 
 async def settle():
@@ -27,32 +27,34 @@ async def settle():
         await asyncio.sleep(0)
 
 
-def scene(*lines):
-    """A hub with one visitor per line, all watching one robot, and their running send tasks."""
+def hub_with_visitors(*connections):
+    """A hub with one visitor per connection, all watching one robot; also returns the visitors and their send tasks."""
     hub = Hub()
-    visitors = [Visitor(line.take, line.take) for line in lines]
+    visitors = [Visitor(each.receive, each.receive) for each in connections]
     for visitor in visitors:
         hub.watch(visitor, "robot")
     return hub, visitors, [asyncio.create_task(visitor.run()) for visitor in visitors]
 
 
-def run(story):
-    async def whole():
+def run(scenario):
+    """Runs a test with an event loop, and then cancels the tasks that it has put into its list."""
+
+    async def run_and_clean_up():
         tasks = []
         try:
-            await story(tasks)
+            await scenario(tasks)
         finally:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
-    asyncio.run(whole())
+    asyncio.run(run_and_clean_up())
 
 
 def test_slow_visitor():
-    async def story(tasks):
-        quick, slow = Line(), Line(slow=True)
-        hub, visitors, running = scene(quick, slow)
+    async def scenario(tasks):
+        quick, slow = FakeConnection(), FakeConnection(slow=True)
+        hub, visitors, running = hub_with_visitors(quick, slow)
         tasks += running
         frames = [bytes([i]) for i in range(30)]
         for i, frame in enumerate(frames):
@@ -61,24 +63,24 @@ def test_slow_visitor():
             if i == 14:
                 slow.permits.release()
                 await settle()
-        assert quick.taken == frames
-        assert slow.taken == [frames[0]]  # it was being sent when the others came
+        assert quick.received == frames
+        assert slow.received == [frames[0]]  # it was being sent when the others came
         slow.permits.release()
         slow.permits.release()
         await settle()
-        assert slow.taken == [frames[0], frames[14], frames[29]]
+        assert slow.received == [frames[0], frames[14], frames[29]]
         assert [visitor.sent for visitor in visitors] == [30, 3]
         assert visitors[1].skipped == 27
         hub.remove(visitors[1])
         assert hub.counters == {"frames_sent": 3, "frames_skipped": 27}
 
-    run(story)
+    run(scenario)
 
 
 def test_order_of_answers():
-    async def story(tasks):
-        line = Line(slow=True)
-        _, (visitor,), running = scene(line)
+    async def scenario(tasks):
+        connection = FakeConnection(slow=True)
+        _, (visitor,), running = hub_with_visitors(connection)
         tasks += running
         visitor.queue_text("first")
         await settle()  # being sent
@@ -89,32 +91,32 @@ def test_order_of_answers():
         visitor.queue_text(b"field 2", "field")
         visitor.queue_frame(b"frame")
         for _ in range(9):
-            line.permits.release()
+            connection.permits.release()
         await settle()
-        assert line.taken == ["first", "services 2", "second", b"field 2", b"frame"]
+        assert connection.received == ["first", "services 2", "second", b"field 2", b"frame"]
 
-    run(story)
+    run(scenario)
 
 
 def test_visitor_that_reads_nothing():
-    async def story(tasks):
-        line = Line(slow=True)
-        _, (visitor,), running = scene(line)
+    async def scenario(tasks):
+        connection = FakeConnection(slow=True)
+        _, (visitor,), running = hub_with_visitors(connection)
         tasks += running
         for i in range(2 * MAX_QUEUED_TEXTS):
             visitor.queue_text(str(i))
             await asyncio.sleep(0)
-        line.permits.release()
+        connection.permits.release()
         with pytest.raises(TooSlowError):
             await asyncio.wait_for(running[0], 5)
 
-    run(story)
+    run(scenario)
 
 
 def test_change_of_robot():
-    async def story(tasks):
-        line = Line(slow=True)
-        hub, (visitor,), running = scene(line)
+    async def scenario(tasks):
+        connection = FakeConnection(slow=True)
+        hub, (visitor,), running = hub_with_visitors(connection)
         tasks += running
         visitor.queue_text("hello")
         await settle()
@@ -125,13 +127,13 @@ def test_change_of_robot():
         hub.queue_frame("robot", b"other")
         hub.queue_frame("ghost", b"new")
         for _ in range(9):
-            line.permits.release()
+            connection.permits.release()
         await settle()
-        assert line.taken == ["hello", "answer", b"new"]
+        assert connection.received == ["hello", "answer", b"new"]
         assert hub.watched == {"ghost"}
         assert [robot for _, robot in hub.newcomers] == ["robot", "ghost"]
 
-    run(story)
+    run(scenario)
 
 
 def test_hub_without_a_loop():

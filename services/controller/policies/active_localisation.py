@@ -36,8 +36,8 @@ MIN_WEIGHT = 1e-3  # hypotheses with less weight are ignored: without them, the 
 # A hypothesis counts as at least this probable. The goal is only reached once all others are excluded, however
 # improbable they are, and the information of a scan about an improbable one would be worth hardly a metre.
 MIN_COUNTED_WEIGHT = 0.05
-MAX_HYPOTHESES = 6
-PLACE_SPACING_M = 1.0
+MAX_HYPOTHESES = 6  # scans are predicted for each
+PLACE_SPACING_M = 1.0  # of the places that are compared
 MIN_PATH_M, MAX_PATH_M = 0.8, 12.0  # length of the path to a place
 MAX_PLACES = 60
 CHOICE_PERIOD_NS = 1_000_000_000  # minimum time between two choices of a place
@@ -46,9 +46,9 @@ INITIAL_WAIT_NS = 1_000_000_000  # time for the estimator to localise before the
 CORRELATION_LENGTH_M = 1.0  # scans from places this far apart are nearly independent
 MAX_VISITED = 100  # positions kept, VISITED_SPACING_M apart
 VISITED_SPACING_M = 0.25
-STALLED_NS = 3_000_000_000  # time without motion after which a place counts as visited, because no way leads there
+STALLED_NS = 3_000_000_000  # after this time without motion, a place counts as visited: no way leads there
 MAX_USEFUL_ROOM_M = 5.0  # more free distance than this is no advantage
-WINDOW_RAD = 0.35  # to either side of a direction; its room (free distance) is the shortest range in this window
+WINDOW_RAD = 0.35  # the room (free distance) in a direction is the shortest range this far to either side of it
 MIN_ROOM_M = 0.7  # if every direction has less, the robot turns on the spot
 NOMINAL_SIGMA_M = 0.02  # of a beam whose precision is not in doubt
 
@@ -68,7 +68,7 @@ class CandidateMotions:
 
 
 class VisitedPlaces:
-    """Where the robot has been while its pose was not known, by its commands, in the present base_link."""
+    """Where the robot has been while its pose was not known, in the present base_link, by dead reckoning."""
 
     def __init__(self) -> None:
         self.positions = np.zeros((1, 2))  # (V, 2) m
@@ -76,7 +76,7 @@ class VisitedPlaces:
         self._progress = np.zeros(2), 0  # m and ns, where and when the robot last made progress
 
     def move(self, stamp_ns: int, velocity: Array) -> Array:
-        """Advance to a stamp with the latest command (3,). Returns the motion (3,) since the stamp before."""
+        """Integrates the latest command (3,) up to a stamp; returns the motion (3,) since the stamp before."""
         seconds = 0.0 if self._stamp_ns is None else max(0.0, (stamp_ns - self._stamp_ns) * 1e-9)
         motion = velocity * seconds
         self.positions = se2.rotate(-motion[2], self.positions - motion[:2])
@@ -90,7 +90,7 @@ class VisitedPlaces:
         return motion
 
     def give_up(self, place: Array) -> None:
-        """Count the place (2,) m that the robot drives to as visited, if there was no progress for `STALLED_NS`."""
+        """Counts the place (2,) m that the robot drives to as visited, if there was no progress for `STALLED_NS`."""
         if self._stamp_ns is not None and self._stamp_ns - self._progress[1] > STALLED_NS:
             self._progress = np.zeros(2), self._stamp_ns
             self._add(place)
@@ -110,7 +110,7 @@ class ActiveLocaliser:
     def __init__(
         self, robot: Robot, graph: FreeSpaceGraph, min_point_distance: float, *, may_turn: bool = True
     ) -> None:
-        """Keep ``min_point_distance`` m from the robot's centre to scan points; ``may_turn``: the heading is free."""
+        """Keeps ``min_point_distance`` m from the robot's centre to scan points. ``may_turn``: any heading will do."""
         self.may_turn = may_turn
         self.robot = robot.model_copy(update={"max_speed": min(robot.max_speed, MAX_SPEED)})
         self.min_point_distance = min_point_distance
@@ -118,14 +118,14 @@ class ActiveLocaliser:
         self.reset()
 
     def use_graph(self, graph: FreeSpaceGraph) -> None:
-        """Plan in another map."""
+        """Plans in another map from now on."""
         self.graph = graph
         area = float((graph.free.clearance > 0).sum()) * graph.grid.resolution**2
         # Entropy of an unknown pose, at the resolution of poses.
         self._unknown_entropy = float(np.log(max(1.0, 2 * np.pi * area / np.sqrt(np.linalg.det(efe.RESOLUTION)))))
 
     def reset(self) -> None:
-        """Forget everything. Call it when the pose is known, or the goal has changed."""
+        """Forgets everything. Call it when the pose is known, or the goal has changed."""
         self._visited = VisitedPlaces()
         self._requested: tuple[int, CandidateMotions] | None = None  # stamp in ns and motions of the last request
         self._place: tuple[Array, dict[str, float]] | None = None  # (3,) in base_link, and its expected free energy
@@ -151,7 +151,7 @@ class ActiveLocaliser:
         return self._requested[1]
 
     def use_predictions(self, reply: PredictReply, range_max: float, to_goal: Callable[[Array], Array]) -> None:
-        """Choose a place with the predictions for the last request; ``to_goal``: (..., 2) m in map -> (...,) m."""
+        """Chooses a place with the predictions for the last request; ``to_goal``: (..., 2) m in map -> (...,) m."""
         if self._requested is None:
             return
         _, motions = self._requested
@@ -163,7 +163,7 @@ class ActiveLocaliser:
         self._place = motions.displacements[best], energy.of(best, energy.total)
 
     def decide(self, belief: Belief, scan: Scan, points: Array, velocity: Array, field_of_view: Sector) -> Decision:
-        """Choose a velocity; ``points`` (K, 2) m in base_link are obstacles."""
+        """Chooses a velocity; ``points`` (K, 2) m in base_link are obstacles."""
         motion = self._visited.move(belief.stamp_ns, velocity)
         if self._place is not None:
             self._place = (se2.between(motion, self._place[0]), self._place[1])
@@ -177,11 +177,11 @@ class ActiveLocaliser:
             if self._place is not None:
                 self._visited.give_up(self._place[0][:2])
                 return self._drive_to(poses[0], *self._place, surroundings, velocity, len(poses))
-            return Decision(reason=f"{len(poses)} places are possible: looking for where to tell them apart")
+            return Decision(reason=f"{len(poses)} places are possible: choosing where to drive to tell them apart")
         if self._unknown_since_ns is None or belief.stamp_ns < self._unknown_since_ns:
             self._unknown_since_ns = belief.stamp_ns
         if belief.stamp_ns - self._unknown_since_ns < INITIAL_WAIT_NS:
-            return Decision(reason=f"the belief is {belief.state}: looking", state="lost")
+            return Decision(reason=f"the belief is {belief.state}: standing while the estimator searches", state="lost")
         return self._drive_to_open_space(belief, scan, surroundings, velocity)
 
     def _candidate_places(self, pose: Array) -> tuple[Array, Array]:
@@ -211,7 +211,7 @@ class ActiveLocaliser:
         velocity: Array,
         count: int,
     ) -> Decision:
-        """Drive from the first of ``count`` hypotheses towards a place (3,) in base_link."""
+        """Drives from the first of ``count`` hypotheses towards a place (3,) in base_link."""
         target = se2.compose(pose, place)[:2]
         if self._field is None or np.hypot(*(self._field[0] - target)) > 2 * self.graph.grid.resolution:
             self._field = (target, self.graph.cost_field(target, self.min_point_distance + PLACE_SPACING_M))
@@ -225,17 +225,18 @@ class ActiveLocaliser:
         return self._approach(attractor, surroundings, velocity, Decision(reason=reason, path=path, terms=terms))
 
     def _drive_to_open_space(self, belief: Belief, scan: Scan, surroundings: Surroundings, velocity: Array) -> Decision:
-        """Drive straight to free space in the present scan from where the next one has most expected information."""
+        """Drives straight to the free place in the present scan where the next scan is expected to tell most."""
         bearing, room = _open_ranges(scan)
         length = np.minimum(room - self.min_point_distance, MAX_USEFUL_ROOM_M)
-        reason = f"the belief is {belief.state}: going where there is room, to see more"
         if room.max() < MIN_ROOM_M:
-            return Decision(np.array([0.0, 0.0, 0.5]), reason.replace("going", "turning to"), "exploring")
+            reason = f"the belief is {belief.state}: turning to where there is room"
+            return Decision(np.array([0.0, 0.0, 0.5]), reason, "exploring")
+        reason = f"the belief is {belief.state}: driving to where there is room, to see more"
         direction = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
         turn = np.abs(se2.wrap(bearing - surroundings.forward)) * self.robot.max_speed / self.robot.max_turn
         gain = self._unknown_entropy * self._visited.novelty(np.maximum(length, 0.0)[:, None] * direction)
-        nothing = np.zeros(len(gain))
-        energy = ExpectedFreeEnergy(NATS_PER_METRE * (length + turn), nothing, nothing, gain)
+        zero = np.zeros(len(gain))
+        energy = ExpectedFreeEnergy(NATS_PER_METRE * (length + turn), zero, zero, gain)
         best = int(np.argmin(energy.total))
         self._visited.give_up(length[best] * direction[best])
         attractor = min(float(length[best]), 2.0) * direction[best]
@@ -271,13 +272,13 @@ def drive_energy(
     ``ranges`` and ``sigma`` (K, M, B) m are the scans predicted at the ends; ``to_goal`` returns the distance (...,) m
     to the goal from places (..., 2) m in map, ``novelty`` the new share (M,) of scans at places (M, 2) m in base_link.
     """
-    onwards = motions.weights @ to_goal(motions.poses()[..., :2]) / motions.weights.sum()
-    noise = NOMINAL_SIGMA_M**2 + efe.ARRIVAL_ERROR_M**2
-    beams = np.log((sigma**2 + efe.ARRIVAL_ERROR_M**2) / noise).mean(axis=2) / 2
+    rest_of_path = motions.weights @ to_goal(motions.poses()[..., :2]) / motions.weights.sum()
+    nominal_variance = NOMINAL_SIGMA_M**2 + efe.ARRIVAL_ERROR_M**2
+    beam_entropy = np.log((sigma**2 + efe.ARRIVAL_ERROR_M**2) / nominal_variance).mean(axis=2) / 2
     gain = efe.place_information(motions.weights, ranges, sigma, range_max)
     return ExpectedFreeEnergy(
-        NATS_PER_METRE * (motions.lengths + onwards),
-        motions.weights @ beams / motions.weights.sum(),
+        NATS_PER_METRE * (motions.lengths + rest_of_path),
+        motions.weights @ beam_entropy / motions.weights.sum(),
         np.zeros(len(gain)),
         gain * novelty(motions.displacements[:, :2]),
     )

@@ -1,4 +1,4 @@
-"""The interface of a policy, and the decision that it returns."""
+"""Interface of a policy, and the decision that it returns."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from common.messages.definitions import Belief, Scan
 
 
-State = Literal["navigating", "blocked", "lost", "exploring"]
+DecisionState = Literal["navigating", "blocked", "lost", "exploring"]  # the states of Status that a policy may set
 
 
 def _no_points() -> Array:
@@ -25,7 +25,7 @@ class Decision:
 
     action: Array = field(default_factory=lambda: np.zeros(3))  # (3,) m/s, m/s, rad/s in base_link
     reason: str = ""  # shown in Status; empty if nothing hinders the robot
-    state: State = "navigating"
+    state: DecisionState = "navigating"
     path: Array = field(default_factory=_no_points)  # (K, 2) m in map, to the goal or destination
     motion: Array = field(default_factory=_no_points)  # (T, 2) m in map, predicted for the action until standstill
     recovering: bool = False  # a recovery motion, which does not lead to the goal
@@ -43,22 +43,22 @@ class Policy(Protocol):
         """
 
     def set_goal(self, goal: Array | None) -> None:
-        """Start towards a goal (2,) m in map, or none. Forgets everything about the previous goal."""
+        """Starts towards a goal (2,) m in map, or none. Forgets everything about the previous goal."""
 
     def interrupt(self) -> None:
-        """Discard the current manoeuvre: the robot stopped, or is driven by hand."""
+        """Discards the current manoeuvre: the robot stopped, or is driven by hand."""
 
     def resume(self) -> None:
         """Undo the last `interrupt`: the simulation was only paused, no simulated time has passed."""
 
     def prepare(self, scan: Scan) -> None:
-        """Compute what depends on the scanner; called with each scan, before its belief."""
+        """Computes what depends on the scanner; called with each scan, before its belief."""
 
     def observe(self, scan: Scan, belief: Belief) -> None:
-        """Process a scan and the belief computed from it."""
+        """Processes a scan and the belief computed from it."""
 
     def decide(self, belief: Belief, velocity: Array) -> Decision:
-        """Choose a velocity towards the goal when the pose is known; ``velocity`` (3,) is the latest command."""
+        """Chooses a velocity towards the goal when the pose is known; ``velocity`` (3,) is the latest command."""
 
     def decide_unlocalised(self, belief: Belief, velocity: Array) -> Decision:
-        """Choose a velocity when the belief is lost, localising or ambiguous."""
+        """Chooses a velocity when the belief is lost, localising or ambiguous."""

@@ -27,9 +27,9 @@ RESOLUTION = np.diag([0.1, 0.1, np.deg2rad(2.5)]) ** 2
 # Standard deviation, in m and rad, that a metre without scans adds to a position and a heading. It is as far as the
 # robot could have got, which is what an estimator without odometry assumes.
 DRIFT_PER_METRE = 1.0
-OUTLIERS = 0.25  # the share of beams that the estimator's likelihood expects to end early
+OUTLIER_SHARE = 0.25  # share of the beams that the estimator's likelihood expects to end early
 ARRIVAL_ERROR_M = 0.05  # the robot does not stop exactly at the place for which a scan is predicted
-INDEPENDENT_SECTORS = 8  # a person, or an edge off its place, spoils a sector of the scan rather than one beam
+INDEPENDENT_SECTORS = 8  # a person, or a displaced edge, spoils a sector of neighbouring beams rather than one beam
 MIN_BEAM_OVERLAP = 1e-6  # lower limit of one beam's overlap, so that a product of 50 beams does not underflow
 
 
@@ -100,7 +100,7 @@ def place_information(
     ranges: Array,
     sigma: Array,
     range_max: float,
-    outliers: float = OUTLIERS,
+    outliers: float = OUTLIER_SHARE,
     arrival_error: float = ARRIVAL_ERROR_M,
     sectors: int = INDEPENDENT_SECTORS,
 ) -> Array:

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 MISS_PROBABILITY = 0.5  # that a scan does not show a cell that it should see
 MIN_CELL_NATS = 0.1  # frontier cells with less information are given up: scans do not reach them
 MIN_VIEWPOINT_NATS = 3.0  # a viewpoint that sees less than half a metre of the frontier is not worth a stop
-VIEWPOINT_SPACING_M = 0.4
+VIEWPOINT_SPACING_M = 0.4  # of the candidate viewpoints
 EXTRA_CLEARANCE_M = 0.05  # around the robot, because walls that are seen later may be nearer
 MAX_VIEWPOINTS = 12  # of a tour: those with most information
 MIN_SHORTENING_M = 0.5  # by which a tour must be shorter to replace the present target, so that the robot goes on

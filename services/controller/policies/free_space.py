@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.geometry.world import World
 
-RESOLUTION_M = 0.1
+RESOLUTION_M = 0.1  # cell size for planning
 MAX_CELLS = 2_000_000  # a world that would need more cells gets larger ones
 MAX_CLEARANCE_M = 3.0  # in a growing map; computing larger ones would take long
 
@@ -122,5 +122,5 @@ class FreeSpace:
         return np.asarray(slope / np.maximum(np.hypot(slope[..., 0], slope[..., 1]), 1e-9)[..., None])
 
 
-# Nowhere is free.
+# Stands for the map before the first one arrives: no cell is free.
 NO_MAP = FreeSpace(Grid((0.0, 0.0), RESOLUTION_M, (1, 1)), np.full((1, 1), -1.0), np.zeros((1, 1), bool))

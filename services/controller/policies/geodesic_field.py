@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 
 WALL_GAP_M = 0.03  # minimum distance between footprint and wall, a little more than the obstacle stop needs
 WALL_COST_RANGE_M = 0.35  # range of clearances beyond the minimum within which a metre costs more
-STOP_RANGE_M = 0.05  # and once more within this range, where noise in the scan makes the obstacle stop brake the robot
+STOP_RANGE_M = 0.05  # within this range it costs even more: there, noise in the scan makes the obstacle stop brake
 MAX_WALL_COST = 1.0  # additional cost of a metre at the minimum clearance, for each of the two ranges
 UNKNOWN_COST = 30.0  # additional cost of a metre where nothing is known: a path through it is the last resort
 ATTRACTOR_RANGE_M = 3.0  # length of the path within which the attractor is chosen
-MAX_ATTRACTOR_CANDIDATES = 12
+MAX_ATTRACTOR_CANDIDATES = 12  # points of the path that are tried, evenly spaced
 MAX_LINE_COST_RATIO = 1.02  # cost of the straight line to the attractor, relative to the path on the grid
 # Half of the 16 neighbours as (rows, columns); the other half are their opposites. A knight's move passes over two more
 # cells, which must be free as well.
@@ -43,7 +43,7 @@ class FreeSpaceGraph:
     """Graph of the free cells. Edge weights are costs, given the walls and the temporary obstacles."""
 
     def __init__(self, free: FreeSpace, radius: float) -> None:
-        """Build the graph for a footprint of ``radius`` m, without temporary obstacles."""
+        """Builds the graph for a footprint of ``radius`` m, without temporary obstacles."""
         self.free, self.grid, self.radius = free, free.grid, radius
         self.min_clearance = radius + WALL_GAP_M
         self.clearance = free.clearance  # (rows, columns) m, to walls and temporary obstacles
@@ -61,7 +61,7 @@ class FreeSpaceGraph:
         self._centres = self.grid.centres()
 
     def set_obstacles(self, points: Array) -> None:
-        """Replace the temporary obstacles by ``points`` (K, 2) m in map."""
+        """Replaces the temporary obstacles by ``points`` (K, 2) m in map."""
         range_m, before = self.min_clearance + WALL_COST_RANGE_M, self._near_obstacles
         self.clearance, self._near_obstacles = self.free.clearance, np.zeros(self.grid.cells, bool)
         if len(points):
@@ -75,7 +75,7 @@ class FreeSpaceGraph:
         self._update_weights(before | self._near_obstacles)
 
     def set_extra_cost_per_metre(self, cost: Array) -> None:
-        """Set an additional cost (cells,) of a metre in each cell."""
+        """Sets an additional cost (cells,) of a metre in each cell."""
         self._extra_cost_per_metre = cost
         self._update_weights(np.ones(self.grid.cells, bool))
 
@@ -85,7 +85,7 @@ class FreeSpaceGraph:
         return csr_matrix((self._length, self._graph.indices, self._graph.indptr), shape=self._graph.shape, copy=True)
 
     def _update_weights(self, changed: npt.NDArray[np.bool_]) -> None:
-        """Recompute the weights of all edges of the ``changed`` cells (cells,) bool."""
+        """Recomputes the weights of all edges of the ``changed`` cells (cells,) bool."""
         clearance, cost = self.clearance.ravel(), self.cost_per_metre.ravel()
         cost[changed] = cost_near_walls(clearance[changed], self.min_clearance) + self._extra_cost_per_metre[changed]
         outgoing = np.flatnonzero(changed[self._from])

@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from common.robot.base import Robot
 
 HOLD_S = 0.4  # how long most policies hold their action; the next scan leads to a new decision
-STEP_S = 1 / 15
+STEP_S = 1 / 15  # time step of predicted motion: the scan period of the shipped scanner
 SHORT_HOLDS_S = STEP_S * np.arange(1, 6)  # of policies that brake, or stop turning, for their target later
 TURN_ACCELERATION_SHARE = 0.4  # share of the acceleration that a turn during motion may use
-NEAR_ATTRACTOR_M = 0.5
+NEAR_ATTRACTOR_M = 0.5  # nearer than this, the robot does not turn to the attractor any more
 STANDING_SPEED = 0.02  # m/s or rad/s; anything slower counts as standing
 
 
@@ -132,7 +132,7 @@ def turn_rate(angle: float, robot: Robot, hold: float = STEP_S) -> float:
 
 
 def turn_to_attractor(action: Array, attractor: Array, robot: Robot, *, may_turn: bool, forward: float = 0.0) -> Array:
-    """Add a turn to the action (3,) of a holonomic base, so that the scanner looks where the robot goes.
+    """Adds a turn to the action (3,) of a holonomic base, so that the scanner looks where the robot goes.
 
     The side at bearing ``forward`` rad in base_link is turned towards the attractor (2,) m. The heading is kept near
     the attractor if that lies ahead. Returns the action unchanged for a differential base, and if ``may_turn`` is

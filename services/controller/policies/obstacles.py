@@ -42,7 +42,7 @@ class TemporaryObstacles:
         self._columns = int(np.ceil(free.grid.shape[1] * free.grid.resolution / CELL_M)) + 1
 
     def change_map(self, free: FreeSpace) -> None:
-        """Use another map of the same place. Obstacles that are walls in it are no longer obstacles."""
+        """Uses another map of the same place. Obstacles that are walls in it are no longer obstacles."""
         points, first, last = self.points(), self._first_seen, self._last_seen
         self._use(free)
         keep = self._unmapped(points)
@@ -55,7 +55,7 @@ class TemporaryObstacles:
         return self._free.grid.inside(points) & (self._free.clearance_at(points) > MIN_WALL_DISTANCE_M)
 
     def update(self, scan: Scan, pose: Array) -> None:
-        """Add and remove cells according to a scan taken at a reliable pose (3,) of base_link in map."""
+        """Adds and removes cells according to a scan taken at a reliable pose (3,) of base_link in map."""
         laser = se2.compose(pose, scan.mount.array())
         ranges = scan.ranges.astype(np.float64)
         angles = scan.angles()
@@ -102,7 +102,7 @@ class TemporaryObstacles:
         self._last_seen = np.concatenate([self._last_seen, stamps])[order]
 
     def _remove_cleared(self, scan: Scan, laser: Array, stamp_ns: int) -> None:
-        """Remove cells through which a beam passed, cells not seen for long, and cells from before a reset."""
+        """Removes cells through which a beam passed, cells not seen for long, and cells from before a reset."""
         if not len(self._cells):
             return
         offset = self.points() - laser[:2]

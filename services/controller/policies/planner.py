@@ -15,7 +15,7 @@ from common.robot.scan_geometry import ALL_ROUND, Sweep
 from common.runtime import safety
 from services.controller.policies import expected_free_energy as efe
 from services.controller.policies.active_localisation import ActiveLocaliser, CandidateMotions
-from services.controller.policies.decision import Decision, State
+from services.controller.policies.decision import Decision, DecisionState
 from services.controller.policies.free_space import NO_MAP, FreeSpace
 from services.controller.policies.geodesic_field import WALL_COST_RANGE_M, CostField, FreeSpaceGraph
 from services.controller.policies.goal_check import near_wall, refusal_text, wall_refusal
@@ -36,9 +36,9 @@ REPLAN_PERIOD_NS = 400_000_000  # minimum time between two plans when obstacles 
 REPLAN_PERIOD_FAR_NS = 1_500_000_000  # the same when obstacles change elsewhere
 STUCK_AFTER_NS = 3_000_000_000  # time without motion after which the robot backs off
 BACK_OFF_NS = 3_000_000_000  # how long it backs off
-BLIND_AHEAD = "the scanner does not look ahead, and this base goes nowhere else: mount it so that it does"
-MIN_PROGRESS_M = 0.004  # near the goal, the robot must get nearer by this much to count as not stuck
-UNREACHABLE_M = 100.0  # stands for an infinite distance to the goal
+BLIND_AHEAD = "a differential base drives ahead, but the scanner does not see there: mount the scanner facing ahead"
+MIN_PROGRESS_M = 0.004  # near the goal, the robot counts as stuck unless it gets nearer by this much
+UNREACHABLE_M = 100.0  # counts as the distance to a goal to which no path leads
 OBSTACLE_RANGE_M = 3.0  # obstacles farther from the robot do not matter to its next second
 
 
@@ -48,12 +48,12 @@ class GeodesicPolicy:
     def __init__(
         self, robot: Robot, world: World | None, *, keep_heading: bool = False, epistemic: bool = True
     ) -> None:
-        """Build the graph of the world, or without a world wait for a map (`use_map`).
+        """Builds the graph of the world, or without a world waits for a map (`use_map`).
 
         ``keep_heading``: a holonomic base does not turn into its direction of motion. ``epistemic``: policies are also
         judged by the information that they gain; otherwise the robot drives on as if the best hypothesis were true.
         """
-        # In a growing map, the information of scans is unknown where the map is unknown.
+        # In a growing map this is off, because the information of a scan cannot be computed where the map is unknown.
         self.epistemic = epistemic and world is not None
         self.robot, self.world, self.keep_heading = robot, world, keep_heading
         self.free = NO_MAP if world is None else FreeSpace.of(world)
@@ -70,7 +70,7 @@ class GeodesicPolicy:
         # Stamp at which obstacles were last given to the graph, and their cells; whether the field is older than that.
         self._planned: tuple[int, npt.NDArray[Any]] = (-REPLAN_PERIOD_NS, np.zeros(0, int))
         self._field_outdated = False
-        self._vetted_component: int | None = None  # the component from which the goal is known to be reachable
+        self._reachable_from: int | None = None  # component of the graph from which the goal is known to be reachable
         self._field_of_view = ALL_ROUND
         # Least distance from the goal in m, and the stamp at which the robot got there; None until it is near the goal.
         self._nearest: tuple[float, int] | None = None
@@ -107,38 +107,38 @@ class GeodesicPolicy:
         return refusal_text(self._map_name, goal, near_wall(clearance))
 
     def use_map(self, graph: FreeSpaceGraph, *, jumped: bool) -> None:
-        """Plan in a new version of the mapper's map; with ``jumped`` it does not fit what was seen so far."""
+        """Plans in a new version of the mapper's map; if places ``jumped`` in it, forgets the obstacles seen so far."""
         self.free, self.graph = graph.free, graph
         if jumped:
             self.obstacles = TemporaryObstacles(self.free)
         else:
             self.obstacles.change_map(self.free)
         self.localiser.use_graph(graph)
-        self.field = self._component = self._vetted_component = None
+        self.field = self._component = self._reachable_from = None
         self._planned = (-REPLAN_PERIOD_NS, np.zeros(0, int))
 
     def set_goal(self, goal: Array | None) -> None:
-        """Set the goal (2,) m in map, or none."""
-        self._goal, self.field, self._vetted_component = goal, None, None
+        """Sets the goal (2,) m in map, or none."""
+        self._goal, self.field, self._reachable_from = goal, None, None
         self.localiser.reset()
         self.interrupt()
 
     def interrupt(self) -> None:
-        """Stop watching for progress: a robot that does not drive to its goal is not stuck."""
+        """Stops watching for progress: a robot that does not drive to its goal is not stuck."""
         self._standing_since_ns = self._backing_off_until_ns = self._nearest = None
 
     def resume(self) -> None:
-        """Do nothing: `interrupt` discarded nothing that has to be restored."""
+        """Does nothing: `interrupt` discarded nothing that has to be restored."""
 
     def prepare(self, scan: Scan) -> None:
-        """Compute from the first scan the information of scans in each place; metres with little of it cost more."""
+        """Computes, with the first scan, how informative scans are in each place; uninformative places cost more."""
         if not self.epistemic or self._information is not None:
             return
         self._information = ScanInformation.of(self.graph, scan, 1 / (STEP_S * self.robot.max_speed))
         self.graph.set_extra_cost_per_metre(self._information.ambiguity.ravel() / efe.NATS_PER_METRE)
 
     def observe(self, scan: Scan, belief: Belief) -> None:
-        """Update the scanner's field of view, and while tracking the obstacles and the component of the graph."""
+        """Updates the scanner's field of view, and while tracking the obstacles and the component of the graph."""
         self._field_of_view = Sweep.of(scan).sector(scan.mount.yaw)
         self._scan = scan
         if belief.state != "tracking":
@@ -150,7 +150,7 @@ class GeodesicPolicy:
             self._component = int(self.graph.component[cell])
 
     def decide(self, belief: Belief, velocity: Array) -> Decision:
-        """Choose the velocity of least expected free energy; ``velocity`` (3,) in base_link is the latest command."""
+        """Chooses the velocity of least expected free energy; ``velocity`` (3,) in base_link is the latest command."""
         # The pose at which the command takes effect; until then the latest command applies.
         ahead = velocity * delay_until_effect(self.robot, self._scan)
         pose, stamp_ns = se2.compose(belief.pose.array(), ahead), belief.stamp_ns
@@ -177,17 +177,17 @@ class GeodesicPolicy:
         self._watch_progress(stamp_ns, moving=is_moving(velocity))
         standing = not selected.action.any()
         reason = self._reason(pose, surroundings, hindered=selected.hindered, standing=standing)
-        state: State = "blocked" if reason and standing else "navigating"
+        state: DecisionState = "blocked" if reason and standing else "navigating"
         motion = se2.transform(pose, selected.motion[:, :2])
         return Decision(action, reason, state, path, motion, terms=selected.terms)
 
     def _refusal_from_here(self) -> str | None:
         """The reason why the goal cannot be reached from where the robot is; checked again when that changes."""
-        if self._goal is None or self._component == self._vetted_component:
+        if self._goal is None or self._component == self._reachable_from:
             return None
         refusal = self.refusal(self._goal)
         if refusal is None:
-            self._vetted_component = self._component
+            self._reachable_from = self._component
         return refusal
 
     def prediction_request(self, belief: Belief) -> CandidateMotions | None:
@@ -197,7 +197,7 @@ class GeodesicPolicy:
         return self.localiser.prediction_request(belief)
 
     def use_predictions(self, reply: PredictReply) -> None:
-        """Take the predictions for the last `prediction_request`."""
+        """Uses the scans that were predicted for the last `prediction_request`."""
         if self._scan is not None:
             self.localiser.use_predictions(reply, self._scan.range_max, self._to_goal)
 
@@ -210,7 +210,7 @@ class GeodesicPolicy:
         return np.minimum(self.field.cost.ravel()[self.free.grid.cell_of(points)], UNREACHABLE_M)
 
     def decide_unlocalised(self, belief: Belief, velocity: Array) -> Decision:
-        """Move so that the pose becomes known. Without `epistemic`, drive to the goal from the best hypothesis."""
+        """Moves so that the pose becomes known. Without `epistemic`, drives to the goal from the best hypothesis."""
         if self._scan is None:
             return Decision(reason=f"standing until localised: the belief is {belief.state}")
         if self.epistemic or belief.state != "ambiguous":
@@ -218,13 +218,13 @@ class GeodesicPolicy:
             points = safety.scan_points(self._scan)
             points = points[np.hypot(*points.T) < OBSTACLE_RANGE_M]
             return self.localiser.decide(belief, self._scan, points, velocity, self._field_of_view)
-        self._nearest = None  # a robot that stands at its goal by the best guess is not stuck
+        self._nearest = None  # a robot that stands at its goal under the best hypothesis is not stuck
         decision = self.decide(belief, velocity)
-        decision.reason = decision.reason or f"the belief is {belief.state}: going by its best guess"
+        decision.reason = decision.reason or f"the belief is {belief.state}: assuming its best hypothesis"
         return decision
 
     def _plan(self, position: Array, points: Array, stamp_ns: int) -> None:
-        """Recompute the field if the goal or the obstacles, ``points`` (K, 2) m in map, changed.
+        """Recomputes the field if the goal or the obstacles, ``points`` (K, 2) m in map, changed.
 
         If there is a usable field, the obstacles are given to the graph with one scan and the field follows with the
         next, because each of the two takes milliseconds.
@@ -252,7 +252,7 @@ class GeodesicPolicy:
         max_goal_shift = self.robot.radius + 2 * self.free.grid.resolution
         self.field, self.field_changed, self.closed = self.graph.cost_field(self._goal, max_goal_shift), True, False
         if self.field is None or not self.field.reaches(position):
-            # Obstacles leave no path. Drive by the map alone, up to what closes the path, and wait there.
+            # Obstacles leave no path. Drive by the map alone, up to the obstacle that blocks the path, and wait there.
             self.graph.set_obstacles(np.zeros((0, 2)))
             self.field, self.closed = self.graph.cost_field(self._goal, max_goal_shift), bool(len(points))
 
@@ -283,7 +283,7 @@ class GeodesicPolicy:
         )
 
     def _watch_progress(self, stamp_ns: int, *, moving: bool) -> None:
-        """Start backing off after `STUCK_AFTER_NS` without motion."""
+        """Starts backing off after `STUCK_AFTER_NS` without motion."""
         if moving:
             self._standing_since_ns = None
         elif self._standing_since_ns is None or stamp_ns < self._standing_since_ns:
@@ -294,7 +294,7 @@ class GeodesicPolicy:
     def _stop_short(
         self, stamp_ns: int, pose: Array, place: Array, surroundings: Surroundings, path: Array
     ) -> Decision | None:
-        """The decision to stand short of a goal that is too near to something; None while the robot may get nearer.
+        """The decision to stop before a goal that is too near to a wall or obstacle; None while the robot gets nearer.
 
         ``place`` (2,) m is the end of the ``path``: the goal, or the free place nearest to it.
         """
@@ -305,8 +305,8 @@ class GeodesicPolicy:
         elif self._nearest is None or stamp_ns < self._nearest[1] or distance < self._nearest[0] - MIN_PROGRESS_M:
             self._nearest = (distance, stamp_ns)
         # Several cells may be about as near to the goal, so the robot need not stand in a certain one.
-        short = float(np.hypot(*(place - self._goal)))
-        arrived = short > 0 and distance < short + self.free.grid.resolution
+        shift = float(np.hypot(*(place - self._goal)))
+        arrived = shift > 0 and distance < shift + self.free.grid.resolution
         stuck = self._nearest is not None and stamp_ns - self._nearest[1] > STUCK_AFTER_NS
         if np.hypot(*surroundings.points.T).min(initial=np.inf) < 2 * self.robot.radius:  # it may go away
             reason = f"{distance:.2f} m from the goal, {self._hindrance(pose, surroundings, standing=True)}"

@@ -23,14 +23,16 @@ if TYPE_CHECKING:
 
 HEADING_FADE_M = 0.3  # closer to the attractor, the cost of turning towards it fades out
 BLIND_SPEED = 0.25  # m/s into directions that the scanner does not see, for a base that may not turn; others turn first
-# The field of view must extend this far beyond the direction of motion, because the body is wide. In a narrow one,
-# motion is still allowed in the part around its centre that this divisor gives.
+# The field of view must extend this far to either side of the direction of motion, because the body is wide. In a
+# field of view too narrow for that, motion is allowed in its middle third.
 FIELD_OF_VIEW_MARGIN_RAD, FIELD_OF_VIEW_DIVISOR = np.pi / 4, 3
-CHANGE_COST_S = 0.02  # m to go that a change of the velocity by 1 m/s must gain, so that policies do not alternate
+# Cost in m of a change of velocity by 1 m/s, so that the choice does not alternate between policies of equal merit.
+CHANGE_COST_S = 0.02
+WALKING_SPEED = 1.0  # m/s at which moving obstacles are assumed to approach
 LINE_SAMPLES = (np.arange(6) + 0.5) / 6  # shares of the line to the attractor at which its information is looked up
 MOTION_SAMPLES = 5  # every so many steps of a motion
-HINDERED_M = 0.05  # m to go that obstacles must cost before the status says so
-GAP_TOLERANCE_M = 1e-3
+HINDERED_M = 0.05  # the status names obstacles if they make the way longer by this much
+GAP_TOLERANCE_M = 1e-3  # for rounding errors
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class Surroundings:
     moving: Array  # (K,) bool, points that may approach
     min_wall_distance: float  # m from the robot's centre
     min_point_distance: float  # m from the robot's centre
-    walking_speed: float = 1.0  # m/s assumed for moving points
+
     field_of_view: Sector = ALL_ROUND  # directions that the scanner sees
     may_turn: bool = True  # if the base may turn, it never has to move into a direction that the scanner does not see
 
@@ -81,7 +83,7 @@ class Surroundings:
         static = self.points[(distance < reach) & np.logical_not(self.moving)]
         if len(static):
             gap = np.minimum(gap, least_distance(positions, static) - self.min_point_distance)
-        approach = self.walking_speed * times[in_motion]
+        approach = WALKING_SPEED * times[in_motion]
         moving = self.points[self.moving & (distance < reach + approach.max(initial=0.0))]
         if len(moving):
             remaining = least_distance(positions[in_motion], moving) - self.min_point_distance - approach
@@ -124,9 +126,9 @@ class PoseBelief:
         ends, length = motions[:, -1, :2], path_lengths(motions)
         line = ends[:, None] + LINE_SAMPLES[:, None] * (attractor - ends)[:, None]
         points = se2.transform(self.pose, np.concatenate([motions[:, ::MOTION_SAMPLES, :2], line], axis=1))
-        onwards = np.hypot(*(attractor - ends).T)
-        metres = np.full(points.shape[:2], 1.0)  # that each point stands for
-        metres[:, -len(LINE_SAMPLES) :] *= onwards[:, None] / len(LINE_SAMPLES)
+        line_length = np.hypot(*(attractor - ends).T)
+        metres = np.full(points.shape[:2], 1.0)  # length of the part of the way that each point represents
+        metres[:, -len(LINE_SAMPLES) :] *= line_length[:, None] / len(LINE_SAMPLES)
         metres[:, : -len(LINE_SAMPLES)] *= length[:, None] / (points.shape[1] - len(LINE_SAMPLES))
         ambiguity = np.sum(metres * self.scans.free_grid.interpolate(self.scans.ambiguity, points), axis=1)
         information = self.scans.matrix[self.scans.grid.cell_of(se2.transform(self.pose, ends))]

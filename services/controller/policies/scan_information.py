@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from services.controller.policies.free_space import FreeSpace
     from services.controller.policies.geodesic_field import FreeSpaceGraph
 
-CELL_M = 0.5
+CELL_M = 0.5  # the information of scans changes slowly over the map
 MAX_CELLS = 10_000  # a map that would need more gets larger cells, so that the first scan takes about a second at most
-DIRECTIONS = 48
+DIRECTIONS = 48  # of the rays that stand for a scan, evenly spaced over a full turn
 DEFAULT_SIGMA_M = 0.02  # of a range, if the scanner does not state it
 MAP_ERROR_M = 0.01  # of a surface along its normal
 MIN_INCIDENCE = 0.05  # cosine of the angle between beam and normal, below which the first order no longer holds
-MAX_RAY_STEPS = 60
+MAX_RAY_STEPS = 60  # of sphere tracing
 UNKNOWN_VARIANCE = 1e4  # m² and rad², of a pose about which scans give no information
 
 
@@ -98,8 +98,8 @@ def _propagate_deviation(graph: FreeSpaceGraph, deviation: Array) -> Array:
     There it is that of the scans, ``deviation`` (cells,) in m or rad; on the way it grows by `efe.DRIFT_PER_METRE`.
     """
     distance = deviation / efe.DRIFT_PER_METRE
-    # Dijkstra's algorithm starts at an additional node, as far from each cell as the way on which the deviation of the
-    # scans there would grow. Edges of length 0 would be none.
+    # Dijkstra's algorithm starts at an additional node. Its distance from a cell is the way on which the deviation
+    # would grow to that of the scans there. A sparse matrix stores no edge of length 0.
     additional = csr_matrix(np.append(np.maximum(distance, 1e-9), 0.0))
     lengths = graph.lengths
     lengths.resize((len(distance), len(distance) + 1))

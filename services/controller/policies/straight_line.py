@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from services.controller.policies.decision import Decision, State
+from services.controller.policies.decision import Decision, DecisionState
 from services.controller.policies.goal_check import wall_refusal
 from services.controller.policies.paper_action import (
     ActionParameters,
@@ -33,29 +33,29 @@ class StraightLinePolicy:
         self._action_before_interrupt = np.zeros(2)
 
     def refusal(self, goal: Array) -> str | None:
-        """The reason why a goal (2,) m in map cannot be reached: a wall within the robot's radius; None if it can."""
+        """The reason why a goal (2,) m in map cannot be reached: a wall within the robot's radius. None if it can."""
         return None if self.world is None else wall_refusal(self.world, goal, self.robot.radius)
 
     def set_goal(self, goal: Array | None) -> None:
-        """Set the goal (2,) m in map, and the sum of equation 4 to zero."""
+        """Sets the goal (2,) m in map, and the sum of equation 4 to zero."""
         self._goal, self._action = goal, np.zeros(2)
 
     def interrupt(self) -> None:
-        """Set the sum of equation 4 to zero; `resume` restores it."""
+        """Sets the sum of equation 4 to zero; `resume` restores it."""
         self._action_before_interrupt, self._action = self._action, np.zeros(2)
 
     def resume(self) -> None:
-        """Restore the sum of equation 4 from before the last `interrupt`."""
+        """Restores the sum of equation 4 from before the last `interrupt`."""
         self._action = self._action_before_interrupt
 
     def prepare(self, scan: Scan) -> None:
-        """Do nothing: this policy uses the belief alone."""
+        """Does nothing: this policy uses the belief alone."""
 
     def observe(self, scan: Scan, belief: Belief) -> None:
-        """Do nothing: this policy uses the belief alone."""
+        """Does nothing: this policy uses the belief alone."""
 
     def decide(self, belief: Belief, velocity: Array) -> Decision:  # noqa: ARG002 - the sum replaces the last velocity
-        """Add one step of equation 4."""
+        """Adds one step of equation 4."""
         if self._goal is None:
             return Decision()
         pose = belief.pose.array()
@@ -67,5 +67,5 @@ class StraightLinePolicy:
     def decide_unlocalised(self, belief: Belief, velocity: Array) -> Decision:  # noqa: ARG002
         """Stand until the pose is known."""
         self._action = np.zeros(2)
-        state: State = "lost" if belief.state == "lost" else "navigating"
+        state: DecisionState = "lost" if belief.state == "lost" else "navigating"
         return Decision(reason=f"standing until localised: the belief is {belief.state}", state=state)

@@ -123,9 +123,9 @@ def find(folder: Path, world: str, preset: str, beams: int) -> Path:
     return known[beams]
 
 
-def nearest(folder: Path, world: str, preset: str, beams: int) -> Path:
-    """The weights file for the number of beams nearest to ``beams``. Raises UserError if there is none at all."""
-    known = available(folder, world, preset)
+def nearest(folder: Path, world: str, beams: int) -> Path:
+    """The weights file of preset paper whose number of beams is nearest to ``beams``; raises UserError without any."""
+    known = available(folder, world, "paper")
     if not known:
-        return find(folder, world, preset, beams)
+        return find(folder, world, "paper", beams)
     return known[min(known, key=lambda count: (abs(count - beams), -count))]

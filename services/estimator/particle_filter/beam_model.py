@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from common.geometry.world import World
 
 HEADINGS = 360  # of the table; ranges are interpolated between them
-MAX_CELLS = 20_000_000
+MAX_CELLS = 20_000_000  # of the table of expected ranges
 
 
 @dataclass(frozen=True)

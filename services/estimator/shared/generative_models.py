@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from common.geometry.world import World
 
 CORNER_ANGLE_RAD = 0.3  # a surface tilted by more is a corner, and not a ripple caused by learning
-PASSED_M = 1e-3  # behind a surface, from where the next one is sought
-EXACT_SCALE_M = 1e-4  # stated error of exact rays, for rounding
+PASSED_M = 1e-3  # distance behind a surface from which a ray is continued, so that it does not hit the same surface
+EXACT_SCALE_M = 1e-4  # standard deviation stated for exact rays: their rounding errors
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Expected:
         return Expected(self.ranges[rows], self.scale[rows], self.jacobian[rows])
 
     def beams(self, first: int, end: int) -> Expected:
-        """Returns the scans with only the beams from ``first`` to before ``end``."""
+        """Returns the scans with only the beams ``first`` to ``end`` - 1."""
         return Expected(self.ranges[:, first:end], self.scale[:, first:end], self.jacobian[:, first:end])
 
 
@@ -77,7 +77,7 @@ class RayCaster:
         """Predicts scans; see GenerativeModel."""
         lasers, angles = np.array(lasers, float).reshape(-1, 3), np.asarray(angles, float)
         ranges, jacobian = cast_rays_with_jacobian(self.world, lasers, angles)
-        # A laser cannot be inside something, so what the map has there was removed.
+        # A laser cannot be inside an object, so an object of the map around it must have been removed.
         for k in np.flatnonzero(self.world.surface_distance(lasers[:, :2]) < 0):
             rays = _advanced(lasers[k], angles, ranges[k] + PASSED_M)
             further, derivatives = cast_rays_with_jacobian(self.world, rays, np.zeros(1))
@@ -95,7 +95,7 @@ class RayCaster:
             hit = np.flatnonzero(np.isfinite(row))
             start = row[hit] + PASSED_M
             inside = _advanced(lasers[k], angles[hit], start)
-            # Out of the thing that was hit; rays do not hit a circle from inside.
+            # Continue from the far side of the object that was hit. Rays do not hit a circle from inside.
             x, y, radius = self.world.circles.T
             in_circle = (np.hypot(inside[:, :1] - x, inside[:, 1:2] - y) < radius).any(axis=1)
             start += np.where(in_circle, 0.0, cast_rays(self.world, inside, np.zeros(1))[:, 0] + PASSED_M)

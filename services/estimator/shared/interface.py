@@ -1,4 +1,4 @@
-"""The PoseEstimator protocol, and what it takes and returns: Observation, Posterior, Hypothesis, Predicted."""
+"""The interface of pose estimators: the PoseEstimator protocol, and the types of its arguments and results."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Observation:
 
 
 def start_belief(pose: Array, covariance: Array) -> tuple[Array, Array]:
-    """Mean (3,) and covariance (3, 3) near ``pose`` (3,); all headings are equally likely if it is (2,)."""
+    """Mean (3,) and covariance (3, 3) of a belief near ``pose``: a pose (3,), or a position (2,) of unknown heading."""
     if len(pose) == 3:
         return np.asarray(pose, float), np.asarray(covariance, float)
     spread = np.diag([0.0, 0.0, np.pi**2 / 3])
@@ -56,11 +56,12 @@ class Posterior:
     xi: Array  # (3,) minus the gradient of accuracy at the pose, in map
     curvature: Array  # (3, 3) Gauss-Newton Hessian of accuracy, in map
     predicted: Array  # (B,) m, ranges expected at the pose
-    # (B,) m, standard deviation of these; empty if the estimator states none
+    # (B,) m, standard deviations of the predicted ranges; empty if the estimator does not compute them
     sigma: Array = field(default_factory=lambda: np.zeros(0))
-    # that the pose is within 0.2 m and 5 degrees of the truth; None if the estimator states none
+    # Probability that the pose is within 0.2 m and 5 degrees of the truth; None if the estimator does not compute it.
     probability: float | None = None
-    # (3,) m along and across base_link, and rad: errors exceeded in one of 10^4 scans; None if none are stated
+    # Protection level (3,): errors along x and y of base_link (m) and of yaw (rad) that are exceeded in one of 10^4
+    # scans; None if the estimator does not compute it.
     protection: Array | None = None
 
     @property

@@ -21,12 +21,11 @@ class BackEnd:
 
     def __init__(self, laser: Laser) -> None:
         self.laser = laser
-        self.poses = np.zeros(
-            (0, 3)
-        )  # of the key scans, corrected; relative poses are known only where links connect them
+        # Corrected poses of the key scans. The relative pose of two key scans is known only if links connect them.
+        self.poses = np.zeros((0, 3))
         self.closures: list[LoopClosure] = []
         self._uncertainty: Uncertainty | None = None  # of the segments; computed again after a change
-        self._tried: set[tuple[int, int]] = set()  # pairs of segments
+        self._tried: set[tuple[int, int]] = set()  # pairs of segments that were matched, with or without success
         self._joiner = PieceJoiner()
         self._cuts: set[int] = set()  # key scans whose link to the one before turned out to be wrong
 

@@ -17,9 +17,11 @@ from common.robot.ranges import is_surface
 
 HALF_WIDTH_M = 0.06  # of an element, across the beams
 SPACING_M = 0.1  # between elements, across the beams
-MIN_GAP_M, GAP_BEAMS = 0.12, 6.0  # neighbours farther apart than both, in m and in distances between beams, are apart
+# Neighbouring points belong to different surfaces if their distance exceeds both limits; the second one is in units of
+# the distance that beams have at this range on a surface that faces the scanner.
+MIN_GAP_M, GAP_BEAMS = 0.12, 6.0
 MAX_ROUGHNESS_M = 0.03  # standard deviation of the points from the line; rougher elements are corners
-MIN_POINTS = 3
+MIN_POINTS = 3  # from which the direction of a surface is computed
 
 
 @dataclass(frozen=True)
@@ -34,12 +36,12 @@ class Elements:
         """The elements in the parent frame of the frame with ``pose`` (3,)."""
         return Elements(se2.transform(pose, self.points), se2.rotate(float(pose[2]), self.normals), self.lengths)
 
-    def select(self, which: npt.NDArray[np.integer | np.bool_]) -> Elements:
-        """Some of the elements."""
+    def part(self, which: npt.NDArray[np.integer | np.bool_]) -> Elements:
+        """The elements with these indices, or in this mask."""
         return Elements(self.points[which], self.normals[which], self.lengths[which])
 
     def divided(self) -> Elements:
-        """The same surfaces in elements of at most `SPACING_M`; far ones were as long as the beams are apart."""
+        """The same surfaces, in elements of at most `SPACING_M`; where beams are sparse, elements are longer."""
         count = np.maximum(np.ceil(self.lengths / SPACING_M), 1).astype(int)
         which = np.repeat(np.arange(len(self)), count)
         number = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
@@ -74,7 +76,7 @@ def elements_of_scan(ranges: Array, angles: Array, mount: Array, range_max: floa
 
 
 def _windows(along: Array, surface: npt.NDArray[np.int_]) -> tuple[npt.NDArray[np.int_], npt.NDArray[np.int_]]:
-    """First point, and the one after the last, of each element; all of them on one ``surface`` (N,).
+    """Index of the first point and of the one after the last of each element; an element lies on one ``surface`` (N,).
 
     ``along`` (N,) m are the places of the points along the scan.
     """

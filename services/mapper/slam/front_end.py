@@ -37,28 +37,29 @@ from services.mapper.slam.registration import (
 from services.mapper.slam.search import search
 from services.mapper.slam.segments import PosedScans, Segment, compare_segments
 
-KEY_DISTANCE_M, KEY_TURN_RAD = 0.4, 0.5  # from the last key scan, before another one is taken
-KEY_SHARE = 0.1  # of the median range, if that is a larger distance
+KEY_DISTANCE_M, KEY_TURN_RAD = 0.4, 0.5  # a key scan is taken after a motion of either size since the last one
+KEY_RANGE_SHARE = 0.1  # in large rooms, the distance is this share of the median range instead
 # A scan of which a smaller share matches sees something new. It becomes a key scan after this share of the distance.
 FAMILIAR_SHARE, EARLY_KEY_SHARE = 0.7, 0.25
-SEARCH_WINDOW, SEARCH_RANGE_M = np.array([0.3, 0.3, 0.4]), 10.0  # around the prior; of the elements that take part
+SEARCH_WINDOW = np.array([0.3, 0.3, 0.4])  # m, m, rad to either side of the prior's mean
+SEARCH_RANGE_M = 10.0  # farther elements take no part in the search
 LOCAL_SCANS = 12  # key scans in the local map
-MIN_SHARE = 0.2  # of a scan's elements that must match the local map
+MIN_MATCHED_SHARE = 0.2  # share of a scan's elements that must match the local map
 # Largest share of contradicting elements, among those that agree with or contradict the local map, at a pose that may
-# be right; and the number of elements that are taken to agree in addition, so that a few contradictions prove nothing.
+# be right. This many agreeing elements are added as a pseudo-count, so that a few contradictions prove nothing.
 MAX_CONTRADICTION, PRIOR_AGREEMENT = 0.22, 10
-# A scan with a larger share than this, and so many times the largest one until now, begins a piece. The largest one
-# fades over about so many scans.
+# A scan is doubtful if its share of contradictions exceeds the first limit, and the recent maximum by the ratio. The
+# recent maximum decays with a time constant of this many scans.
 DOUBTFUL_CONTRADICTION, DOUBTFUL_RATIO, FADING_SCANS = 0.05, 1.5, 50
-MAX_SUSPECT_SCANS = 10  # in a row; the last of them begins another piece
+MAX_SUSPECT_SCANS = 10  # after this many suspect scans in a row, the last of them begins another piece
 MAX_SLIP = 6.0  # standard deviations of the motion; a scan that matches farther from the prior begins a piece
-CLOSE_TO_PRIOR = np.array([0.1, 0.1, 0.1])  # m, m, rad: after a suspect scan, a match farther away may be chance
-NO_PIECE = -1
+CLOSE_TO_PRIOR = np.array([0.1, 0.1, 0.1])  # m, m, rad: after a suspect scan, a match farther away may be accidental
+NO_PIECE = -1  # of a suspect scan, instead of the number of a piece
 # Standard deviations of the motion. With odometry: of its error, as a share of the motion. Without: of the change of
 # the velocity in one second, m/s and rad/s, and of the velocity itself where the last one is unknown.
 ODOMETRY_PATH, ODOMETRY_TURN_BY_PATH, ODOMETRY_TURN = 0.4, 0.5, 1.0  # m/m, rad/m, rad/rad
-ACCELERATION = np.array([1.0, 1.0, 3.0])
-MAX_VELOCITY = np.array([1.0, 1.0, 1.5])
+ACCELERATION = np.array([1.0, 1.0, 3.0])  # change of the velocity in one second
+MAX_VELOCITY = np.array([1.0, 1.0, 1.5])  # the velocity itself
 STANDING_DEVIATION = np.array([0.002, 0.002, 0.002])  # m, m, rad: in addition to both
 MAX_MOTION = 3 * MAX_VELOCITY  # in one second; a robot that seems to move faster was kidnapped
 # Scans over which these deviations are learned, and the largest error that counts, in deviations.
@@ -69,7 +70,7 @@ REGISTRATION_DEVIATION = np.array([0.005, 0.005, 0.002])
 
 @dataclass(frozen=True)
 class KeyScanGraph:
-    """Key scans and the links between them, from the front end: exact over some metres, with drift beyond."""
+    """Key scans and the links between them, from the front end: precise over some metres, with drift beyond."""
 
     poses: Array  # (K, 3)
     elements: list[Elements]
@@ -135,7 +136,7 @@ class FrontEnd:
         self._scale = np.ones(3)  # of the deviations of the motion, learned
         self._since_key = np.zeros((3, 3))  # covariance of the motion since the last key scan, by the motion model
         self._suspect_scans = 0  # in a row until now
-        self._recent_contradiction = 0.0  # largest share of elements, in the last scans of which little matched
+        self._recent_contradiction = 0.0  # recent maximum of the share of contradictions, see `FADING_SCANS`
 
     def add(self, stamp: float, ranges: Array, odom: Array | None = None) -> ScanPose:
         """Registers a scan ``ranges`` (B,) m at ``stamp`` s, later than the one before, with or without odometry."""
@@ -160,13 +161,13 @@ class FrontEnd:
         return self._add_suspect(scan, prior.mean) if suspect else self._add_unmatched(scan, prior.mean)
 
     def key_scans(self) -> KeyScanGraph:
-        """The key scans so far."""
+        """Returns the key scans so far."""
         poses = np.array([self.poses[key] for key in self.keys])
         pieces = np.array(self._key_pieces)
         return KeyScanGraph(poses, self._elements.copy(), self._ranges.copy(), self._links.copy(), pieces)
 
     def track(self) -> TrackedDrive:
-        """The drive so far."""
+        """Returns the drive so far."""
         return TrackedDrive(
             np.array(self.poses), np.array(self.pieces), self.keys.copy(), self.key_scans(), self.unmatched
         )
@@ -201,9 +202,10 @@ class FrontEnd:
         return PosePrior(se2.compose(last, motion), np.asarray(np.linalg.inv(covariance), float)), covariance
 
     def _register(self, scan: _Scan, prior: PosePrior, period: float) -> Registration | None:
-        """Registers a scan to the local map, from the prior's mean; None if too little matches.
+        """Registers a scan to the local map, starting at the prior's mean; returns None if too little matches.
 
-        If only a part matches, also from the pose at the velocity so far, and from the results of a search.
+        If only a part of the scan matches, also starts at the pose that the last velocity predicts and at the results
+        of a search.
         """
         surface, elements = self._surface, scan.elements
         found = register(surface, elements, prior.mean, prior)
@@ -211,13 +213,13 @@ class FrontEnd:
             return found
         last = self.poses[-1]
         starts = [last if self._velocity is None else se2.compose(last, self._velocity * period)]
-        near = elements.select(np.hypot(*elements.points.T) < SEARCH_RANGE_M)
+        near = elements.part(np.hypot(*elements.points.T) < SEARCH_RANGE_M)
         if len(near):
             starts += list(search(surface.elements, near, prior.mean, SEARCH_WINDOW))
         others = [register(surface, elements, start, prior) for start in starts]
         matches = [each for each in (found, *others) if each is not None]
         best = min(matches, key=lambda each: each.cost, default=None)
-        return None if best is None or best.share < MIN_SHARE else best
+        return None if best is None or best.share < MIN_MATCHED_SHARE else best
 
     def _is_suspect(self, found: Registration | None, prior: PosePrior, period: float) -> bool:
         """Whether a registration implies that the robot was kidnapped, or may match by chance."""
@@ -239,7 +241,7 @@ class FrontEnd:
         return counted.contradicting / (counted.agreeing + PRIOR_AGREEMENT + counted.contradicting)
 
     def _is_doubtful(self, contradiction: float) -> bool:
-        """Whether a share of contradictions is more than moving things caused until now."""
+        """Whether a share of contradictions is more than moving objects have caused recently."""
         before = self._recent_contradiction
         self._recent_contradiction = max(contradiction, before * (1 - 1 / FADING_SCANS))
         return contradiction > max(DOUBTFUL_CONTRADICTION, DOUBTFUL_RATIO * before)
@@ -294,9 +296,9 @@ class FrontEnd:
         self.pieces.append(scan_pose.piece)
 
     def _is_key_due(self, scan: _Scan, *, familiar: bool) -> bool:
-        """Whether the last scan is far from the last key scan."""
+        """Whether the last scan is so far from the last key scan that it has to become one."""
         off = se2.between(self.poses[self.keys[-1]], self.poses[-1])
-        distance = max(KEY_DISTANCE_M, KEY_SHARE * _median_range(scan.elements))
+        distance = max(KEY_DISTANCE_M, KEY_RANGE_SHARE * _median_range(scan.elements))
         share = max(np.hypot(off[0], off[1]) / distance, abs(off[2]) / KEY_TURN_RAD)
         return bool(share >= (1.0 if familiar else EARLY_KEY_SHARE))
 

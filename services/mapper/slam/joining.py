@@ -22,11 +22,11 @@ from services.mapper.slam.search import search
 from services.mapper.slam.segments import Segment, compare_segments, submap
 
 TARGET_SPACING_M = 2.0  # between segments of the map in which a segment is searched for
-SEARCH_RANGE_M, TURN_STEP = 4.0, 0.06  # m from them, and rad between the headings tried
-SAME_PLACE_M, SAME_PLACE_RAD = 0.5, 0.1  # candidates that place a segment closer together than this agree
-MIN_SUPPORT = 2  # segments that agree
-# A place is refuted by this share of contradictions with the nearest segments, more than people cause.
-MAX_CONTRADICTION, NEAREST = 0.03, 3
+SEARCH_RANGE_M, TURN_STEP = 4.0, 0.06  # m to either side of a target, and rad between the headings that are tried
+SAME_PLACE_M, SAME_PLACE_RAD = 0.5, 0.1  # two candidates agree if they place the piece this close together
+MIN_SUPPORT = 2  # number of segments that must agree
+# A place is rejected if more than this share of the elements contradicts the nearest segments; people cause less.
+MAX_CONTRADICTION, NEAREST_SEGMENTS = 0.03, 3
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ def is_contradicted(
 ) -> bool:
     """Whether a segment at a pose (3,) contradicts the segments ``targets``.
 
-    It does if the contradictions are more than those between successive segments, which moving things cause.
+    It does if there are more contradictions than between successive segments, where moving objects cause them.
     """
     nearest = _nearest(pose, targets, segments, poses)
     if not nearest:
@@ -177,7 +177,7 @@ def is_contradicted(
 def _nearest(pose: Array, targets: Sequence[int], segments: Sequence[Segment], poses: Array) -> list[int]:
     """Those of the segments ``targets`` that are nearest to a pose (3,)."""
     distance = np.hypot(*(poses[[segments[k].reference for k in targets], :2] - pose[:2]).T) if targets else np.zeros(0)
-    return [targets[k] for k in np.argsort(distance)[:NEAREST] if distance[k] < MAX_DISTANCE_M]
+    return [targets[k] for k in np.argsort(distance)[:NEAREST_SEGMENTS] if distance[k] < MAX_DISTANCE_M]
 
 
 def _contradiction_among_successive(number: int, segments: Sequence[Segment], poses: Array) -> float:

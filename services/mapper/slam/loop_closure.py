@@ -1,7 +1,7 @@
 """Loop closures: links between segments that saw the same place at different times.
 
-The graph's own uncertainty limits where to look. A match counts only if neither side saw through what the other saw
-there, and, if the search was wide, only together with another match that agrees (Mangelson et al. 2018).
+The uncertainty of the pose graph limits the search. A match counts only if neither segment saw through the surfaces of
+the other, and, if the search was wide, only together with another match that agrees (Mangelson et al. 2018).
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from services.mapper.slam.search import search
 from services.mapper.slam.segments import Agreement, Segment, compare_segments, submap
 
 MAX_DISTANCE_M = 6.0  # between the references of segments that are matched
-MIN_APART = 3  # segments between two that are matched
-MAX_TARGETS = 2  # for each segment in one round
-SEARCH_SIGMAS = 3.0  # standard deviations of the graph, half the width of the search window
+MIN_APART = 3  # segments that are closer than this in the sequence are not matched
+MAX_TARGETS = 2  # segments with which one segment is matched in one round
+SEARCH_SIGMAS = 3.0  # half the width of the search window, in standard deviations of the graph
 NO_SEARCH_WINDOW = np.array([0.3, 0.3, 0.1])  # m, m, rad: a smaller window needs no search
 MIN_MATCHED, MIN_SHARE = 60, 0.85  # elements, and their share among those that match or contradict
 RIVAL_SHARE = 0.8  # of the best score: a better match at another place means that the place is not unique
-SAME_PLACE_M, SAME_PLACE_RAD = 0.3, 0.15
+SAME_PLACE_M, SAME_PLACE_RAD = 0.3, 0.15  # two matches that differ by more are of different places
 MAX_SQUARED_DEVIATION = 16.3  # chi squared with three degrees of freedom, 0.1 %
 # Standard deviations of a match beyond its noise: the segment is not quite rigid.
 MATCH_DEVIATION = np.array([0.01, 0.01, 0.003])
@@ -143,15 +143,15 @@ def _close_loop(
 
 def _is_plausible(match: SegmentMatch, predicted: Array, covariance: Array) -> bool:
     """Whether a match agrees with the pose (3,) that the graph predicts within ``covariance`` (3, 3)."""
-    off = match.pose - predicted
-    off[2] = se2.wrap(off[2])
-    return bool(off @ np.linalg.solve(covariance + match.covariance, off) < MAX_SQUARED_DEVIATION)
+    difference = match.pose - predicted
+    difference[2] = se2.wrap(difference[2])
+    return bool(difference @ np.linalg.solve(covariance + match.covariance, difference) < MAX_SQUARED_DEVIATION)
 
 
 def _is_rival(match: SegmentMatch, best: SegmentMatch) -> bool:
     """Whether a match is at another pose than the best one, and nearly as good."""
-    off = match.pose - best.pose
-    elsewhere = bool(np.hypot(off[0], off[1]) > SAME_PLACE_M or abs(se2.wrap(off[2])) > SAME_PLACE_RAD)
+    dx, dy, turn = match.pose - best.pose
+    elsewhere = bool(np.hypot(dx, dy) > SAME_PLACE_M or abs(se2.wrap(turn)) > SAME_PLACE_RAD)
     return match.score > RIVAL_SHARE * best.score and elsewhere
 
 

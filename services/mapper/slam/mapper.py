@@ -43,7 +43,7 @@ class Mapper:
         self._front_end = FrontEnd(laser)
         self._back_end = BackEnd(laser)
         self._origin = np.zeros(3)  # of the front end's frame, in map
-        self._pieces = {0}  # connected to the map, by the last update or by a link that no update has removed
+        self._pieces = {0}  # pieces that are connected to the map, by the last update or by a later link
 
     def add(self, stamp: float, ranges: Array, odom: Array | None = None) -> ScanPose:
         """Returns the pose in map of a scan ``ranges`` (B,) m at ``stamp`` s, with or without odometry (3,)."""

@@ -17,7 +17,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from common.geometry import se2
 from common.geometry.se2 import Array
 
-MAX_STEPS = 20
+MAX_STEPS = 20  # of Gauss-Newton
 CONVERGED = 1e-5  # m and rad
 ANCHOR = 1e8  # information that holds the first pose of each component
 ROBUST_SCALE = 3.0  # standard deviations, of the Cauchy weights of robust links

@@ -15,14 +15,14 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from services.mapper.slam.elements import Elements
 
-NORMAL_DIFFERENCE_M = 0.3  # distance as which a difference of 1 between two unit normals counts
+NORMAL_DIFFERENCE_M = 0.3  # a difference of 1 between two unit normals counts as this distance
 PARTNER_RADII_M = (0.6, 0.6, 0.5, 0.4, 0.3, 0.2, 0.2, 0.2)  # largest distance of partners, iteration by iteration
 RESIDUAL_M = 0.03  # standard deviation of the distance between partners, and scale of the Cauchy weights
 PRIOR_SCALE = 2.0  # standard deviations, scale of the prior's Cauchy weight: wheels slip
 PRIOR_INFLATION = 2.0  # factor on the deviations of the prior, because those of the elements are too large as well
 MATCHED_M = 0.15  # an element whose partner is nearer than this is matched
-MIN_PARTNERS = 10
-CORRELATED_ELEMENTS = 10.0  # that match or fail together, because they belong to one thing
+MIN_PARTNERS = 10  # elements with a counterpart in the target; with fewer there is no match
+CORRELATED_ELEMENTS = 10.0  # number of elements that match or fail together, because they belong to one object
 
 
 @dataclass
@@ -50,9 +50,9 @@ class PosePrior:
 
     def difference(self, pose: Array) -> tuple[Array, float]:
         """Difference (3,) of the mean from a pose, and its squared Mahalanobis distance."""
-        off = self.mean - pose
-        off[2] = se2.wrap(off[2])
-        return off, float(off @ self.information @ off)
+        difference = self.mean - pose
+        difference[2] = se2.wrap(difference[2])
+        return difference, float(difference @ self.information @ difference)
 
 
 NO_PRIOR = PosePrior(np.zeros(3), np.zeros((3, 3)))

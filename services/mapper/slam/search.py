@@ -10,18 +10,18 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from services.mapper.slam.elements import Elements
 
-CELL_M = 0.15
+CELL_M = 0.15  # of the grid that is searched
 SECTORS = 8  # of the directions of normals
 TURN_STEP = 0.03  # rad
-MAX_ELEMENTS = 200  # of the group that is moved
+MAX_ELEMENTS = 200  # of the moved group that are used
 PEAKS = 4  # poses returned
 PEAK_DISTANCE_M, PEAK_TURN = 0.5, 0.15  # between them
 
 
 def search(target: Elements, moved: Elements, around: Array, window: Array, turn_step: float = TURN_STEP) -> Array:
-    """The best poses (K, 3) of ``moved`` in ``target``, within ``window`` (3,) m, m, rad of ``around`` (3,)."""
+    """The best poses (K, 3) of ``moved`` in the frame of ``target``, at most ``window`` (3,) from ``around`` (3,)."""
     window = np.minimum(window, [np.inf, np.inf, np.pi])
-    sample = moved.select(np.linspace(0, len(moved) - 1, min(len(moved), MAX_ELEMENTS)).astype(int))
+    sample = moved.part(np.linspace(0, len(moved) - 1, min(len(moved), MAX_ELEMENTS)).astype(int))
     reach = np.hypot(*sample.points.T).max() + np.hypot(*window[:2])
     low = around[:2] - reach - 2 * CELL_M
     grid = _rasterise(target, low, int(2 * (reach + 2 * CELL_M) / CELL_M) + 2)

@@ -15,7 +15,7 @@ from common.robot.scan_geometry import Sweep
 from services.mapper.slam.elements import Elements, concatenate
 from services.mapper.slam.registration import MATCHED_M, Surface
 
-KEY_SCANS_PER_SEGMENT = 8
+KEY_SCANS_PER_SEGMENT = 8  # successive ones that form a segment
 PERSON_M, GAP_M = 0.7, 0.3  # size of a person, the largest moving object, and largest gap between its parts
 PASSED_M = 0.3  # behind an element, along its normal, from where a beam counts as having passed through it
 
@@ -118,8 +118,8 @@ def compare_segments(first: Segment, surface: Surface, second: Segment, pose: Ar
     second_matches = surface.partner_distances(placed) < MATCHED_M
     first_matches = Surface(placed).partner_distances(first.elements) < MATCHED_M
     first_in_second = first.elements.transformed(se2.inverse(pose))
-    contradicting = _count_contradicting(first.scans, placed.select(~second_matches))
-    contradicting += _count_contradicting(second.scans, first_in_second.select(~first_matches))
+    contradicting = _count_contradicting(first.scans, placed.part(~second_matches))
+    contradicting += _count_contradicting(second.scans, first_in_second.part(~first_matches))
     matched = int(second_matches.sum())
     return Agreement(matched, matched + int(first_matches.sum()), contradicting)
 

@@ -14,7 +14,7 @@ from common.messages.requests import PlayerReply, PlayerRequest
 from common.messages.topics import CMD_VEL, HEALTH, ROOT, TOPICS, Topic
 
 MAX_LAG_S = 1.0  # a replay that lags further behind continues from its position instead of catching up
-MAX_STEPS = 10_000
+MAX_STEPS = 10_000  # in one request
 LOOP_GAP_S = 0.1  # pause between the end of a loop and its next pass
 
 
@@ -36,7 +36,7 @@ class Player:
             return self._position
         return min(self.end, self._position + max(0.0, now - self._since) * self.rate)
 
-    def wait(self, position: float, now: float) -> float:
+    def time_until(self, position: float, now: float) -> float:
         """Seconds until a message at ``position`` is due: 0 if it is due now, infinity while paused."""
         if self._steps:
             return 0.0

@@ -157,7 +157,7 @@ class Replay:
     ) -> bool:
         """Waits until a message is due and answers requests meanwhile. Returns False if it must not be published."""
         while True:
-            wait = self.player.wait(position, time.monotonic())
+            wait = self.player.time_until(position, time.monotonic())
             entry = self.inbox.get(min(wait, POLL_PERIOD_S))
             if isinstance(entry, IncomingRequest):
                 self._answer(entry)
@@ -165,7 +165,7 @@ class Replay:
                 on_progress(self.player.state(time.monotonic()))
             if stop.is_set() or self.control.quitting or self.player.seek_pending:
                 return False
-            if entry is None and self.player.wait(position, time.monotonic()) <= 0:
+            if entry is None and self.player.time_until(position, time.monotonic()) <= 0:
                 return True
 
     def _wait_at_end(self, on_progress: Callable[[PlayerReply], None], stop: threading.Event) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from common.messages.definitions import Status, Truth
 
-MAX_ROWS = 20
+MAX_ROWS = 20  # shown on the page
 DISTANCE_MARGIN, ANGLE_MARGIN = 0.1, 0.3  # m and rad; smaller displacements are never reported
 ACCELERATION, TURN_ACCELERATION = 2.0, 12.0  # m/s² and rad/s²; more than robots reach
 NUMBERS = re.compile(r"[-+\d.,()]+")

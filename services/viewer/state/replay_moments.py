@@ -27,7 +27,7 @@ class ReplayMoments:
         self._first = self._last = 0.0  # when the first and last new message arrived, s
         self._has_new = False  # messages have arrived since the last `choose`
 
-    def take(self, topic: Topic, message: Stamped, now: float) -> None:
+    def add(self, topic: Topic, message: Stamped, now: float) -> None:
         """Adds a message received at time ``now`` in s."""
         self._by_stamp.setdefault(message.stamp_ns, {})[topic.name] = message
         if len(self._by_stamp) > MAX_STAMPS:

@@ -110,7 +110,7 @@ class RobotView:
         self._received[topic.name] = ReceivedMessage(message, now, published_ns)
         self._update(message)
         if not self.live:
-            self._moments.take(topic, message, now)
+            self._moments.add(topic, message, now)
             return None
         if isinstance(message, Scan):
             self._waiting = (message.stamp_ns, now)

@@ -35,7 +35,7 @@ def scan(i: int = 0) -> Scan:
 
 @contextmanager
 def answering(bus, query, answer):
-    """Answer requests in a thread, as a service's loop does."""
+    """Answers requests in a thread, as a service's loop does."""
     inbox, end = Inbox(), threading.Event()
     bus.serve(query, inbox)
 

@@ -13,10 +13,10 @@ from common.bus.security import (
     ROUTER,
     Member,
     client_rules,
-    credentials,
     may_answer,
     may_put,
     may_query,
+    read_credentials,
     router_rules,
     rules_of,
     service_of,
@@ -131,34 +131,34 @@ def keys(tmp_path_factory):
 
 
 def test_credentials_of_a_robot(keys):
-    assert credentials(keys, ("controller",), "one").member.robots == ("one",)
+    assert read_credentials(keys, ("controller",), "one").member.robots == ("one",)
     with pytest.raises(UserError, match="no credentials of 'controller', but of controller-one, estimator-one"):
-        credentials(keys, ("controller",), "two")
-    assert credentials(keys, ("nobody", "observer"), "one").member.name == "observer"
+        read_credentials(keys, ("controller",), "two")
+    assert read_credentials(keys, ("nobody", "observer"), "one").member.name == "observer"
 
 
 def test_invalid_folders_are_explained(keys, tmp_path):
     with pytest.raises(UserError, match=r"no such folder \(--security"):
-        credentials(tmp_path / "none", ("observer",))
+        read_credentials(tmp_path / "none", ("observer",))
     secure.init(tmp_path)
     (tmp_path / "observer" / "own.key").unlink()
     with pytest.raises(UserError, match=r"own\.key: No such file"):
-        credentials(tmp_path, ("observer",))
+        read_credentials(tmp_path, ("observer",))
     (tmp_path / "viewer" / "identity.json").write_text(json.dumps({"name": "viewer", "role": "king"}))
     with pytest.raises(UserError, match="no role 'king'"):
-        credentials(tmp_path, ("viewer",))
+        read_credentials(tmp_path, ("viewer",))
     (tmp_path / "router" / "members.json").write_text("{}")
     with pytest.raises(UserError, match="members"):
-        credentials(tmp_path, ("router",))
+        read_credentials(tmp_path, ("router",))
 
 
 def test_passwords_are_not_printed(keys):
-    mine = credentials(keys, ("observer",))
+    mine = read_credentials(keys, ("observer",))
     assert mine.password not in repr(mine)
 
 
 def test_missing_rights(keys):
-    mine = credentials(keys, ("controller",), "one")
+    mine = read_credentials(keys, ("controller",), "one")
     mine.check(may_put, CMD_VEL, "one")
     with pytest.raises(UserError, match="'controller-one' is for one, not for robot 'two'"):
         mine.check(may_put, CMD_VEL, "two")

@@ -28,7 +28,7 @@ NOW = 1000.0
     ("service", "beats", "fault"),
     [
         ("estimator", {"a": Report(NOW), "b": Report(NOW)}, ""),
-        ("estimator", {"a": Report(NOW), "b": Report(NOW - 9)}, "b: no sign of life for 9 s"),
+        ("estimator", {"a": Report(NOW), "b": Report(NOW - 9)}, "b: no report for 9 s"),
         ("estimator", {"a": Report(NOW)}, "b: no heartbeat"),
         ("viewer", {"a": Report(NOW)}, ""),  # one process for all robots
         ("simulator", {"a": Report(NOW, note="n")}, "a: no scan was published so far (n)"),
@@ -83,7 +83,7 @@ def test_frozen_service(bus, process, link, tmp_path):
     try:
         frozen = lambda: check("small", tmp_path, PRESAGE_ROBOT=bus.robot)  # noqa: E731
         assert wait_until(lambda: frozen()[0] == 1, 30, period=0.5)
-        assert "no sign of life for" in frozen()[1]
+        assert "no report for" in frozen()[1]
     finally:
         running.send(signal.SIGCONT)
     assert wait_until(lambda: check("small", tmp_path, PRESAGE_ROBOT=bus.robot)[0] == 0, 30, period=0.5)

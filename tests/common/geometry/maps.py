@@ -52,7 +52,7 @@ def speckled(seed, size=9):
 
 
 def write_yaml(folder: Path, *, name="map", **keys) -> Path:
-    """Write map.yaml without an image."""
+    """Writes map.yaml without an image."""
     path = folder / f"{name}.yaml"
     path.write_text(yaml.safe_dump(DEFAULT_KEYS | keys))
     return path

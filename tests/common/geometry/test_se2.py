@@ -12,7 +12,7 @@ from common.geometry import se2
 poses = st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-3.1, 3.1)).map(np.array)
 
 
-def same(a, b, tolerance=1e-8):
+def assert_same_pose(a, b, tolerance=1e-8):
     assert np.hypot(*(a - b)[:2]) < tolerance
     assert abs(float(se2.wrap(a[2] - b[2]))) < tolerance
 
@@ -26,13 +26,13 @@ def test_wrap(angle):
 
 @given(poses, poses, poses)
 def test_group_laws(a, b, c):
-    same(se2.compose(se2.compose(a, b), c), se2.compose(a, se2.compose(b, c)))
-    same(se2.compose(a, se2.inverse(a)), np.zeros(3))
-    same(se2.compose(a, se2.between(a, b)), b)
+    assert_same_pose(se2.compose(se2.compose(a, b), c), se2.compose(a, se2.compose(b, c)))
+    assert_same_pose(se2.compose(a, se2.inverse(a)), np.zeros(3))
+    assert_same_pose(se2.compose(a, se2.between(a, b)), b)
 
 
 def test_known_poses():
-    same(se2.compose([1, 2, np.pi / 2], [3, 0, 0.5]), np.array([1, 5, np.pi / 2 + 0.5]))
+    assert_same_pose(se2.compose([1, 2, np.pi / 2], [3, 0, 0.5]), np.array([1, 5, np.pi / 2 + 0.5]))
     assert se2.compose(np.arange(12.0).reshape(4, 3), [0.2, 0, 0]).shape == (4, 3)
     assert se2.rotate(np.pi / 2, [[1, 0], [0, 1]]) == pytest.approx(np.array([[0, 1], [-1, 0]]))
 

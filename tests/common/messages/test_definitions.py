@@ -30,7 +30,7 @@ def allowed(schema: dict, root: dict) -> list[dict]:
 
 
 def check(value, schema: dict, root: dict, where: str) -> None:
-    """Check the part of JSON schema that messages use; bytes match a string with ``contentEncoding: binary``."""
+    """Checks the part of JSON schema that messages use; bytes match a string with ``contentEncoding: binary``."""
     kind = JSON_TYPES[type(value)]
     options = allowed(schema, root)
     fitting = [o for o in options if o.get("type") in (kind, None) or (kind == "integer" and o.get("type") == "number")]

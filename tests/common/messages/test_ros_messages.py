@@ -33,7 +33,7 @@ def placed(x, y, yaw, roll=0.0) -> Transform:
 @given(METRES, METRES, ANGLES, ANGLES)
 def test_transforms_have_inverses(x, y, yaw, roll):
     one = placed(x, y, yaw, roll)
-    assert one.then(one.inverse()).apart(IDENTITY) < 1e-9
+    assert one.then(one.inverse()).difference(IDENTITY) < 1e-9
     assert np.linalg.det(one.rotation) == pytest.approx(1)
 
 

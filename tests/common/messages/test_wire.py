@@ -58,7 +58,8 @@ def test_bytes_of_arrays():
     assert packed == struct.pack("<2f", 1.0, 2.0)  # little-endian
 
 
-def changed(message, **changes) -> bytes:
+def encoded_with(message, **changes) -> bytes:
+    """The payload of a message after changes of its fields; `...` leaves a field out."""
     data = msgpack.unpackb(message.encode())
     for name, value in changes.items():
         if value is ...:
@@ -76,18 +77,18 @@ BELIEF = Belief(
 GOAL = Goal(stamp_ns=1, pose=Pose(x=0.0, y=0.0))
 REQUEST = PredictRequest(poses=np.zeros((1, 3)))
 COMMAND = CmdVel(stamp_ns=1, twist=Twist(vx=0.5))
-BAD = {
-    "a missing field": changed(COMMAND, twist=...),
-    "a missing stamp": changed(COMMAND, stamp_ns=...),
-    "a negative stamp": changed(COMMAND, stamp_ns=-1),
-    "a stamp that is a float": changed(COMMAND, stamp_ns=1.0),
-    "a stamp that is a bool": changed(COMMAND, stamp_ns=True),
-    "a stamp of 64 bits": changed(COMMAND, stamp_ns=2**64 - 1),
-    "NaN as velocity": changed(COMMAND, twist={"vx": math.nan, "vy": 0.0, "wz": 0.0}),
-    "infinity as velocity": changed(COMMAND, twist={"vx": math.inf, "vy": 0.0, "wz": 0.0}),
-    "text as velocity": changed(COMMAND, twist={"vx": "1", "vy": 0.0, "wz": 0.0}),
-    "None as velocity": changed(COMMAND, twist={"vx": None, "vy": 0.0, "wz": 0.0}),
-    "a list for a map": changed(COMMAND, twist=[0.0, 0.0, 0.0]),
+INVALID_PAYLOADS = {
+    "a missing field": encoded_with(COMMAND, twist=...),
+    "a missing stamp": encoded_with(COMMAND, stamp_ns=...),
+    "a negative stamp": encoded_with(COMMAND, stamp_ns=-1),
+    "a stamp that is a float": encoded_with(COMMAND, stamp_ns=1.0),
+    "a stamp that is a bool": encoded_with(COMMAND, stamp_ns=True),
+    "a stamp of 64 bits": encoded_with(COMMAND, stamp_ns=2**64 - 1),
+    "NaN as velocity": encoded_with(COMMAND, twist={"vx": math.nan, "vy": 0.0, "wz": 0.0}),
+    "infinity as velocity": encoded_with(COMMAND, twist={"vx": math.inf, "vy": 0.0, "wz": 0.0}),
+    "text as velocity": encoded_with(COMMAND, twist={"vx": "1", "vy": 0.0, "wz": 0.0}),
+    "None as velocity": encoded_with(COMMAND, twist={"vx": None, "vy": 0.0, "wz": 0.0}),
+    "a list for a map": encoded_with(COMMAND, twist=[0.0, 0.0, 0.0]),
     "no map at all": msgpack.packb([1, 2, 3]),
     "nil": msgpack.packb(None),
     "keys that are numbers": msgpack.packb({1: 2}),
@@ -106,40 +107,43 @@ BAD = {
     "an impossible time stamp": b"\xc7\x0c\xff" + b"\xff" * 12,
     "a reserved byte": b"\xc1",
 }
-BAD_VALUES = {
-    "bytes that are no whole number": (Scan, changed(a_scan(), ranges=b"12345")),
-    "NaN in a scan": (Scan, changed(a_scan(), ranges=np.float32([1, np.nan]).tobytes())),
-    "a list for an array": (Scan, changed(a_scan(), ranges=[1.0, 2.0])),
-    "text for an array": (Scan, changed(a_scan(), ranges="1234")),
-    "infinity in a covariance": (Odom, changed(ODOM, covariance=np.full((3, 3), np.inf).tobytes())),
-    "rows of the wrong length": (Odom, changed(ODOM, covariance=np.zeros(4).tobytes())),
-    "a gradient of four": (Belief, changed(BELIEF, xi=np.zeros(4, np.float32).tobytes())),
-    "a protection level of two": (Belief, changed(BELIEF, protection=np.zeros(2, np.float32).tobytes())),
-    "a probability above one": (Belief, changed(BELIEF, probability=1.5)),
-    "a covariance of two rows": (Belief, changed(BELIEF, covariance=np.zeros((2, 3)).tobytes())),
-    "an unknown state": (Belief, changed(BELIEF, state="asleep")),
-    "a range_max of nought": (Scan, changed(a_scan(), range_max=0.0)),
-    "a negative range_min": (Scan, changed(a_scan(), range_min=-0.1)),
-    "a scan of more beams than any scanner has": (Scan, changed(a_scan(), ranges=bytes(4 * (MAX_BEAMS + 1)))),
-    "a range of a million kilometres": (Scan, changed(a_scan(), ranges=np.float32([1, 1e9]).tobytes())),
-    "an absurd range_max": (Scan, changed(a_scan(), range_max=1e300)),
-    "an absurd sigma": (Scan, changed(a_scan(), sigma=1e308)),
-    "an absurd angle": (Scan, changed(a_scan(), angle_increment=1e300)),
-    "a scanner mounted outside the solar system": (Scan, changed(a_scan(), mount={"x": 1e300, "y": 0.0, "yaw": 0.0})),
-    "a goal beyond all maps": (Goal, changed(GOAL, pose={"x": 0.0, "y": -1e300, "yaw": 0.0})),
-    "a goal's absurd heading": (Goal, changed(GOAL, pose={"x": 0.0, "y": 0.0, "yaw": 1e300})),
-    "a goal's absurd tolerance": (Goal, changed(GOAL, tolerance=1e300)),
-    "an absurd velocity": (Odom, changed(ODOM, twist={"vx": 1e300})),
-    "a path beyond all maps": (Plan, changed(Plan(stamp_ns=1), path=np.float32([0, 1e20]).tobytes())),
-    "poses beyond all maps": (PredictRequest, changed(REQUEST, poses=np.full(3, 1e300).tobytes())),
-    "a name without end": (Scan, changed(a_scan(), frame_id="x" * 201)),
+INVALID_VALUES = {
+    "bytes that are no whole number": (Scan, encoded_with(a_scan(), ranges=b"12345")),
+    "NaN in a scan": (Scan, encoded_with(a_scan(), ranges=np.float32([1, np.nan]).tobytes())),
+    "a list for an array": (Scan, encoded_with(a_scan(), ranges=[1.0, 2.0])),
+    "text for an array": (Scan, encoded_with(a_scan(), ranges="1234")),
+    "infinity in a covariance": (Odom, encoded_with(ODOM, covariance=np.full((3, 3), np.inf).tobytes())),
+    "rows of the wrong length": (Odom, encoded_with(ODOM, covariance=np.zeros(4).tobytes())),
+    "a gradient of four": (Belief, encoded_with(BELIEF, xi=np.zeros(4, np.float32).tobytes())),
+    "a protection level of two": (Belief, encoded_with(BELIEF, protection=np.zeros(2, np.float32).tobytes())),
+    "a probability above one": (Belief, encoded_with(BELIEF, probability=1.5)),
+    "a covariance of two rows": (Belief, encoded_with(BELIEF, covariance=np.zeros((2, 3)).tobytes())),
+    "an unknown state": (Belief, encoded_with(BELIEF, state="asleep")),
+    "a range_max of nought": (Scan, encoded_with(a_scan(), range_max=0.0)),
+    "a negative range_min": (Scan, encoded_with(a_scan(), range_min=-0.1)),
+    "a scan of more beams than any scanner has": (Scan, encoded_with(a_scan(), ranges=bytes(4 * (MAX_BEAMS + 1)))),
+    "a range of a million kilometres": (Scan, encoded_with(a_scan(), ranges=np.float32([1, 1e9]).tobytes())),
+    "an absurd range_max": (Scan, encoded_with(a_scan(), range_max=1e300)),
+    "an absurd sigma": (Scan, encoded_with(a_scan(), sigma=1e308)),
+    "an absurd angle": (Scan, encoded_with(a_scan(), angle_increment=1e300)),
+    "a scanner mounted outside the solar system": (
+        Scan,
+        encoded_with(a_scan(), mount={"x": 1e300, "y": 0.0, "yaw": 0.0}),
+    ),
+    "a goal beyond all maps": (Goal, encoded_with(GOAL, pose={"x": 0.0, "y": -1e300, "yaw": 0.0})),
+    "a goal's absurd heading": (Goal, encoded_with(GOAL, pose={"x": 0.0, "y": 0.0, "yaw": 1e300})),
+    "a goal's absurd tolerance": (Goal, encoded_with(GOAL, tolerance=1e300)),
+    "an absurd velocity": (Odom, encoded_with(ODOM, twist={"vx": 1e300})),
+    "a path beyond all maps": (Plan, encoded_with(Plan(stamp_ns=1), path=np.float32([0, 1e20]).tobytes())),
+    "poses beyond all maps": (PredictRequest, encoded_with(REQUEST, poses=np.full(3, 1e300).tobytes())),
+    "a name without end": (Scan, encoded_with(a_scan(), frame_id="x" * 201)),
 }
 
 
 @pytest.mark.parametrize("cls", CLASSES, ids=lambda c: c.__name__)
 def test_invalid_payloads(cls):
     errors = []
-    for payload in BAD.values():
+    for payload in INVALID_PAYLOADS.values():
         try:
             cls.decode(payload)
         except DecodeError as error:
@@ -148,7 +152,7 @@ def test_invalid_payloads(cls):
 
 
 def test_invalid_values_are_refused():
-    cases = {**{what: (CmdVel, payload) for what, payload in BAD.items()}, **BAD_VALUES}
+    cases = {**{what: (CmdVel, payload) for what, payload in INVALID_PAYLOADS.items()}, **INVALID_VALUES}
     accepted = []
     for what, (cls, payload) in cases.items():
         with contextlib.suppress(DecodeError):
@@ -169,18 +173,18 @@ def test_values_at_the_limits_are_accepted():
 
 def test_the_error_names_the_field():
     with pytest.raises(DecodeError, match=r"CmdVel\.twist\.vx: .*finite"):
-        CmdVel.decode(BAD["NaN as velocity"])
+        CmdVel.decode(INVALID_PAYLOADS["NaN as velocity"])
     with pytest.raises(DecodeError, match=r"Scan\.ranges: .*1 values are NaN"):
-        Scan.decode(BAD_VALUES["NaN in a scan"][1])
+        Scan.decode(INVALID_VALUES["NaN in a scan"][1])
     with pytest.raises(DecodeError, match=rf"Scan\.ranges: .*{MAX_BEAMS + 1} values are more than {MAX_BEAMS}"):
-        Scan.decode(BAD_VALUES["a scan of more beams than any scanner has"][1])
+        Scan.decode(INVALID_VALUES["a scan of more beams than any scanner has"][1])
     with pytest.raises(DecodeError, match=r"Goal\.pose\.y: .*greater than or equal to -10000"):
-        Goal.decode(BAD_VALUES["a goal beyond all maps"][1])
+        Goal.decode(INVALID_VALUES["a goal beyond all maps"][1])
 
 
 def test_unknown_and_missing_fields():
-    assert CmdVel.decode(changed(COMMAND, colour="red")) == COMMAND
-    assert Scan.decode(changed(a_scan(), scan_time=..., time_increment=..., mount=..., seq=...)) == a_scan()
+    assert CmdVel.decode(encoded_with(COMMAND, colour="red")) == COMMAND
+    assert Scan.decode(encoded_with(a_scan(), scan_time=..., time_increment=..., mount=..., seq=...)) == a_scan()
 
 
 @settings(max_examples=2000)

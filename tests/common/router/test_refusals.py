@@ -6,11 +6,11 @@ from common.router.refusals import Refusal, ZenohLogParser
 
 AT = "2026-01-01T00:00:00.000000Z"
 ACCESS = "zenoh::net::routing::interceptor::access_control"
-SHOWN = (
+CERTIFICATE_READ = (
     f"{AT} DEBUG acc-0 ThreadId(05) zenoh_link_tls::unicast: Accepted TLS connection on 10.0.0.1:7447: "
     "10.0.0.2:50998. Common Name: observer."
 )
-LET_IN = (
+LINK_ACCEPTED = (
     f"{AT} DEBUG acc-0 ThreadId(05) zenoh_transport::unicast::establishment::accept: New transport link accepted from "
     "9e87 to 607b: TransportLinkUnicast { link: Link { src: tls/10.0.0.1:7447, dst: tls/10.0.0.2:50998, mtu: 1 } }"
 )
@@ -26,7 +26,9 @@ def read(*lines):
 
 
 def test_name_of_a_refused_sender():
-    assert read(SHOWN, LET_IN, denied("Put", "presage/r/cmd_vel")) == [Refusal("put", "observer", "presage/r/cmd_vel")]
+    assert read(CERTIFICATE_READ, LINK_ACCEPTED, denied("Put", "presage/r/cmd_vel")) == [
+        Refusal("put", "observer", "presage/r/cmd_vel")
+    ]
     assert read(denied("Put", "presage/r/cmd_vel")) == [Refusal("put", "", "presage/r/cmd_vel")]
 
 
@@ -35,7 +37,9 @@ def test_cached_permissions():
     subject = "9e87 on Interface(lo)+CertCommonName(observer)+Username(observer)"
     planned += [denied(f"Kind{what}", "presage/r/goal", subject, how="") for what in range(9)]
     asked = denied("Query", "presage/r/teleport", subject, how="")
-    assert read(SHOWN, LET_IN, *planned, asked) == [Refusal("query", "observer", "presage/r/teleport")]
+    assert read(CERTIFICATE_READ, LINK_ACCEPTED, *planned, asked) == [
+        Refusal("query", "observer", "presage/r/teleport")
+    ]
 
 
 def test_messages_not_forwarded():
@@ -52,7 +56,7 @@ def test_handshakes():
     accept = f"{AT} DEBUG acc-0 ThreadId(05) zenoh_transport::unicast::establishment::accept: "
     tls = f"{AT}  WARN acc-1 ThreadId(07) zenoh_link_tls::unicast: "
     assert read(
-        SHOWN, accept + "UsrPwd extension - Recv OpenSyn. Invalid password. at /src/x.rs:1.",
+        CERTIFICATE_READ, accept + "UsrPwd extension - Recv OpenSyn. Invalid password. at /src/x.rs:1.",
         accept + "UsrPwd extension - Recv InitSyn. Expected extension. at /src/x.rs:1.",
         tls + "invalid peer certificate: BadSignature. Hint: increase the system open file limit.",
         tls + "peer sent no certificates. Hint: increase the system open file limit.",
@@ -75,5 +79,5 @@ def test_other_errors_of_zenoh_are_passed_on():
 def test_repeated_connections():
     reader = ZenohLogParser()
     for number in range(5000):
-        reader.read(SHOWN.replace("10.0.0.2:50998", f"10.0.0.2:{number}"))
+        reader.read(CERTIFICATE_READ.replace("10.0.0.2:50998", f"10.0.0.2:{number}"))
     assert len(reader._names) <= 1000

@@ -54,7 +54,7 @@ def report(age=0.5, *, linked=True, idle=False, **ages) -> Report:
         ("simulator", report(), "no scan was published so far"),
         ("simulator", report(scan__published=30), "no scan was published for 30 s"),
         ("simulator", report(scan__published=30, idle=True), ""),
-        ("simulator", report(9, scan__published=0.5), "no sign of life for 9 s"),
+        ("simulator", report(9, scan__published=0.5), "no report for 9 s"),
         ("simulator", report(scan__published=0.5, linked=False), "not connected to any session"),
         ("simulator", report(idle=True, linked=False), "not connected to any session"),
         ("remote", report(scan__received=0.5), ""),

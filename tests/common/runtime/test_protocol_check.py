@@ -37,7 +37,7 @@ def reply_of(name="x", protocol=PROTOCOL, uptime=0.0, **versions) -> ConfigReply
 
 
 def started_long_ago(small, bus):
-    """Wait until the service is so old that a new one is clearly later."""
+    """Waits until the service is so old that a new one is clearly later."""
     assert wait_until(lambda: "small" in bus.alive(), WAIT_TIMEOUT_S), small.output
     messages = Inbox()
     bus.subscribe(HEALTH, messages, keep_all=True)

@@ -36,7 +36,7 @@ class Beside:
         assert self.until(lambda h: True)
 
     def until(self, fits) -> bool:
-        """Wait for a health message that satisfies ``fits``; returns whether it arrives."""
+        """Waits for a health message that satisfies ``fits``; returns whether it arrives."""
 
         def look() -> bool:
             while (sample := self.health.get(0)) is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from common.messages.definitions import Hypothesis, Pose
+from common.messages.definitions import BeliefHypothesis, Pose
 from common.robot.base import Robot
 from services.controller.policies.active_localisation import ActiveLocaliser
 from services.controller.policies.free_space import FreeSpace
@@ -19,7 +19,7 @@ ROBOT = Robot()
 def test_weight_of_the_second_hypothesis(weight, counted):
     """An improbable one counts as 5 %, one that would not keep the belief from being tracked not at all."""
     poses = np.array([[3.0, 2.0, 0.0], [7.0, 2.0, 0.0]])
-    hypotheses = [Hypothesis(pose=Pose.of(p), weight=w) for p, w in zip(poses, (1 - weight, weight), strict=True)]
+    hypotheses = [BeliefHypothesis(pose=Pose.of(p), weight=w) for p, w in zip(poses, (1 - weight, weight), strict=True)]
     ambiguous = belief(0, poses[0], "ambiguous").model_copy(update={"hypotheses": hypotheses})
     graph = FreeSpaceGraph(FreeSpace.of(room(10, 4)), ROBOT.radius)
     motions = ActiveLocaliser(ROBOT, graph, 0.33).prediction_request(ambiguous)

@@ -8,7 +8,7 @@ import pytest
 from common.errors import UserError
 from common.geometry import se2
 from common.robot.scanner import SCANNERS, Scanner
-from services.estimator.factory import EstimatorOptions, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.paper.beam_fitting import fit
 from services.estimator.shared.interface import Observation
 from tests.estimator.models import ROOM
@@ -85,7 +85,7 @@ def test_unfit_scanner(scanner, reason):
 
 def test_shipped_weights():
     scanner = SCANNERS["rplidar-a1"].model_copy(update={"mount": SCANNERS["tim571"].mount, "sigma_relative": 0.0})
-    made = prepare(EstimatorOptions("corridor", "paper"))(Geometry.of(scanner))
+    made = prepare_factory(EstimatorOptions("corridor", "paper"))(ScannerGeometry.of(scanner))
     world, pose = made.card.world, np.array([9.0, 1.5, made.card.heading])
     ranges = world.ray_distances(se2.compose(pose, scanner.mount)[None], scanner.angles())[0]
     made.restart(pose)

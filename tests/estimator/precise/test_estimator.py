@@ -16,7 +16,7 @@ from common.limits import MAX_BEAMS
 from lab.accuracy import bound, tasks
 from lab.accuracy.runner import quick_field
 from lab.accuracy.scenes import TIM571, TWINS, Scene
-from services.estimator.factory import EstimatorOptions, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.precise.estimator import TARGET_BEAMS, PreciseEstimator
 from services.estimator.precise.global_seeds import Seeds, thin_places
 from services.estimator.shared.generative_models import RayCaster
@@ -126,7 +126,7 @@ def test_driving_in_a_featureless_hall(learned):
     """Without odometry and features the error along the walls grows, but remains within the stated covariance."""
     made, scene = estimator(HALL, 360)
     if learned:
-        geometry = Geometry(scene.scanner.angles(), np.array(scene.scanner.mount), 25.0)
+        geometry = ScannerGeometry(scene.scanner.angles(), np.array(scene.scanner.mount), 25.0)
         made.model = quick_field(HALL, geometry, np.random.default_rng(0), 3000)
     pose = np.array([27.0, 0.9, 0.1])
     made.restart(pose, np.diag([1e-4, 1e-4, 1e-4]))
@@ -254,7 +254,9 @@ def test_shipped_fields(world):
     """Finds 10 of 10 poses to a few millimetres; nothing was tuned on these poses and this noise."""
     scene = Scene.of(load_world(world), 622, 4242)
     scanner = scene.scanner
-    made = prepare(EstimatorOptions(world))(Geometry(scanner.angles(), np.array(scanner.mount), scanner.range_max))
+    made = prepare_factory(EstimatorOptions(world))(
+        ScannerGeometry(scanner.angles(), np.array(scanner.mount), scanner.range_max)
+    )
     errors = []
     for pose in scene.poses(10):
         made.restart()
@@ -344,7 +346,7 @@ import sys
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
-from services.estimator.factory import EstimatorOptions, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.shared.interface import Observation
 
 def compiled():
@@ -354,10 +356,10 @@ def compiled():
 
 angles = np.linspace(-np.pi, np.pi, 90)
 for model in ("learned", "exact"):
-    make = prepare(EstimatorOptions(model=model))
+    make = prepare_factory(EstimatorOptions(model=model))
     before = compiled()
     assert before
-    made = make(Geometry(angles, np.zeros(3), 25.0))
+    made = make(ScannerGeometry(angles, np.zeros(3), 25.0))
     rng = np.random.default_rng(0)
     for k in range(40):
         pose = np.array([3 + 0.05 * k, 1.5, 0.0] if k < 30 else [12.0, 1.5, 1.0])

@@ -10,7 +10,7 @@ import pytest
 
 from common.geometry.world import load_world
 from lab.accuracy.scenes import Scene
-from services.estimator.factory import EstimatorOptions, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
 
 TWIN = np.array([6.0, 0.0, 0.0])
 WORLD = load_world("twins")
@@ -20,8 +20,8 @@ RATE = 15.0
 def begun(model, seed):
     scene = Scene.of(WORLD, 622, seed)
     scanner = scene.scanner
-    geometry = Geometry(scanner.angles(), np.array(scanner.mount), scanner.range_max)
-    made = prepare(EstimatorOptions("twins", model=model))(geometry)
+    geometry = ScannerGeometry(scanner.angles(), np.array(scanner.mount), scanner.range_max)
+    made = prepare_factory(EstimatorOptions("twins", model=model))(geometry)
     return made, scene
 
 

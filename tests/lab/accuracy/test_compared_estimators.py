@@ -8,7 +8,7 @@ import pytest
 from common.geometry.world import load_world
 from lab.accuracy.compared_estimators import COMPARED_ESTIMATORS, EstimatorSetup, LearnedSurfaces
 from lab.accuracy.scenes import Scene
-from services.estimator.factory import EstimatorOptions, Geometry, load_model
+from services.estimator.factory import EstimatorOptions, ScannerGeometry, load_model
 
 
 @pytest.mark.parametrize(
@@ -16,7 +16,7 @@ from services.estimator.factory import EstimatorOptions, Geometry, load_model
 )
 def test_tracking(name):
     scene = Scene.of(load_world("corridor"), 100, 5000)
-    estimator = COMPARED_ESTIMATORS[name].make(EstimatorSetup(scene.world, Geometry.of(scene.scanner), 0))
+    estimator = COMPARED_ESTIMATORS[name].make(EstimatorSetup(scene.world, ScannerGeometry.of(scene.scanner), 0))
     path = scene.path(1.0)
     estimator.restart(path[0], np.diag([0.01, 0.01, 0.01]))
     for k, (pose, clean) in enumerate(zip(path, scene.clean(path), strict=True)):

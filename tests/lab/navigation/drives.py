@@ -8,11 +8,11 @@ from common.geometry import se2
 from common.geometry.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from common.messages.definitions import (
     Belief,
+    BeliefHypothesis,
     CmdVel,
     Drive,
     Goal,
     Health,
-    Hypothesis,
     LearnedField,
     Map,
     Odom,
@@ -85,8 +85,8 @@ def odometry(i):
 
 def belief(i):
     hypotheses = [
-        Hypothesis(pose=Pose.of(believed(i)), covariance=COVARIANCE, weight=0.75),
-        Hypothesis(pose=Pose(x=7.0, y=3.0), weight=0.25),
+        BeliefHypothesis(pose=Pose.of(believed(i)), covariance=COVARIANCE, weight=0.75),
+        BeliefHypothesis(pose=Pose(x=7.0, y=3.0), weight=0.25),
     ]
     return Belief(
         stamp_ns=i * PERIOD_NS, seq=i, state="ambiguous" if i < 3 else "tracking", pose=Pose.of(believed(i)),

@@ -20,7 +20,7 @@ from presage.learning.map_of_log import MapOptions, map_command
 from presage.learning.train_drive import drive_of
 from presage.logs.log import Reading
 from presage.logs.scan_files import Scans
-from services.estimator.factory import EstimatorOptions, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.shared.generative_models import RayCaster
 from services.estimator.shared.interface import Observation
 from services.mapper.slam.drive import Laser
@@ -139,7 +139,7 @@ def test_swept_scans():
     path = scene.path(5, at_full_speed=True)
     observed = observations(scene, path, "corrected", "laser only")
     ranges, stamps = np.array([each.ranges for each in observed]), np.arange(len(observed)) / scene.scanner.rate
-    geometry, increment = Geometry.of(scene.scanner), observed[0].time_increment
+    geometry, increment = ScannerGeometry.of(scene.scanner), observed[0].time_increment
     swept = Scans(geometry, ranges, stamps, truth=path[:-1], time_increment=increment)
     errors = []
     for each in (swept, replace(swept, time_increment=0.0)):
@@ -158,7 +158,7 @@ def test_refined_map_keeps_the_rough_frame(log, tmp_path):
     placed = np.loadtxt(tmp_path / "fine.tum")[:, 1:3]
     assert (placed - turned[:, :2]).mean(axis=0) == pytest.approx(0, abs=0.01)
     fine = EstimatorOptions(str(tmp_path / "fine.yaml"), models=tmp_path)
-    estimator = prepare(fine)(Geometry(truth.angles, truth.mount, truth.range_max))
+    estimator = prepare_factory(fine)(ScannerGeometry(truth.angles, truth.mount, truth.range_max))
     estimator.restart(turned[0])
     posterior = estimator.update(Observation(truth.ranges[0], truth.angles, truth.range_max, 0.0))
     assert posterior.pose[:2] == pytest.approx(turned[0, :2], abs=0.05)

@@ -10,7 +10,7 @@ from cryptography import x509
 from cryptography.x509.oid import NameOID
 from typer.testing import CliRunner
 
-from common.bus.security import credentials, read_members
+from common.bus.security import read_credentials, read_members
 from common.errors import UserError
 from presage.cli.main import app
 from presage.session import credentials as secure
@@ -63,7 +63,7 @@ def test_overwriting(tmp_path):
 def test_added_and_removed_member(tmp_path):
     secure.init(tmp_path)
     secure.add(tmp_path, "operator", "anna", ["one"])
-    router = credentials(tmp_path, ("router",))
+    router = read_credentials(tmp_path, ("router",))
     assert router.members[-1].robots == ("one",)
     assert (tmp_path / "anna" / "password").read_text().strip() in (tmp_path / "router" / "passwords").read_text()
     secure.remove(tmp_path, "anna")

@@ -16,7 +16,7 @@ def test_checks_leave_no_trace(tmp_path):
     os.mkfifo(tmp_path / "pipe")  # opening it would wait for a reader
     for file in (tmp_path / "new.json", tmp_path / "old", tmp_path / "pipe", Path("/dev/null"), None):
         check_file(file, "--json")
-    make_folder(tmp_path / "a" / "b", "--out")
+    make_folder(tmp_path / "a" / "b")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "old", "pipe"]
     assert (tmp_path / "old").read_text() == "old"
     assert not list((tmp_path / "a" / "b").iterdir())
@@ -32,4 +32,4 @@ def test_unwritable_files(tmp_path, name):
 @pytest.mark.parametrize("folder", ["/dev/null", "/dev/null/x", "/proc/nowhere"])
 def test_unwritable_folders(folder):
     with pytest.raises(UserError, match=f"{folder}: cannot be written to .* choose another folder with --out"):
-        make_folder(Path(folder), "--out")
+        make_folder(Path(folder))

@@ -29,7 +29,7 @@ def play(player, times, now=0.0):
     """Wall times at which messages are published, without any request."""
     published = []
     for at in times:
-        now += player.wait(at, now)
+        now += player.time_until(at, now)
         player.mark_sent(at, now, completes_step=True)
         published.append(now)
     return published
@@ -59,7 +59,7 @@ def test_pause(times, rate, at, length):
     before = [t for t in times if t <= at]
     play(player, before)
     ask(player, "pause", now=now)
-    assert player.wait(100.0, now) == math.inf
+    assert player.time_until(100.0, now) == math.inf
     assert player.position(now + length) == pytest.approx(player.position(now))
     ask(player, "resume", now=now + length)
     after = play(player, [t for t in times if t > at], now + length)
@@ -75,8 +75,8 @@ def test_seek(rate, place, now):
     assert player.seek_pending
     assert player.take_seek_target() == there
     assert not player.seek_pending
-    assert player.wait(there, now) == 0.0
-    assert player.wait(there + rate, now) == pytest.approx(1.0)
+    assert player.time_until(there, now) == 0.0
+    assert player.time_until(there + rate, now) == pytest.approx(1.0)
 
 
 @given(st.lists(st.booleans(), min_size=1, max_size=40), st.integers(1, 5))
@@ -87,7 +87,7 @@ def test_steps(scans, steps):
         ask(player, "step")
     sent = []
     for number, scan in enumerate(scans):
-        if player.wait(float(number), 0.0):
+        if player.time_until(float(number), 0.0):
             break
         player.mark_sent(float(number), 0.0, completes_step=scan)
         sent.append(scan)
@@ -111,22 +111,22 @@ def test_long_delay():
     player = Player(0.0, 100.0, 2.0)
     assert play(player, [0.0, 2.0]) == [0.0, 1.0]
     late = 1.0 + MAX_LAG_S * 50
-    assert player.wait(4.0, late) == 0.0
+    assert player.time_until(4.0, late) == 0.0
     player.mark_sent(4.0, late, completes_step=True)
-    assert player.wait(6.0, late) == pytest.approx(1.0)
+    assert player.time_until(6.0, late) == pytest.approx(1.0)
 
 
 def test_short_delay():
     player = Player(0.0, 100.0)
     player.mark_sent(4.0, 4.0 + MAX_LAG_S / 2, completes_step=True)
-    assert player.wait(5.0, 4.0 + MAX_LAG_S / 2) == pytest.approx(1.0 - MAX_LAG_S / 2)
+    assert player.time_until(5.0, 4.0 + MAX_LAG_S / 2) == pytest.approx(1.0 - MAX_LAG_S / 2)
 
 
 def test_loop():
     player = Player(3.0, 8.0, loop=True)
     player.restart(50.0)
     assert player.take_seek_target() == 3.0
-    assert player.wait(3.0, 50.0) == pytest.approx(LOOP_GAP_S)
+    assert player.time_until(3.0, 50.0) == pytest.approx(LOOP_GAP_S)
     assert player.state(50.0).position_s == 3.0
     assert player.state(50.0).loop
 

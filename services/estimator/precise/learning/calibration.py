@@ -24,10 +24,11 @@ if TYPE_CHECKING:
     from services.estimator.precise.likelihood import Evidence
     from services.estimator.shared.generative_models import Expected, GenerativeModel
 
-EM_STEPS = 30
+EM_STEPS = 30  # of expectation maximisation
 PRIOR_BEAMS = 10.0  # pseudo-count of each kind of beam
 CHI2_MEDIAN = 2.366  # median of chi squared with three degrees of freedom
 MAX_POSITION_ERROR_M = 0.3  # larger errors mean that another place was found; the covariance does not describe them
+# Probabilities at which the calibration curve is evaluated.
 PROBABILITIES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 
 
@@ -51,7 +52,7 @@ class Calibration:
     coverage: tuple[tuple[float, float], ...]  # pairs of a range's cumulative probability and the share of beams below
 
     def settings(self) -> PreciseSettings:
-        """Parameters of the estimator, with shares of explained beams relative to the usual one in this place."""
+        """Parameters of the estimator; the thresholds of explained beams are relative to the usual share here."""
         default = PreciseSettings()
         return PreciseSettings(
             min_explained_share=0.77 * self.usual,
@@ -130,19 +131,19 @@ def _pose_precision(
             inverse = np.linalg.inv(evidence.curvature[0] + np.eye(3))
             errors.append(error + inverse @ evidence.xi[0])
             covariances.append(inverse @ (evidence.xi_noise_covariance[0] + evidence.xi_model_covariance[0]) @ inverse)
-    off, stated = np.array(errors), np.array(covariances)
+    error, stated = np.array(errors), np.array(covariances)
 
     def excess_deviation(values: Array, variance: Array) -> float:
         return float(np.sqrt(max(0.0, (1.4826 * np.median(np.abs(values))) ** 2 - float(np.median(variance)))))
 
-    position = excess_deviation(off[:, :2].ravel(), stated[:, [0, 1], [0, 1]].ravel())
-    heading = excess_deviation(off[:, 2], stated[:, 2, 2])
+    position = excess_deviation(error[:, :2].ravel(), stated[:, [0, 1], [0, 1]].ravel())
+    heading = excess_deviation(error[:, 2], stated[:, 2, 2])
     floor = np.diag([position**2, position**2, heading**2])
 
     def nees(inflation: float) -> Array:
-        return np.asarray(np.einsum("ni,nij,nj->n", off, np.linalg.inv(inflation * stated + floor), off))
+        return np.asarray(np.einsum("ni,nij,nj->n", error, np.linalg.inv(inflation * stated + floor), error))
 
-    low, high = 1.0, 1e4
+    low, high = 1.0, 1e4  # bisection for the inflation
     for _ in range(40):
         middle = float(np.sqrt(low * high))
         low, high = (middle, high) if np.median(nees(middle)) > CHI2_MEDIAN else (low, middle)
@@ -209,10 +210,10 @@ def learn_motion(stamps: Array, poses: Array, odom: Array | None) -> MotionNoise
 
 def _learn_odometry(noise: MotionNoise, steps: Array, odom_steps: Array) -> MotionNoise:
     """Fits the variances per metre and per radian by least squares of the squared errors, each clipped at 99 %."""
-    off = se2.between(odom_steps, steps)
+    error = se2.between(odom_steps, steps)
     by = np.column_stack([np.hypot(odom_steps[:, 0], odom_steps[:, 1]), np.abs(odom_steps[:, 2])])
-    position = np.mean(off[:, :2] ** 2, axis=1)
-    heading = off[:, 2] ** 2
+    position = np.mean(error[:, :2] ** 2, axis=1)
+    heading = error[:, 2] ** 2
     (path_by_path, path_by_turn), (turn_by_path, turn_by_turn) = (
         _non_negative_least_squares(by, np.minimum(square, np.quantile(square, 0.99))) for square in (position, heading)
     )

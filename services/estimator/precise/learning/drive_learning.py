@@ -31,8 +31,8 @@ from services.estimator.precise.noise import estimate_noise
 from services.estimator.shared.generative_models import GenerativeModel
 
 HELD_OUT_EVERY = 5  # every fifth scan is held out, to measure the precision
-MIN_SCANS = 50
-Report = Callable[[str, float], None]
+MIN_SCANS = 50  # of a drive from which a field can be learned and calibrated
+ReportProgress = Callable[[str, float], None]  # called with the present stage and the share done
 
 
 @dataclass(frozen=True)
@@ -46,13 +46,12 @@ class LearningResult:
 
 
 def learn_drive(
-    drive: ReferenceDrive, recipe: Recipe, simulated: Beams | None, report: Report, *, replayed: bool = False
+    drive: ReferenceDrive, recipe: Recipe, simulated: Beams | None, report: ReportProgress, *, replayed: bool = False
 ) -> LearningResult:
-    """Learns the model of a drive, and calibrates it.
+    """Learns a model from a drive, and calibrates it.
 
     ``simulated`` are beams simulated in a map of the place, used where the drive saw nothing. If they are ``replayed``
-    from a former model, they are used unless the drive contradicts them. ``report`` is called with the present stage
-    and the share done.
+    from a former model, they are used unless the drive contradicts them.
 
     The field is learned twice: first without the held-out scans, which measure its precision, then from all scans.
     """
@@ -96,12 +95,12 @@ def _learn_model(
     if simulated is not None and replayed:
         beams = measured.joined(remove_contradicted(measured, simulated, recipe.resolution))
     elif simulated is not None:
-        beams = measured.joined(_outside_of(measured, simulated))
+        beams = measured.joined(_unseen_part(measured, simulated))
     return learn_model(beams, recipe, report)
 
 
 def learn_model(beams: Beams, recipe: Recipe, report: Callable[[float], None] = lambda _done: None) -> FieldModel:
-    """The model that predicts the beams; its scales are not learned."""
+    """Learns a model that predicts the beams; its scales, the deviations of its errors, are left at their defaults."""
     field = learn_field(beams, recipe, lambda _, done: report(done))
     # Rounded to half precision, as the field will be stored and read.
     field = replace(field, phi=field.phi.astype(np.float16).astype(np.float32))
@@ -114,13 +113,13 @@ def free_places(model: FieldModel, places: Array) -> Array:
     return np.asarray(places[free if model.seen is None else free & model.seen.contains(places)])
 
 
-def _outside_of(measured: Beams, simulated: Beams) -> Beams:
-    """The simulated beams that end where no measured beam has passed; a map's walls are as thick as its cells."""
+def _unseen_part(measured: Beams, simulated: Beams) -> Beams:
+    """The simulated beams that end in cells that no measured beam has passed or ended in."""
     return simulated.part(~seen_cells(measured).contains(simulated.ends()))
 
 
 def replay_model(model: GenerativeModel, places: Array, drive: ReferenceDrive, samples: int, seed: int) -> Beams:
-    """Scans of the drive's scanner as a model predicts them, at random ``places`` of (S, 2) m that it knows."""
+    """Beams that a model predicts for the drive's scanner, at ``samples`` random poses at ``places`` (S, 2) m."""
     rng = np.random.default_rng(seed)
     lasers = np.column_stack([rng.choice(places, samples), rng.uniform(-np.pi, np.pi, samples)])
     expected = model.expect(lasers, drive.angles)
@@ -131,8 +130,8 @@ def replay_model(model: GenerativeModel, places: Array, drive: ReferenceDrive, s
 def remove_contradicted(measured: Beams, replayed: Beams, h: float) -> Beams:
     """The beams replayed from a former model that the measured ones do not contradict.
 
-    Left out are those that end at a surface that is gone, or would pass through one that is new: from any side, also
-    from the space behind it, which the measured beams did not see, and from inside it.
+    A beam is contradicted if it ends at a surface that is gone, or passes through a new one: from either side, or from
+    inside it.
     """
     cells = SurfaceCells.of(replayed, h)
     gone = cells.at(cells.contradicted_by(measured), replayed.ends())

@@ -42,30 +42,30 @@ def evaluate_model(
 ) -> ModelErrors:
     """Compares the model with noiseless scans ``ranges`` (N, B) m at base_link poses (N, 3).
 
-    ``sigma`` m is the scanner's noise, ``relative`` its part that grows with the range, as a share of the range.
+    ``sigma`` m is the scanner's noise, and ``relative`` the part of it that grows with the range, as a share of that.
     """
     likelihood = Likelihood(sigma, relative=relative)
     expected = model.expect(se2.compose(poses, mount), angles)
     both = np.isfinite(ranges) & np.isfinite(expected.ranges)
-    error = np.abs(ranges[both] - expected.ranges[both])
-    offsets, misfits, rng = [], [], np.random.default_rng(0)
+    range_error = np.abs(ranges[both] - expected.ranges[both])
+    position_errors, nees, rng = [], [], np.random.default_rng(0)
     for pose, scan in zip(poses, ranges, strict=True):
         for draw in range(1 + NOISE_DRAWS):  # the first one without noise
             noise = likelihood.deviation(scan) * rng.standard_normal(len(scan)) if draw else 0.0
             view = View(model, likelihood, mount, angles, scan + noise, range_max)
             found, evidence = polish(view, pose[None])
             inverse = np.linalg.inv(evidence.curvature[0] + 1e-6 * np.eye(3))
-            off = difference(found, pose[None])[0] + inverse @ evidence.xi[0]  # the last step to the minimum
+            error = difference(found, pose[None])[0] + inverse @ evidence.xi[0]  # with a last step to the minimum
             if draw:
                 covariance = inverse @ (evidence.xi_noise_covariance[0] + evidence.xi_model_covariance[0]) @ inverse
-                misfits.append(float(off @ np.linalg.pinv(covariance, hermitian=True) @ off) / 3)
+                nees.append(float(error @ np.linalg.pinv(covariance, hermitian=True) @ error) / 3)
             else:
-                offsets.append(float(np.hypot(off[0], off[1])))
+                position_errors.append(float(np.hypot(error[0], error[1])))
     return ModelErrors(
-        float(np.median(error)),
-        float(error.mean()),
-        float((error > 0.05).mean()),
-        float(np.median(offsets)),
-        float(np.sqrt(np.mean(np.square(offsets)))),
-        max(1.0, float(np.mean(misfits))),
+        float(np.median(range_error)),
+        float(range_error.mean()),
+        float((range_error > 0.05).mean()),
+        float(np.median(position_errors)),
+        float(np.sqrt(np.mean(np.square(position_errors)))),
+        max(1.0, float(np.mean(nees))),
     )

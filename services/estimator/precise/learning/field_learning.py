@@ -31,15 +31,15 @@ from services.estimator.shared.generative_models import CORNER_ANGLE_RAD
 
 CARVED_DISTANCE_CELLS = 0.5  # minimum of phi at a node through which beams pass
 PASSING_CELLS = 0.25  # a beam passes a node within this distance
-EM_STEPS = 15
+EM_STEPS = 15  # of expectation maximisation
 OUTLIER_SHARE, OUTLIER_RANGE_M = 0.1, 25.0  # weight and width of the uniform part of the density
-BEAMS_AT_ONCE = 2_000_000  # in a sweep, which limits memory
+BEAMS_AT_ONCE = 2_000_000  # processed together in a sweep, which limits memory
 MAX_ERROR_M = 0.1  # a larger error means that the beam ended at another surface
-MIN_FACING = 0.15  # minimum of |n . u| of a beam that shapes the field
+MIN_FACING = 0.15  # minimum |n . u| of a beam that shapes the field: cosine of its angle of incidence
 PRIOR_COUNT, PRIOR_SCALE_M = 20, 0.05  # pseudo-count of each class, and its error, for classes that are seldom seen
 MIN_SCALE_M = 1e-3
-SEED_CLEARANCE_M = 0.1  # from surfaces, of a place where a search begins
-RIPPLE_BEAMS = 10  # apart are the normals that are compared, to either side
+SEED_CLEARANCE_M = 0.1  # minimum distance from surfaces of a place where a search begins
+RIPPLE_BEAMS = 10  # a beam's normal is compared with those of the beams this many beams to either side
 
 
 @dataclass(frozen=True)
@@ -132,8 +132,8 @@ def _clear_passed_nodes(field: DistanceField, beams: Beams) -> Floats:
 def _descend(field: DistanceField, beams: Beams, sample: npt.NDArray[np.intp], rate: float) -> Floats:
     """One sweep of prediction over a sample of the beams.
 
-    Since dr = dphi / |n . u|, an error e = o - r requires dphi = e |n . u| where the beam ends, with weight 1 / |n .
-    u|². Surfaces that most beams passed through are removed: planes extended past an edge, things that moved away.
+    Since dr = dphi / |n . u|, an error e = o - r requires dphi = e |n . u| where the beam ends, with weight
+    1 / |n . u|². Surfaces that most beams passed through are removed: planes extended past an edge, objects that moved.
     """
     ended, passed, up, norm = np.zeros((4, field.phi.size))
     for begin in range(0, len(sample), BEAMS_AT_ONCE):

@@ -1,7 +1,7 @@
 """Key scans: scans at trusted poses, from which the field is learned while driving.
 
-A scan is trusted while the estimator is `tracking` and its protection level is small. It counts only once the robot has
-driven on for `VERIFIED_AFTER_M` and was still tracked: a pose that turns out to be wrong before that leaves no trace.
+A scan is trusted if the estimator is `tracking` and its protection level is small. It is used only if the robot is
+still tracked after driving another `VERIFIED_AFTER_M`. A pose that turns out to be wrong before that is dropped.
 """
 
 from __future__ import annotations
@@ -25,11 +25,12 @@ if TYPE_CHECKING:
 
 PLACE_M, HEADINGS = 0.5, 4  # one key scan is kept for each square of this size and each of these headings
 MAX_KEY_SCANS = 4000  # with 622 beams, 10 MB; if there are more, the squares become twice as large
-MIN_DISTANCE_M, MIN_TURN_RAD = 0.25, 0.35  # from one key scan to the next
+MIN_DISTANCE_M, MIN_TURN_RAD = 0.25, 0.35  # a key scan is taken after a motion of either size
 MAX_PROTECTION = np.array([0.2, 0.2, np.deg2rad(5)])  # m, m, rad: protection level of a trusted pose
 VERIFIED_AFTER_M = 5.0  # of driving: about a room
-MIN_KEY_SCANS, MIN_NEW, MIN_NEW_SHARE = 50, 20, 0.1  # from which it is worth to learn again
-MAX_GAP_S = 1.0  # without `tracking`; afterwards, the robot may be elsewhere
+# A version is learned from at least this many key scans, of which this many and this share are new.
+MIN_KEY_SCANS, MIN_NEW, MIN_NEW_SHARE = 50, 20, 0.1
+MAX_GAP_S = 1.0  # longest time without `tracking` after which the robot is still assumed to be where it was tracked
 # A pose jumps if it moves by more than this between two scans, beyond the speeds of any robot that is expected.
 JUMP_M, JUMP_RAD = 0.2, 0.2
 MAX_SPEED, MAX_TURN = 2.0, 3.0  # m/s, rad/s
@@ -57,8 +58,8 @@ class KeyScanCollector:
         """``angles`` (B,) rad are those of the scanner's beams, ``mount`` (3,) is the laser in base_link."""
         self.angles, self.mount, self.range_max = angles, np.asarray(mount, float), range_max
         self.verified: dict[tuple[int, int, int], KeyScan] = {}  # by cell
-        self.verified_total = 0  # so far
-        self.dropped_total = 0  # because the pose turned out to be wrong
+        self.verified_total = 0  # scans verified so far, including those that newer ones replaced
+        self.dropped_total = 0  # scans dropped because their pose may be wrong
         self._unverified: deque[KeyScan] = deque()
         self._taken_total = 0
         self._size = PLACE_M
@@ -101,7 +102,7 @@ class KeyScanCollector:
         self._last = self._last_key = None
 
     def take_drive(self) -> ReferenceDrive | None:
-        """The verified key scans, in order of time, if enough are new since the last time that they were returned."""
+        """Returns the verified key scans in order of time if enough of them are new since the last time, else None."""
         new = self.verified_total - self._taken_total
         if len(self.verified) < MIN_KEY_SCANS or new < max(MIN_NEW, MIN_NEW_SHARE * len(self.verified)):
             return None
@@ -131,8 +132,8 @@ class KeyScanCollector:
     def _is_due(self, pose: Array) -> bool:
         if self._last_key is None:
             return True
-        off = se2.between(self._last_key, pose)
-        return bool(np.hypot(off[0], off[1]) >= MIN_DISTANCE_M or abs(off[2]) >= MIN_TURN_RAD)
+        motion = se2.between(self._last_key, pose)
+        return bool(np.hypot(motion[0], motion[1]) >= MIN_DISTANCE_M or abs(motion[2]) >= MIN_TURN_RAD)
 
     def _correct_for_motion(self, observation: Observation, velocity: Array) -> Array:
         """Returns the ranges (B,) in m along the scanner's beams, as if all were measured at the stamp."""

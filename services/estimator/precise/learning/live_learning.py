@@ -27,7 +27,7 @@ from services.estimator.precise.learning.field_learning import (
     seed_places,
     seen_cells,
 )
-from services.estimator.precise.learning.frame import align_to_map
+from services.estimator.precise.learning.map_alignment import align_to_map
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.noise import estimate_noise
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from services.estimator.shared.generative_models import GenerativeModel
 
 RECIPE = Recipe(resolution=0.05, sweeps=6, beams_per_sweep=500_000)
-MAX_REPLAYED_SCANS = 2000  # of the original model; not more than there are places
+MAX_REPLAYED_SCANS = 2000  # predicted by the original model; at most one for each place
 PRECISE_M = 1e-3  # error of an original model whose replayed scans count as much as measured ones
 LASTING_S, LASTING_CELL_M = 3.0, 0.1  # a surface is learned if beams end near a cell of it this long after the first
 EPOCHS = 4  # parts of the key scans, of which each may contradict those before it
@@ -64,7 +64,7 @@ def learn_version(
 ) -> ModelVersion | None:
     """Learns a field from key scans and the ``original`` model, which knows the surroundings of ``places`` (S, 2) m.
 
-    Returns None if the model in use, ``present``, predicts the key scans as well.
+    Returns None if the new field predicts held-out key scans no better than the model in use, ``present``.
     """
     tracked = remove_moving_objects(keys)
     sigma = estimate_noise(tracked.ranges, tracked.angles)
@@ -75,6 +75,7 @@ def learn_version(
     for _ in range(ALIGNMENTS):
         aligned = _match_key_scans(_learn(aligned, beside, recipe, 1), aligned, tracked.poses, sigma)
     aligned = align_to_map(original, aligned)
+    # A trial field, learned without the held-out key scans, shows whether learning is an improvement.
     numbers = np.arange(len(aligned.poses))
     is_held_out = numbers % HELD_OUT_EVERY == HELD_OUT_EVERY // 2
     held_out = aligned.part(is_held_out)
@@ -117,7 +118,7 @@ def remove_moving_objects(keys: ReferenceDrive) -> ReferenceDrive:
 
 
 def mean_error(errors: Array) -> float:
-    """The mean of errors (K,) in m, of which larger ones than `MAX_ERROR_M`, at changed surroundings, count as that."""
+    """Mean of errors (K,) in m, each clipped at `MAX_ERROR_M`, because larger ones are due to changed surroundings."""
     return float(np.minimum(errors, MAX_ERROR_M).mean()) if len(errors) else MAX_ERROR_M
 
 
@@ -137,7 +138,7 @@ def _estimate_map_error(model: GenerativeModel, keys: ReferenceDrive, sigma: flo
 
 
 def _split_replayed_beams(replayed: Beams, keys: ReferenceDrive, error: float, seed: int) -> tuple[Beams, Beams]:
-    """Splits the beams replayed from the original model: those that end where key scans saw something, and all others.
+    """Splits the beams replayed from the original model: those that end in cells seen by key scans, and all others.
 
     The rougher the model, the fewer of the first are kept: the ``error`` of the model, in m, does not average out over
     many beams, as the noise of measured beams does.
@@ -148,7 +149,7 @@ def _split_replayed_beams(replayed: Beams, keys: ReferenceDrive, error: float, s
 
 
 def _learn(keys: ReferenceDrive, replayed: Beams, recipe: Recipe, epochs: int) -> FieldModel:
-    """The model of key scans in order of time, and of those older and replayed beams that they do not contradict."""
+    """Learns a model from key scans in ``epochs`` parts, each with the earlier beams that it does not contradict."""
     beams = replayed
     for part in np.array_split(np.arange(len(keys.poses)), epochs):
         measured = Beams.of(keys.poses[part], keys.mount, keys.angles, keys.ranges[part])

@@ -87,7 +87,7 @@ class SurfaceCells:
         dx, dy = pooled(unit[:, 0]), pooled(unit[:, 1])
         angle = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the surface, the long axis of the points
         nx, ny = -np.sin(angle), np.cos(angle)
-        flip = np.where(nx * dx + ny * dy > 0, -1.0, 1.0)  # against the beams, that is, towards free space
+        flip = np.where(nx * dx + ny * dy > 0, -1.0, 1.0)  # normals point against the beams, towards free space
         return cls(low, h, own, mx, my, nx * flip, ny * flip)
 
     @property
@@ -103,7 +103,7 @@ class SurfaceCells:
         return crossed
 
     def contradicted_by(self, beams: Beams) -> npt.NDArray[np.bool_]:
-        """Mask (ny, nx) of cells through whose elements most of the beams pass that meet them."""
+        """Mask (ny, nx) of cells whose surface element is absent: most of the beams that meet it pass through it."""
         crossed = _pooled(self.crossings(beams))
         cell, inside = self._cells_at(beams.ends())
         ended = np.zeros(self.own.shape)
@@ -125,7 +125,7 @@ class SurfaceCells:
 
 
 def are_mostly_passed(ended: Array, passed: Array) -> npt.NDArray[np.bool_]:
-    """Where enough beams passed through, and too small a share ended, for a surface to be there."""
+    """Whether so many beams passed, and so few ended, that no surface can be there; element by element."""
     return np.asarray((passed >= MIN_POINTS_PER_CELL) & (ended < MIN_PRESENT_SHARE * (ended + passed)))
 
 

@@ -1,4 +1,4 @@
-"""Moves key scans as a whole into the frame of a map that is known only roughly."""
+"""Aligns key scans, as one rigid body, to a map that is known only roughly."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from services.estimator.shared.generative_models import GenerativeModel
 
 STEPS = 5  # of Gauss-Newton
-# For surfaces in the cells of a grid
+# The following are for maps that are grids.
 EDGE_M = 0.005  # standard deviation of a surface's distance from the edge of its cell
-MISSING_SHARE = 0.1  # of the surfaces that the grid does not have
-CELL_M, MAX_ELEMENTS = 0.05, 3000  # the elements that stand for the surfaces
-FIRST_STEP_M, LAST_STEP_M = 0.008, 0.0005  # of the search
+MISSING_SHARE = 0.1  # share of the surfaces that the grid does not have
+CELL_M, MAX_ELEMENTS = 0.05, 3000  # size and maximum number of the surface elements that are compared with the grid
+FIRST_STEP_M, LAST_STEP_M = 0.008, 0.0005  # of the compass search
 
 
 def align_to_map(original: GenerativeModel, keys: ReferenceDrive) -> ReferenceDrive:

@@ -9,7 +9,7 @@ from common.geometry.world import load_world
 from lab.accuracy.scenes import Scene
 from lab.integrity.maps import noisy_grid
 from services.estimator.precise.learning.calibration import ReferenceDrive
-from services.estimator.precise.learning.frame import align_to_map, move_into_cells
+from services.estimator.precise.learning.map_alignment import align_to_map, move_into_cells
 from services.estimator.shared.generative_models import RayCaster
 
 
