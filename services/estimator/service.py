@@ -61,9 +61,8 @@ from services.estimator.prediction_query import answer_prediction
 from services.estimator.settings import EstimatorSettings
 from services.estimator.shared.interface import Observation, PoseEstimator, Posterior
 
-FIELD_PERIOD_NS = (
-    30_000_000_000  # the learned field is published again after this time, for recordings that begin later
-)
+# The learned field is published again after this time, for recordings that begin later.
+FIELD_PERIOD_NS = 30_000_000_000
 
 
 def estimator_options(settings: EstimatorSettings) -> EstimatorOptions:

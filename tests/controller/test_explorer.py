@@ -160,7 +160,7 @@ def test_a_goal_of_a_user_takes_precedence():
     assert (status.goal_seq, status.exploration.phase) == (6, "exploring")
     count = robot.scans
     robot.until(lambda _: robot.navigator._viewpoint_due)
-    assert robot.scans - count >= 2 * SCANS_PER_S - 1  # whoever waits for the goal sees that it was reached
+    assert robot.scans - count >= 2 * SCANS_PER_S - 1  # long enough to publish that the goal was reached
     robot.explore((8.0, 2.5))
     assert robot.step().state == "exploring"
 

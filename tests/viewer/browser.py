@@ -90,7 +90,7 @@ class Visit:
     def toast(self, text: str = "", *, ok: bool = True) -> str:
         """The first answer with some text in it since the last one returned here, once it was shown."""
         found = "window.toasts.findIndex((toast) => toast.ok === arg[0] && toast.text.includes(arg[1]))"
-        self.wait(f"{found} >= 0", WAIT_TIMEOUT_S, [ok, text])
+        self.wait(f"{found} >= 0", argument=[ok, text])
         return str(self.see(f"window.toasts.splice(0, 1 + {found}).at(-1).text", [ok, text]))
 
 

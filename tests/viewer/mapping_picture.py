@@ -28,7 +28,7 @@ def main() -> None:
         viewer, _ = start_mapping(processes)
         with open_browser(path) as browser:
             seen = visit(browser, page_of(viewer), width=1440, height=900)
-            seen.wait("store.map", 60)
+            seen.wait("store.map")
             seen.page.locator("#explore").click()
             seen.wait("store.frame.status.exploration?.phase === 'finished'", TIMEOUT_S)
             seen.wait("document.querySelector('#explore-label').textContent === 'Explore'")

@@ -62,7 +62,7 @@ def still(seen: Visit) -> Image.Image:
     tracked = "store.frame?.belief?.state === 'tracking' && Math.abs(store.frame.belief.x - store.frame.truth.x) < 0.1"
     seen.wait(f"{tracked} && store.history.t.length > 60", 90)
     seen.click(*GOAL)
-    seen.wait(f"{tracked} && store.frame.truth.x > 8 && store.frame.speed > 0.7", 60)
+    seen.wait(f"{tracked} && store.frame.truth.x > 8 && store.frame.speed > 0.7")
     quiet(seen)
     return picture(seen)
 

@@ -23,19 +23,19 @@ def test_drive_explore_and_save(browser, processes):
 
     viewer, environment = start_mapping(processes)
     seen = visit(browser, page_of(viewer))
-    seen.wait("store.map && store.frame?.belief?.estimator === 'mapper'", 60)
+    seen.wait("store.map && store.frame?.belief?.estimator === 'mapper'")
     seen.wait("store.frame.truth === null && store.frame.error === null")
     assert seen.see("store.world.name") == "map"
     count = seen.see("store.map.path.length")
     seen.page.locator("#map").focus()
     seen.page.keyboard.down("ArrowUp")
-    seen.wait("store.map.path.length > arg", 60, count)
+    seen.wait("store.map.path.length > arg", argument=count)
     seen.page.keyboard.up("ArrowUp")
 
     seen.page.locator("#explore").click()
     seen.toast("exploring")
     count = seen.see("store.map.path.length")
-    seen.wait("store.frame.status.exploration?.phase === 'exploring' && store.map.path.length > arg", 60, count)
+    seen.wait("store.frame.status.exploration?.phase === 'exploring' && store.map.path.length > arg", argument=count)
     seen.wait("document.querySelector('#explore-label').textContent === 'Stop'")
     seen.page.locator("#explore").click()
     seen.toast("goal cancelled")
@@ -54,6 +54,6 @@ def test_drive_explore_and_save(browser, processes):
         if service.name in {"simulator", "mapper", "controller"}:
             service.stop(timeout=60)
     processes.start("simulator", "--world", "maze", env=environment)
-    seen.wait("store.map === null && store.world?.name === 'maze' && store.frame.truth !== null", 60)
+    seen.wait("store.map === null && store.world?.name === 'maze' && store.frame.truth !== null")
     seen.page.context.close()
     assert seen.complaints == []

@@ -59,7 +59,7 @@ def page(browser, system):
     from tests.viewer.browser import visit  # without playwright these tests are skipped
 
     seen = visit(browser, system.address)
-    seen.wait("store.frame?.belief?.state === 'tracking' && store.world", 60)
+    seen.wait("store.frame?.belief?.state === 'tracking' && store.world")
     yield seen
     seen.page.context.close()
     assert seen.complaints == []
@@ -118,7 +118,7 @@ def test_kidnapping(page):
     page.toast("carried")
     page.page.locator("#journal b", has_text="carried").first.wait_for(timeout=1000 * WAIT_TIMEOUT_S)
     found = f"store.frame.belief?.state === 'tracking' && {AWAY.format('store.frame.belief')} < 0.6"
-    page.wait(f"{found} && store.frame.error < 0.1", 60, there)
+    page.wait(f"{found} && store.frame.error < 0.1", argument=there)
     off = [error for _, _, error in page.see("window.seen") if error >= 0]
     assert off[0] < 0.1  # it was localised,
     assert max(off) > 3  # then metres off on the map,
@@ -165,7 +165,7 @@ def test_recording(page, system):
     (name,) = [path.name for path in system.folder.glob("*.mcap")]
     page.page.locator("#open").click()
     page.page.locator(f'[data-file="{name}"]').click()
-    page.wait("store.player && store.frame && store.world", 60)
+    page.wait("store.player && store.frame && store.world")
     length = page.see("store.player.duration_s")
     assert length > 1.5
     page.page.locator("#player-play").click()
@@ -187,7 +187,7 @@ def test_missing_service(page, system):
     page.wait("store.frame.status === null", 10)
     system.start("controller")
     notice.wait_for(state="detached", timeout=40_000)
-    page.wait("store.frame?.status?.state === 'idle'", 60)
+    page.wait("store.frame?.status?.state === 'idle'")
 
 
 def test_two_visitors(system):

@@ -57,9 +57,8 @@ if TYPE_CHECKING:
 
 START_COVARIANCE = np.diag([0.25, 0.25, 0.09])  # of a pose given without one
 MAX_SEARCH_INTERVAL = 150  # scans between two searches without success; the interval doubles from 1
-WRONG_MATCH = (
-    1e-6  # probability that a match with recent scans is wrong, and the right motion one of many that fit the map
-)
+# Probability that a match with recent scans is wrong, and the right motion one of many that fit the map.
+WRONG_MATCH = 1e-6
 SIGNIFICANT_MAP_ERROR = 0.25  # of the scanner's noise: less is within what the noise of one scan makes it seem
 UNKNOWN_SIGMA_M = 100.0  # published where the model does not know what to expect
 TARGET_BEAMS = 2000  # a scan with at least twice as many is thinned, because the time of a search grows with the beams

@@ -109,17 +109,12 @@ def predict_motion(
             change = change + noise.command_share * np.abs(command) * period
             found.append(_propagate("commanded", before, command * period, change, rest / 2))
         elif velocity is not None:
-            velocity = clip_to_plausible_velocity(noise, velocity)
+            motion = limit_steps(velocity * period, MAX_MOTION_SIGMAS * max_motion)
             deviation = np.sqrt(change**2 + _velocity_variance(pose, covariance, period))
-            found.append(_propagate("going on", before, velocity * period, deviation, rest / 2))
+            found.append(_propagate("going on", before, motion, deviation, rest / 2))
     centre = odom if odom is not None else np.zeros(3)
     found.append(_propagate("any motion", before, centre, max_motion + np.abs(centre), noise.surprise))
     return found if odom is None else [_add_drift(each, noise.slip * odom, float(pose[2])) for each in found]
-
-
-def clip_to_plausible_velocity(noise: MotionNoise, velocity: Array) -> Array:
-    """The velocity (3,), reduced to one that is attributed to the robot."""
-    return limit_steps(velocity, MAX_MOTION_SIGMAS * np.array([noise.speed, noise.speed, noise.turn]))
 
 
 def smooth_velocity(previous: Array | None, current: Array, period: float) -> Array:

@@ -134,7 +134,7 @@ def test_credentials_of_a_robot(keys):
     assert read_credentials(keys, ("controller",), "one").member.robots == ("one",)
     with pytest.raises(UserError, match="no credentials of 'controller', but of controller-one, estimator-one"):
         read_credentials(keys, ("controller",), "two")
-    assert read_credentials(keys, ("nobody", "observer"), "one").member.name == "observer"
+    assert read_credentials(keys, ("missing", "observer"), "one").member.name == "observer"
 
 
 def test_invalid_folders_are_explained(keys, tmp_path):
