@@ -129,7 +129,7 @@ def refine(name: str, seed: int, seconds: float) -> dict[str, Any]:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """The Markdown table of docs/refinement.md, in mm: median, RMS and maximum; and medians without the map's place."""
+    """The Markdown table of docs/refinement.md, in mm: median, RMS and maximum; and medians of aligned errors."""
     cells = []
     for row in rows:
         errors = [

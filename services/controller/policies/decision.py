@@ -49,7 +49,7 @@ class Policy(Protocol):
         """Discards the current manoeuvre: the robot stopped, or is driven by hand."""
 
     def resume(self) -> None:
-        """Undo the last `interrupt`: the simulation was only paused, no simulated time has passed."""
+        """Undoes the last `interrupt`: the simulation was only paused, no simulated time has passed."""
 
     def prepare(self, scan: Scan) -> None:
         """Computes what depends on the scanner; called with each scan, before its belief."""
