@@ -109,7 +109,7 @@ COPY --from=program /app /app
 # Numba's compiled code is stored in the image; on another type of processor it is compiled again. Numba needs a
 # writable cache, so each container starts with a copy.
 RUN NUMBA_CACHE_DIR=/numba python -c \
-    'from services.estimator.factory import *; [prepare(EstimatorOptions(model=m)) for m in ("learned", "exact")]'
+    'from services.estimator.factory import *; [prepare_factory(EstimatorOptions(model=m)) for m in ("learned", "exact")]'
 ENV NUMBA_CACHE_DIR=/tmp/numba
 # Only preset paper needs PyTorch.
 ARG ESTIMATOR=precise
