@@ -140,7 +140,8 @@ def _nearest_outline(outlines: IndexArrays, x: float, y: float, ux: float, uy: f
                 r = _distance_to_segment(segments[s], x, y, ux, uy)
             else:
                 r = _distance_to_circle(circles[s - segments.shape[0]], x, y, ux, uy)
-            if r < nearest:
+            # At a corner, the first of the outlines that meet there, whichever cell lists it first.
+            if r < nearest or (r == nearest and s < which):
                 nearest, which = r, s
         to_x, to_y = _distance_to_edge(px, ux, column, 0), _distance_to_edge(py, uy, row, 0)
         t = min(to_x, to_y)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from common.geometry.occupancy_grid import OccupancyGrid
@@ -85,6 +85,7 @@ def clutter(seed):
 
 @settings(max_examples=50)
 @given(st.integers(0, 2**32 - 1))
+@example(17051)  # a ray ends in a corner
 def test_outline_index(seed):
     world, listed = clutter(seed)
     x0, y0, x1, y1 = world.bounds
