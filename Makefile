@@ -92,17 +92,32 @@ chaos: install ## inject faults into a system on three hosts; measure detection,
 	$(BIN)/presage bench chaos $(ARGS)
 
 # The command of each table also stands beside it. PEERS: a folder as described in docs/peers.md; without it, that table
-# stays. Interrupted experiments continue, bench accuracy begins again.
+# stays, as do those of real logs. Interrupted experiments continue, benchmarks begin again.
 PEERS ?=
 RESULTS := docs/experiments
-tables: install ## measure all tables of README and docs/ at this commit, and fill them (hours)
+tables: install ## measure the generated tables of README and docs/ at this commit, and fill them (many hours)
 	$(BIN)/presage bench accuracy --seed 2801 --seeds 5 --trials 20 --minutes 0.5 --json $(RESULTS)/accuracy.json --figure docs/accuracy.png
 	$(BIN)/presage bench accuracy --estimators all --tasks standing,blocked,furnished,tracking,odometry --seed 2801 --seeds 5 --trials 10 --minutes 0.2 --json $(RESULTS)/accuracy-rivals.json
 	$(BIN)/presage experiment --out $(RESULTS) all
+	$(BIN)/presage experiment --out $(RESULTS) navigation
+	$(BIN)/presage experiment --out $(RESULTS) navigation --start unknown
+	$(BIN)/presage experiment --out $(RESULTS) navigation --worlds office --people 10 --trials 50
+	$(BIN)/presage experiment --seed 2611 --out $(RESULTS)/within_2cm navigation --trials 30
+	$(BIN)/presage experiment --seed 4300 --out $(RESULTS) navigation --worlds hall --drives holonomic --max-range 4 --beams 271 --prior odometry --slip 0.05 --limit 60 --trials 50
+	$(BIN)/presage experiment --seed 4300 --out $(RESULTS) navigation --worlds hall --drives holonomic --max-range 4 --beams 271 --prior odometry --slip 0.05 --limit 60 --trials 50 --no-epistemic
+	$(BIN)/presage experiment --seed 4300 --out $(RESULTS) navigation --worlds twins --start unknown --trials 50
+	$(BIN)/presage experiment --seed 4300 --out $(RESULTS) navigation --worlds twins --start unknown --trials 50 --drives holonomic --no-epistemic
+	$(BIN)/presage experiment --seed 2611 --out $(RESULTS) docking --trials 64
+	$(BIN)/presage experiment --seed 51 --out $(RESULTS) exploration
+	$(BIN)/presage bench mapping-faults --worlds 2 --seed 990 --seconds 60 --json $(RESULTS)/mapping-faults.json
+	$(BIN)/presage bench refinement --worlds 1 --seed 4110 --seconds 300 --out experiments/refinement --json $(RESULTS)/refinement.json
+	$(BIN)/presage bench visits --worlds 0 --visits 6 --scans 100 --seed 4711 --out experiments/visits --json $(RESULTS)/visits-office.json
+	$(BIN)/python -m lab.benchmarks.live_refinement --worlds office,4712 --seed 4712 --json $(RESULTS)/live-refinement.json
 	$(if $(PEERS),OMP_NUM_THREADS=1 PRESAGE_WORKERS=1 $(BIN)/presage experiment --seed 2801 --out $(RESULTS) peers '$(PEERS)')
-	$(BIN)/presage bench integrity --out experiments/integrity --worlds 3 --seed 2911 --model exact --seconds 10
+	$(BIN)/presage bench integrity --out experiments/integrity --worlds 3 --seed 3111 --model exact --seconds 10
 	$(BIN)/presage bench integrity --out experiments/integrity-long-corridor --worlds 20 --seed 2712 --model exact --seconds 10 --cases long-corridor --estimators precise
 	$(BIN)/presage bench integrity --out experiments/integrity-moved-50 --worlds 20 --seed 2611 --model exact --cases moved-50
+	$(BIN)/presage bench integrity --out experiments/integrity-single-scan --worlds 20 --seed 3112 --model exact --cases single-scan-moved-50 --estimators precise
 	for folder in experiments/integrity*; do cp $$folder/integrity.json $(RESULTS)/$${folder#*/}.json || exit 1; done
 	cp experiments/integrity/integrity.png $(RESULTS)/
 	for page in README.md docs/*.md; do $(BIN)/presage experiment --out $(RESULTS) tables --page $$page || exit 1; done
