@@ -28,7 +28,7 @@ from services.estimator.precise.learning import weights
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.motion_model import MotionNoise
 from services.estimator.precise.settings import PreciseSettings
-from services.estimator.shared.generative_models import GenerativeModel, RayCaster, map_error
+from services.estimator.shared.generative_models import GenerativeModel, RayCaster
 from services.estimator.shared.interface import Observation, PoseEstimator
 from services.estimator.shared.model_folder import find_folder
 
@@ -170,7 +170,7 @@ def _prepare_precise(options: EstimatorOptions, world: World) -> EstimatorFactor
     model, seeds, card = load_model(options, world)
     calibration = card.calibration if card else None
     settings = calibration.settings() if calibration else PreciseSettings(inflation=card.inflation if card else 1.0)
-    error = 0.0 if calibration else map_error(world)
+    cell = 0.0 if calibration or world.grid is None else world.grid.resolution
     bounds = (card.world if card else world).bounds
     _compile(model, seeds)
 
@@ -185,7 +185,7 @@ def _prepare_precise(options: EstimatorOptions, world: World) -> EstimatorFactor
             likelihood = geometry.likelihood(options.sigma)
         rng = np.random.default_rng(options.seed)
         estimator = PreciseEstimator(
-            model, seeds, geometry.mount, likelihood, settings, rng, bounds, options.optimiser, error
+            model, seeds, geometry.mount, likelihood, settings, rng, bounds, options.optimiser, cell
         )
         if options.initial_pose is not None:
             estimator.restart(options.initial_pose)

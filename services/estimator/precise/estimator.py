@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common.geometry import se2
-from services.estimator.precise.gauss_newton import COARSE_SIGMA_M, GaussNewton, Optimiser, Prior, View
+from services.estimator.precise.gauss_newton import COARSE_SIGMA_M, GaussNewton, Optimiser, Prior, View, moved_back
 from services.estimator.precise.hypotheses import (
     CLUTTER_PERSISTENCE,
     CLUTTER_PROBABILITY,
@@ -89,18 +89,18 @@ class PreciseEstimator:
         rng: np.random.Generator | None = None,
         bounds: tuple[float, float, float, float] | None = None,
         optimiser: Optimiser | None = None,
-        map_error: float = 0.0,
+        map_cell: float = 0.0,
     ) -> None:
         """``mount`` (3,) is the laser in base_link; ``rng`` places the starts of a search near a given pose.
 
-        The belief stays within ``bounds``, the map's x0, y0, x1, y1 in m. ``map_error`` is the standard deviation in m
-        of the map's surfaces beyond what the model states, as far as known; it is learned while driving.
+        The belief stays within ``bounds``, the map's x0, y0, x1, y1 in m. ``map_cell`` is the edge in m of the cells of
+        a grid whose surfaces the model predicts at the front of the cells; 0 if it has learned where they are.
         """
         self.model, self.seeds, self.mount = model, seeds, np.array(mount, float)
         self.likelihood, self.settings = likelihood or Likelihood(), settings or PreciseSettings()
         self.bounds = bounds or (-np.inf, -np.inf, np.inf, np.inf)
         self._rng = rng or np.random.default_rng(0)
-        self._optimiser, self._map_error = optimiser or GaussNewton(), map_error
+        self._optimiser, self._map_cell = optimiser or GaussNewton(), map_cell
         self.restart()
 
     def restart(self, pose: Array | None = None, covariance: Array | None = None) -> None:
@@ -115,7 +115,7 @@ class PreciseEstimator:
         self._was_tracking = False
         self._unknown_place = UnknownPlace()
         self._local_map = LocalMap(self.mount)
-        self._precision = Precision.of_map(self._map_error)
+        self._precision = Precision.of_map(self._map_cell)
         self._scans_since_search, self._search_interval = 0, 1
 
         # Of the last scan.
@@ -131,8 +131,9 @@ class PreciseEstimator:
         self._log_change = 0.0  # nats, log probability of what has changed since the scan before
 
     def use_model(self, model: GenerativeModel, seeds: Seeds) -> None:
-        """Replaces the model by another one in the same frame, between two scans. The belief stays."""
-        self.model, self.seeds = model, seeds
+        """Replaces the model by one learned from real scans in the same frame, between two scans. The belief stays."""
+        self.model, self.seeds, self._map_cell = model, seeds, 0.0
+        self._precision.forget_cells()
 
     def update(self, observation: Observation) -> Posterior:
         """Returns the posterior after one more scan."""
@@ -152,6 +153,7 @@ class PreciseEstimator:
             self._optimiser,
             self._precision.map_error,
             self._precision.changed,
+            self._precision.offset,
         )
         velocity = self._velocity(self.modes[0], observation) if self.modes else None
         view = self._correct_motion(view, observation, velocity)
@@ -180,29 +182,32 @@ class PreciseEstimator:
         if self._scan is None:
             raise RuntimeError("there is no scan to search with: call track first")
         view, observation = self._scan
-        start = self._start
+        start, is_first = self._start, not self._precision.scans
         self._search_for_hypotheses(view)
-        if not self._precision.scans and self._probability() >= self.settings.tracking_probability:
+        if is_first and self._probability() >= self.settings.tracking_probability:
             view = self._search_with_map_error(view, start)
         return self._finish_scan(view, observation)
 
     def _search_with_map_error(self, view: View, start: tuple[Array, Array] | None) -> View:
-        """Searches again if the first scan shows that the map is less precise than stated.
+        """Searches again if the first scan contradicts what was assumed of the map's errors.
 
-        Returns the view with the map's error.
+        Returns the view with the map's errors.
         """
-        self._precision.learn(view, self.modes[0].pose)
-        error = self._precision.map_error
-        if error < max(view.map_error, SIGNIFICANT_MAP_ERROR * view.likelihood.sigma):
+        if not self._precision.scans:
+            self._precision.learn(view, self.modes[0].pose)
+        error, offset = self._precision.map_error, self._precision.offset
+        significant = SIGNIFICANT_MAP_ERROR * view.likelihood.sigma
+        if error < max(view.map_error, significant) and abs(offset - view.map_offset) < significant:
             return view
-        view = replace(view, map_error=error)
+        view = replace(view, map_error=error, map_offset=offset)
         self.modes, self._start = [], start
         self._search_for_hypotheses(view)
         return view
 
     def predict(self, poses: Array, angles: Array) -> Predicted:
         """Predicts scans (see PoseEstimator); sigma combines the scanner's noise and the model's stated error."""
-        return self._predicted(self.model.expect(se2.compose(poses, self.mount), angles))
+        expected = self.model.expect(se2.compose(poses, self.mount), angles)
+        return self._predicted(moved_back(expected, self._precision.offset))
 
     def _predicted(self, expected: Expected) -> Predicted:
         unknown = np.isinf(expected.scale)
@@ -248,12 +253,14 @@ class PreciseEstimator:
         return view
 
     def _search_where_possible(self, view: View, best: Mode, candidates: list[Candidate]) -> list[Mode]:
-        """Other hypotheses that fit the scan, if it has just made the ``best`` one certain.
+        """Other hypotheses that fit the scan, if it has just made the ``best`` one far less uncertain.
 
         Before, the robot may have been at many poses, and the descent from one of them finds the nearest match only.
         """
-        before, certain = self.modes[0], self.settings.tracking_probability
-        if not self._probability_of_being_near(before) < certain <= self._probability_of_being_near(best):
+        before = self.modes[0]
+        doubt = 1 - self._probability_of_being_near(before)
+        certain = doubt <= 1 - self.settings.tracking_probability
+        if certain or 1 - self._probability_of_being_near(best) > 0.5 * doubt:
             return []
         motion = candidates[0]
         found = search_near(view, motion.mean, motion.covariance, self.seeds, self.settings, self._rng)
@@ -407,6 +414,7 @@ class PreciseEstimator:
         mapped = view.surface_evidence(best.pose[None]).weights[0] > 0.5
         if self._probability() >= self.settings.tracking_probability:
             self._precision.learn_changes(view, best.pose)
+            self._precision.learn(view, best.pose)
         self._unknown_place.add_key_scan()
         key = LocalMapScan(self._local_pose, view, self._old_beams, mapped, self._log_change, log_unknown)
         self._local_map.add(key, best.pose, best.noise_covariance)
@@ -543,10 +551,7 @@ class PreciseEstimator:
         predicted = (
             self._predicted(view.expected(poses[0])) if same_beams else self.predict(poses[0][None], observation.angles)
         )
-        probability = self._probability()
-        if probability >= self.settings.tracking_probability:
-            self._precision.learn(view, self.modes[0].pose)
-        return self._posterior(view, poses, predicted, probability)
+        return self._posterior(view, poses, predicted, self._probability())
 
     def _posterior(self, view: View, poses: list[Array], predicted: Predicted, probability: float) -> Posterior:
         """The posterior with the hypotheses at ``poses``, those at the stamp of the scan."""

@@ -89,6 +89,7 @@ class View:
     optimiser: Optimiser = field(default_factory=GaussNewton)
     map_error: float = 0.0  # m, standard deviation beyond what the model states, alike for neighbouring beams
     changed: float = 0.25  # share of surfaces that the map does not show as they are
+    map_offset: float = 0.0  # m, mean distance of the real surfaces behind those that the model predicts
     _last: list[_AtPoses] = field(default_factory=list, init=False, repr=False)
 
     def thinned(self, beams: int) -> View:
@@ -136,6 +137,10 @@ class View:
         """The surfaces that the scan shows."""
         return ScanSurfaces.of(self.ranges, self.angles, self.likelihood)
 
+    def expect(self, lasers: Array) -> Expected:
+        """The scans that the model predicts at laser poses (N, 3), with its surfaces moved back by the map's offset."""
+        return moved_back(self.model.expect(lasers, self.angles), self.map_offset)
+
     def _with_map_error(self, expected: Expected) -> Expected:
         """Adds the map's error, which is across a surface and so larger along beams that graze it."""
         if not self.map_error:
@@ -182,7 +187,7 @@ class View:
         """
         if not self._last or not np.array_equal(self._last[0].poses[: len(poses)], poses):
             lasers = se2.compose(poses, self.mount)
-            stated = self.model.expect(lasers, self.angles)
+            stated = self.expect(lasers)
             expected = self._with_map_error(stated)
             with np.errstate(invalid="ignore"):
                 passed = self.ranges > expected.ranges + self.likelihood.deviation(expected.ranges)
@@ -200,10 +205,7 @@ class View:
         derivatives of each beam.
         """
         lasers = se2.compose(poses, self.mount)
-        if attention is None:
-            expected = self._with_map_error(self.model.expect(lasers, self.angles))
-        else:
-            expected = self._at(poses).expected
+        expected = self._with_map_error(self.expect(lasers)) if attention is None else self._at(poses).expected
         at_laser = self.likelihood.evaluate(self.ranges, self.range_max, expected, extra_sigma, attention)
         return self._at_base(at_laser, poses, lasers)
 
@@ -234,6 +236,14 @@ class View:
             (Tt @ at_laser.xi[..., None])[..., 0],
             *(Tt @ matrix @ T for matrix in matrices),
         )
+
+
+def moved_back(expected: Expected, offset: float) -> Expected:
+    """The expected scans if all surfaces were ``offset`` m farther back, perpendicular to themselves."""
+    if not offset:
+        return expected
+    along = np.hypot(expected.jacobian[..., 0], expected.jacobian[..., 1])  # 1 / cosine of the angle of incidence
+    return replace(expected, ranges=expected.ranges + offset * along)
 
 
 @dataclass(frozen=True)

@@ -250,7 +250,7 @@ def constraining_beams(view: View, pose: Array, direction: Array) -> tuple[float
 
     Also returns the mask (B,) of the beams that would meet such surfaces.
     """
-    expected = view.model.expect(se2.compose(pose, view.mount)[None], view.angles)
+    expected = view.expect(se2.compose(pose, view.mount)[None])
     normal, surface, scale = expected.jacobian[0, :, :2], expected.ranges[0], expected.scale[0]
     facing = np.abs(normal @ direction) > np.sin(CORNER_ANGLE_RAD) * np.hypot(*normal.T)
     used = facing & np.isfinite(view.ranges) & np.isfinite(surface)

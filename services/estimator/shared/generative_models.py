@@ -58,14 +58,6 @@ class GenerativeModel(Protocol):
         ...
 
 
-def map_error(world: World) -> float:
-    """Standard deviation in m of the surfaces in a world: half a cell of a ROS map, else 0.
-
-    The real surface may be anywhere in the cell, and mapping adds rounding errors of poses and walls.
-    """
-    return 0.0 if world.grid is None else 0.5 * world.grid.resolution
-
-
 @dataclass(frozen=True)
 class RayCaster:
     """The exact model, which casts rays in the world: the limit of what learning can reach."""

@@ -14,7 +14,8 @@ from common.geometry import se2
 from common.geometry.world import World, load_world
 from lab.accuracy import tasks
 from lab.accuracy.scenes import Scene
-from lab.integrity.maps import scaled_map
+from lab.integrity.maps import noisy_grid, scaled_map
+from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.global_seeds import Seeds, thin_places
 from services.estimator.precise.hypotheses import NEAR_HEADING_RAD, NEAR_POSITION_M, probability_of_being_near
@@ -194,6 +195,21 @@ def test_map_error_of_the_first_scan():
         off = (found.pose - truth * [1.01, 1.01, 1.0])[:2]
         errors.append(off @ np.linalg.solve(found.covariance[:2, :2], off))
     assert np.mean(errors) < 20, errors
+
+
+def test_surfaces_in_the_cells_of_a_grid():
+    """A grid's cells begin half a cell in front of the real walls on average, and the covariance contains the rest."""
+    scene = Scene.of(HALL, BEAMS, 3)
+    make = prepare_factory(EstimatorOptions(noisy_grid(scene), "precise", "exact"))
+    errors, normalised = [], []
+    for truth in scene.poses(30):
+        made = make(ScannerGeometry.of(scene.scanner))
+        made.restart(truth, CLOSE)
+        found = drive(made, scene, truth[None])[0]
+        errors.append((found.pose - truth)[:2])
+        normalised.append(errors[-1] @ np.linalg.solve(found.covariance[:2, :2], errors[-1]))
+    assert np.sqrt((np.array(errors) ** 2).sum(axis=1).mean()) < 0.02
+    assert 0.5 < np.mean(normalised) < 4.5
 
 
 def test_heading_of_a_kidnapping():

@@ -28,8 +28,10 @@ WIDE_HALL = World(name="wide-hall", boundary=[(0, 0), (40, 0), (40, 30), (0, 30)
 HALL = World(name="hall", boundary=[(0, 0), (60, 0), (60, 2), (0, 2)])  # longer than the scanner's 25 m
 
 
-def estimator(world: World, beams: int = BEAMS, range_max: float = 25.0) -> tuple[PreciseEstimator, Scene]:
-    scene = Scene.of(world, beams, 3, TIM571.model_copy(update={"range_max": range_max}))
+def estimator(
+    world: World, beams: int = BEAMS, range_max: float = 25.0, seed: int = 3
+) -> tuple[PreciseEstimator, Scene]:
+    scene = Scene.of(world, beams, seed, TIM571.model_copy(update={"range_max": range_max}))
     model = RayCaster(world)
     places = thin_places(world.sample_free(4000, np.random.default_rng(0), 0.05), 0.3)
     return PreciseEstimator(model, Seeds.at(model, places), np.array(scene.scanner.mount)), scene
@@ -124,21 +126,24 @@ def test_standing_in_a_featureless_hall():
 @pytest.mark.parametrize("learned", [False, True])
 def test_driving_in_a_featureless_hall(learned):
     """Without odometry and features the error along the walls grows, but remains within the stated covariance."""
-    made, scene = estimator(HALL, 360)
-    if learned:
-        geometry = ScannerGeometry(scene.scanner.angles(), np.array(scene.scanner.mount), 25.0)
-        made.model = quick_field(HALL, geometry, np.random.default_rng(0), 3000)
-    pose = np.array([27.0, 0.9, 0.1])
-    made.restart(pose, np.diag([1e-4, 1e-4, 1e-4]))
-    for k in range(75):
-        posterior = feed(made, scene, pose + np.array([0.8 / 15 * k, 0, 0]), 1, k)[0]
-    error = off(posterior, pose + np.array([0.8 / 15 * 74, 0, 0]))
-    stated = np.sqrt(np.diag(posterior.covariance))
+    start, speed, scans = np.array([27.0, 0.9, 0.1]), 0.8, 75
+    off_along = []  # in stated deviations
+    for seed in range(2):
+        made, scene = estimator(HALL, 360, seed=seed)
+        if learned:
+            geometry = ScannerGeometry(scene.scanner.angles(), np.array(scene.scanner.mount), 25.0)
+            made.model = quick_field(HALL, geometry, np.random.default_rng(seed), 3000)
+        made.restart(start, np.diag([1e-4, 1e-4, 1e-4]))
+        for k in range(scans):
+            pose = start + np.array([speed / 15 * k, 0, 0])
+            posterior = feed(made, scene, pose, 1, k)[0]
+        error, stated = off(posterior, pose), np.sqrt(np.diag(posterior.covariance))
+        off_along.append(error[0] / stated[0])
+        assert stated[0] > (0.5 if learned else 1)
+        assert abs(error[1]) < 0.02
+        assert posterior.state != "tracking"
     # Not all ripples of a learned wall can be distinguished from features (docs/precise.md, limits).
-    assert abs(error[0]) < (5 if learned else 3) * stated[0]
-    assert stated[0] > (0.5 if learned else 1)
-    assert abs(error[1]) < 0.02
-    assert posterior.state != "tracking"
+    assert np.sqrt(np.mean(np.square(off_along))) < (5 if learned else 3)
 
 
 def drive(made, scene, path, slip=None):
@@ -179,10 +184,12 @@ def test_odometry_where_scans_confirm_it():
     assert np.sqrt(np.trace(found[-1].covariance[:2, :2])) < 0.005
 
 
-def test_slip_back_to_a_similar_place():
+@pytest.mark.parametrize("seed", [5, 10])
+def test_slip_back_to_a_similar_place(seed):
     """After a drift by the distance of two equal pillars, the scan fits at the wrong one."""
     pillars = [{"box": {"center": (x, 0.25), "size": (0.4, 0.5)}} for x in np.arange(3.0, 37.0, 0.8)]
-    made, scene = estimator(World(name="pillars", boundary=WIDE_HALL.boundary, obstacles=pillars), range_max=4.0)
+    world = World(name="pillars", boundary=WIDE_HALL.boundary, obstacles=pillars)
+    made, scene = estimator(world, range_max=4.0, seed=seed)
     path = np.concatenate([straight(6.0, 2.0, 0.4, 12.0), straight(17.05, 6.67, -0.4, 12.0)])
     found = drive(made, scene, path, slip=0.05)
     error = [float(np.hypot(*off(posterior, pose)[:2])) for posterior, pose in zip(found, path, strict=True)]

@@ -56,7 +56,7 @@ def align_to_map(original: GenerativeModel, keys: ReferenceDrive) -> ReferenceDr
 def move_into_cells(world: World, keys: ReferenceDrive) -> Array:
     """Returns the poses (N, 3) of key scans, moved as a whole so that the surfaces seen lie in a grid's occupied cells.
 
-    In a grid, a surface may be anywhere in its cell with equal probability; the estimator expects it at the edge.
+    In a grid, a surface may be anywhere in its cell with equal probability; the model's rays end at the edge.
     """
     cells = SurfaceCells.of(Beams.of(keys.poses, keys.mount, keys.angles, keys.ranges), CELL_M)
     elements = np.stack([cells.mx[cells.is_surface], cells.my[cells.is_surface]], axis=-1) + cells.low
