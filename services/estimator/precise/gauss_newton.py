@@ -29,8 +29,8 @@ SETTLED_STEP = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: this near, F is quadra
 # Added in quadrature to every beam's standard deviation during a descent, so that the minimum is wide at first.
 COARSE_SIGMA_M, MEDIUM_SIGMA_M = 0.3, 0.1
 FOLLOWING_SCHEDULE_M = (0.05, 0.0, 0.0, 0.0, 0.0)  # the same, from a predicted pose
-CORRELATED_M = 2.0  # along a surface, on which the errors of a map are alike
 MAX_POLISHING_STEPS = 4
+CORRELATED_M = 2.0  # along a surface, on which the errors of a map are alike
 DAMPING = np.diag([1.0, 1.0, 1.0]) * 1e-6  # 1/m², 1/rad²: no step along directions without information
 
 
@@ -124,6 +124,11 @@ class View:
         """
         order = np.argsort(self.angles, kind="stable")
         return order, self.angles[order]
+
+    @cached_property
+    def spacing(self) -> float:
+        """Angle in rad between neighbouring beams."""
+        return float(np.median(np.diff(self.sorted_beams[1])))
 
     @cached_property
     def nearest_of_neighbours(self) -> Array:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from services.estimator.precise.gauss_newton import CORRELATED_M
 from services.estimator.precise.noise import estimate_noise
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ MAX_NOISE_FACTOR = 4.0  # the noise is never taken for more than this times the 
 MAX_MAP_ERROR_M = 0.1  # larger errors are not the map's, but changes of the surroundings
 NORMAL_MAD = 1.4826  # standard deviation of a Gaussian, in median absolute deviations
 MIN_LEARNING_BEAMS = 30
+DAMPING = 1e-9  # in m; keeps the inverse finite where a direction is not observed
 
 
 @dataclass
@@ -34,6 +36,7 @@ class Precision:
     changed: float = 0.25  # share of surfaces that the map does not show as they are
     cell: float = 0.0  # m, edge of the cells if the map is a grid
     offset: float = 0.0  # m, mean distance of the real surfaces behind the front of the cells
+    offset_variance: float = 0.0  # m²
     excess: float = 0.0  # m², variance of the errors beyond the scanner's noise and what the model states
     scans: int = 0  # key scans from which the map's errors were learned
 
@@ -41,9 +44,10 @@ class Precision:
     def of_map(cls, cell: float) -> Precision:
         """What is known before the first scan of a map, a grid with cells of ``cell`` m or, if that is 0, another one.
 
-        A surface is anywhere in its cell (variance cell² / 12), and errors of mapping add as much again.
+        A surface is anywhere in its cell (variance cell² / 12), and errors of mapping add as much again. But a map may
+        be drawn so that all surfaces are alike in their cells.
         """
-        return cls(cell=cell, offset=cell / 2, excess=cell**2 / 6)
+        return cls(cell=cell, offset=cell / 2, offset_variance=cell**2 / 12, excess=cell**2 / 6)
 
     @property
     def map_error(self) -> float:
@@ -60,7 +64,7 @@ class Precision:
 
     def forget_cells(self) -> None:
         """The model is replaced by one that has learned where the surfaces are in the cells of the grid."""
-        self.cell = self.offset = 0.0
+        self.cell = self.offset = self.offset_variance = 0.0
 
     def learn_changes(self, view: View, pose: Array) -> None:
         """Learns from a key scan at ``pose`` (3,) how much of the surroundings is as the map shows it."""
@@ -84,18 +88,43 @@ class Precision:
             used = (np.abs(errors) < MAX_MAP_ERROR_M) & np.isfinite(scale)
         if used.sum() < max(MIN_LEARNING_BEAMS, 0.3 * len(view.ranges)):
             return
-        median = float(np.median(np.abs(view.ranges - surface)[used]))
-        robust = (NORMAL_MAD * median) ** 2 - float(np.median((noise**2 + scale**2)[used]))
+        errors, slope, along = errors[used], slope[used], (noise**2 + scale**2)[used]
+        robust = _robust_excess(errors * slope, along)
         if robust > view.map_error**2:  # with too small an error, no surface would be explained
             view = replace(view, map_error=float(np.sqrt(robust)))
         # By length of surface instead of by beam, because near surfaces have more beams.
-        weights = view.surface_evidence(pose[None]).weights[0][used] * surface[used]
-        if not weights.any():
+        lengths = (view.surface_evidence(pose[None]).weights[0] * surface)[used] * view.spacing
+        if not lengths.any():
             return
-        errors, stated = errors[used], (noise**2 + scale**2)[used] / slope[used] ** 2
-        mean = float(np.average(errors, weights=weights)) if self.cell else 0.0
-        excess = max(robust, float(np.average((errors - mean) ** 2 - stated, weights=weights)))
+        stated = along / slope**2
+        if self.cell:
+            errors = self._learn_offset(errors, stated, expected.jacobian[0, used] / slope[:, None], lengths)
+        mean_square = float(np.average(errors**2 - stated, weights=lengths))
+        excess = max(mean_square, _robust_excess(errors * slope, along))
         self.scans += 1
         share = max(UPDATE_SHARE, 1 / (self.scans + 1))  # what was known before counts as one more scan
-        self.offset = float(np.clip(self.offset + share * mean, 0.0, self.cell))
         self.excess += share * (excess - self.excess)
+
+    def _learn_offset(self, errors: Array, stated: Array, jacobian: Array, lengths: Array) -> Array:
+        """Learns the offset from the errors (K,) in m across surfaces, of variance ``stated`` (K,) without the map's.
+
+        The pose was fitted to the same beams with the offset so far, so both are estimated together: with ``jacobian``
+        (K, 3), the derivative of the errors by the pose. Beams count by their ``lengths`` (K,) of surface in m. Returns
+        the errors that remain.
+        """
+        design = np.column_stack([jacobian, np.ones(len(errors))])
+        inverse = np.linalg.inv(design.T @ (lengths[:, None] * design) + DAMPING * np.eye(4))
+        fitted = inverse @ (design.T @ (lengths * errors))
+        remaining = np.asarray(errors - design @ fitted)
+        excess = max(0.0, float(np.average(remaining**2 - stated, weights=lengths)))
+        noise = float(np.average(stated, weights=lengths) * lengths.mean())  # the same for every beam
+        variance = (excess * CORRELATED_M + noise) * float(inverse[3, 3])
+        gain = self.offset_variance / (self.offset_variance + variance)
+        self.offset = float(np.clip(self.offset + gain * fitted[3], 0.0, self.cell))
+        self.offset_variance *= 1 - gain
+        return remaining
+
+
+def _robust_excess(errors: Array, stated: Array) -> float:
+    """Variance in m² of range errors (K,) beyond what is ``stated`` (K,), however large some of the errors are."""
+    return (NORMAL_MAD * float(np.median(np.abs(errors)))) ** 2 - float(np.median(stated))
