@@ -115,9 +115,9 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	$(BIN)/python -m lab.benchmarks.live_refinement --worlds office,4712 --seed 4712 --json $(RESULTS)/live-refinement.json
 	$(if $(PEERS),OMP_NUM_THREADS=1 PRESAGE_WORKERS=1 $(BIN)/presage experiment --seed 2801 --out $(RESULTS) peers '$(PEERS)')
 	$(BIN)/presage bench integrity --out experiments/integrity --worlds 3 --seed 3114 --model exact --seconds 10
-	$(BIN)/presage bench integrity --out experiments/integrity-long-corridor --worlds 20 --seed 2712 --model exact --seconds 10 --cases long-corridor --estimators precise
+	$(BIN)/presage bench integrity --out experiments/integrity-long-corridor --worlds 20 --seed 3116 --model exact --seconds 10 --cases long-corridor --estimators precise
 	$(BIN)/presage bench integrity --out experiments/integrity-moved-50 --worlds 20 --seed 2611 --model exact --cases moved-50
-	$(BIN)/presage bench integrity --out experiments/integrity-single-scan --worlds 20 --seed 3112 --model exact --cases single-scan-moved-50 --estimators precise
+	$(BIN)/presage bench integrity --out experiments/integrity-single-scan --worlds 20 --seed 3115 --model exact --cases single-scan-moved-50 --estimators precise
 	for folder in experiments/integrity*; do cp $$folder/integrity.json $(RESULTS)/$${folder#*/}.json || exit 1; done
 	cp experiments/integrity/integrity.png $(RESULTS)/
 	for page in README.md docs/*.md; do $(BIN)/presage experiment --out $(RESULTS) tables --page $$page || exit 1; done
