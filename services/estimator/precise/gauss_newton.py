@@ -150,8 +150,7 @@ class View:
         """Adds the map's error, which is across a surface and so larger along beams that graze it."""
         if not self.map_error:
             return expected
-        along = self.map_error * np.hypot(expected.jacobian[..., 0], expected.jacobian[..., 1])
-        return replace(expected, scale=np.hypot(expected.scale, along))
+        return replace(expected, scale=np.hypot(expected.scale, self.map_error * expected.slope))
 
     @cached_property
     def _correlation(self) -> float:
@@ -247,8 +246,7 @@ def moved_back(expected: Expected, offset: float) -> Expected:
     """The expected scans if all surfaces were ``offset`` m farther back, perpendicular to themselves."""
     if not offset:
         return expected
-    along = np.hypot(expected.jacobian[..., 0], expected.jacobian[..., 1])  # 1 / cosine of the angle of incidence
-    return replace(expected, ranges=expected.ranges + offset * along)
+    return replace(expected, ranges=expected.ranges + offset * expected.slope)
 
 
 @dataclass(frozen=True)

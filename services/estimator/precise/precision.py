@@ -75,32 +75,33 @@ class Precision:
     def learn(self, view: View, pose: Array) -> None:
         """Learns the map's errors from those of the prediction of a key scan at ``pose`` (3,).
 
-        Scans at one place show the same errors, so only key scans are used. Two estimates of their variance are too
-        small in different cases, so the larger one counts: the median of all errors if they differ between surfaces,
-        and the mean square over the surfaces that the map explains if it explains too few.
+        Scans at one place show the same errors, so only key scans are used. Two estimates of their variance may be
+        too small, so the larger one counts: that by the median of all errors, if only some surfaces have large errors,
+        and the mean square over the surfaces that the map explains, if it explains too few.
         """
         expected = view.expected(pose)
         surface, scale = expected.ranges[0], expected.scale[0]
         noise = view.likelihood.deviation(surface)
-        slope = np.hypot(*expected.jacobian[0, :, :2].T)  # of the range by the distance to the surface
+        slope = expected.slope[0]
         with np.errstate(invalid="ignore", divide="ignore"):
             errors = (view.ranges - surface) / slope
             used = (np.abs(errors) < MAX_MAP_ERROR_M) & np.isfinite(scale)
         if used.sum() < max(MIN_LEARNING_BEAMS, 0.3 * len(view.ranges)):
             return
-        errors, slope, along = errors[used], slope[used], (noise**2 + scale**2)[used]
-        robust = _robust_excess(errors * slope, along)
+        # `stated` is the variance along the beams.
+        errors, slope, stated = errors[used], slope[used], (noise**2 + scale**2)[used]
+        robust = robust_excess(errors * slope, stated)
         if robust > view.map_error**2:  # with too small an error, no surface would be explained
             view = replace(view, map_error=float(np.sqrt(robust)))
         # By length of surface instead of by beam, because near surfaces have more beams.
         lengths = (view.surface_evidence(pose[None]).weights[0] * surface)[used] * view.spacing
         if not lengths.any():
             return
-        stated = along / slope**2
+        stated_across = stated / slope**2
         if self.cell:
-            errors = self._learn_offset(errors, stated, expected.jacobian[0, used] / slope[:, None], lengths)
-        mean_square = float(np.average(errors**2 - stated, weights=lengths))
-        excess = max(mean_square, _robust_excess(errors * slope, along))
+            errors = self._learn_offset(errors, stated_across, expected.jacobian[0, used] / slope[:, None], lengths)
+        mean_square = float(np.average(errors**2 - stated_across, weights=lengths))
+        excess = max(mean_square, robust_excess(errors * slope, stated))
         self.scans += 1
         share = max(UPDATE_SHARE, 1 / (self.scans + 1))  # what was known before counts as one more scan
         self.excess += share * (excess - self.excess)
@@ -125,6 +126,6 @@ class Precision:
         return remaining
 
 
-def _robust_excess(errors: Array, stated: Array) -> float:
-    """Variance in m² of range errors (K,) beyond what is ``stated`` (K,), however large some of the errors are."""
+def robust_excess(errors: Array, stated: Array) -> float:
+    """Variance in m² of errors (K,) beyond what is ``stated``, (K,) or (), however large some of them are."""
     return (NORMAL_MAD * float(np.median(np.abs(errors)))) ** 2 - float(np.median(stated))

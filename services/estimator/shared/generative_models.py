@@ -26,6 +26,11 @@ class Expected:
     scale: Array  # (N, B) m, standard deviation of the model's error; +inf where the model knows nothing
     jacobian: Array  # (N, B, 3) derivative of the ranges by the laser's x, y (m/m) and yaw (m/rad) in map
 
+    @property
+    def slope(self) -> Array:
+        """Derivative (N, B) of the ranges by the distance to the surface: 1 / cosine of the angle of incidence."""
+        return np.asarray(np.hypot(self.jacobian[..., 0], self.jacobian[..., 1]))
+
     def part(self, rows: slice) -> Expected:
         """Returns the scans at some of the poses."""
         return Expected(self.ranges[rows], self.scale[rows], self.jacobian[rows])

@@ -127,7 +127,6 @@ def test_standing_in_a_featureless_hall():
 def test_driving_in_a_featureless_hall(learned):
     """Without odometry and features the error along the walls grows, but remains within the stated covariance."""
     start, speed, scans = np.array([27.0, 0.9, 0.1]), 0.8, 75
-    off_along = []  # in stated deviations
     for seed in range(2):
         made, scene = estimator(HALL, 360, seed=seed)
         if learned:
@@ -138,12 +137,11 @@ def test_driving_in_a_featureless_hall(learned):
             pose = start + np.array([speed / 15 * k, 0, 0])
             posterior = feed(made, scene, pose, 1, k)[0]
         error, stated = off(posterior, pose), np.sqrt(np.diag(posterior.covariance))
-        off_along.append(error[0] / stated[0])
+        # Not all ripples of a learned wall can be distinguished from features (docs/precise.md, limits).
+        assert abs(error[0]) < (5 if learned else 3) * stated[0]
         assert stated[0] > (0.5 if learned else 1)
         assert abs(error[1]) < 0.02
         assert posterior.state != "tracking"
-    # Not all ripples of a learned wall can be distinguished from features (docs/precise.md, limits).
-    assert np.sqrt(np.mean(np.square(off_along))) < (5 if learned else 3)
 
 
 def drive(made, scene, path, slip=None):

@@ -31,7 +31,7 @@ from services.estimator.precise.learning.map_alignment import align_to_map
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.noise import estimate_noise
-from services.estimator.precise.precision import NORMAL_MAD
+from services.estimator.precise.precision import robust_excess
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -133,7 +133,7 @@ def _estimate_map_error(model: GenerativeModel, keys: ReferenceDrive, sigma: flo
     """Estimates the standard deviation in m of the model's own errors, without the scanner's noise ``sigma`` m."""
     errors = range_errors(model, keys)
     errors = errors[errors < MAX_ERROR_M]
-    variance = (NORMAL_MAD * float(np.median(errors))) ** 2 - sigma**2 if len(errors) else 0.0
+    variance = robust_excess(errors, np.array(sigma**2)) if len(errors) else 0.0
     return float(np.sqrt(max(variance, PRECISE_M**2)))
 
 

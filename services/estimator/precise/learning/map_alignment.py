@@ -39,7 +39,7 @@ def align_to_map(original: GenerativeModel, keys: ReferenceDrive) -> ReferenceDr
         lasers = se2.compose(poses, keys.mount)
         expected = original.expect(lasers, keys.angles)
         by_x, by_y, by_yaw = np.moveaxis(expected.jacobian, -1, 0)
-        slope = np.hypot(by_x, by_y)  # of the range by the distance to the surface
+        slope = expected.slope
         with np.errstate(invalid="ignore", divide="ignore"):
             distance = (keys.ranges - expected.ranges) / slope
             used = (np.abs(distance) < MAX_ERROR_M) & np.isfinite(expected.scale)
