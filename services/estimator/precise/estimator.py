@@ -27,6 +27,7 @@ from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.local_map import LocalMap, LocalMapScan, LocalScan
 from services.estimator.precise.motion_model import (
     Candidate,
+    decouple,
     fuse,
     limit_to_map,
     predict_motion,
@@ -324,7 +325,9 @@ class PreciseEstimator:
                 for each in (*candidates, widest)
             )
         fused = [
-            fuse(limit_to_map(each, self.seeds.spread), pose, evidence.xi[k], evidence.curvature[k])
+            fuse(
+                limit_to_map(decouple(each, unobserved), self.seeds.spread), pose, evidence.xi[k], evidence.curvature[k]
+            )
             for each in candidates
         ]
         best = min(fused, key=lambda each: each.surprise)

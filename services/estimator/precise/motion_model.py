@@ -161,6 +161,17 @@ def widen_unobserved(
     return replace(candidate, covariance=candidate.covariance + (2 * scans + 1) * motion @ motion.T)
 
 
+def decouple(candidate: Candidate, directions: Array) -> Candidate:
+    """Removes the correlation of the position along ``directions`` (K, 3) with the rest of the pose.
+
+    Each scan shows these unobserved unit vectors tilted by the ripple of its walls. With the correlation, the
+    difference between two tilts would pass for information along them.
+    """
+    along = directions.T @ directions
+    across = np.eye(3) - along
+    return replace(candidate, covariance=along @ candidate.covariance @ along + across @ candidate.covariance @ across)
+
+
 def limit_to_map(candidate: Candidate, unknown: Array) -> Candidate:
     """Limits the variances to those of a completely unknown pose, ``unknown`` (3, 3)."""
     excess = np.sqrt(np.diag(candidate.covariance) / np.diag(unknown))
