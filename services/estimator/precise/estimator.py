@@ -26,7 +26,7 @@ from services.estimator.precise.hypotheses import (
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.local_map import LocalMap, LocalMapScan, LocalScan
 from services.estimator.precise.motion_model import (
-    Candidate,
+    MotionCandidate,
     decouple,
     fuse,
     limit_to_map,
@@ -69,7 +69,7 @@ TARGET_BEAMS = 2000  # a scan with at least twice as many is thinned, because th
 class ScanMatch:
     """Where a scan fits the map, near the poses to which the hypotheses have moved."""
 
-    motions: list[list[Candidate]]  # since the last scan, of each hypothesis; the last one is the widest
+    motions: list[list[MotionCandidate]]  # since the last scan, of each hypothesis; the last one is the widest
     poses: Array  # (N, 3), one per hypothesis
     evidence: Evidence  # at these poses
     local_pose: Array | None = None  # (3,) in the local frame, if recent scans gave the motion
@@ -227,7 +227,7 @@ class PreciseEstimator:
             return mode.velocity
         return odom / self._period(observation.stamp)
 
-    def _predict(self, mode: Mode, period: float, odom: Array | None, command: Array | None) -> list[Candidate]:
+    def _predict(self, mode: Mode, period: float, odom: Array | None, command: Array | None) -> list[MotionCandidate]:
         """Predicts the motions that the robot may have made since the last scan; the last one is the widest."""
         return predict_motion(
             self.settings.motion, mode.pose, mode.noise_covariance, period, odom, command, mode.velocity, mode.drift
@@ -253,7 +253,7 @@ class PreciseEstimator:
         self._weigh_scan(view, modes, match.local_pose, period)
         return view
 
-    def _search_where_possible(self, view: View, best: Mode, candidates: list[Candidate]) -> list[Mode]:
+    def _search_where_possible(self, view: View, best: Mode, candidates: list[MotionCandidate]) -> list[Mode]:
         """Other hypotheses that fit the scan, if it has just made the ``best`` one far less uncertain.
 
         Before, the robot may have been at many poses, and the descent from one of them finds the nearest match only.
@@ -268,7 +268,9 @@ class PreciseEstimator:
         at_best = before.log_evidence + _prior_of([motion]).energy(best.pose[None])[0]
         return [replace(mode, log_evidence=at_best + mode.log_evidence) for mode in found]
 
-    def _match(self, view: View, motions: list[list[Candidate]], period: float, *, with_odometry: bool) -> ScanMatch:
+    def _match(
+        self, view: View, motions: list[list[MotionCandidate]], period: float, *, with_odometry: bool
+    ) -> ScanMatch:
         """Matches the scan to the map near the predicted pose of each hypothesis.
 
         If the map explains much less than before, over a wider area. If it explains too little, recent scans give the
@@ -307,7 +309,7 @@ class PreciseEstimator:
         by_map, by_scans = _log_at_poses(view, both, view.surfaces.small, np.full(2, self.modes[0].clutter))[0]
         return match if by_map + np.log(WRONG_MATCH) > by_scans else by_recent_scans
 
-    def _fuse(self, view: View, k: int, match: ScanMatch, widest: Candidate, observation: Observation) -> Mode:
+    def _fuse(self, view: View, k: int, match: ScanMatch, widest: MotionCandidate, observation: Observation) -> Mode:
         """Fuses the k-th hypothesis with the scan.
 
         A motion of which the robot is hardly capable, within the ``widest`` candidate, is evidence against the
@@ -625,7 +627,7 @@ def _log_at_poses(view: View, poses: Array, skip: npt.NDArray[np.bool_], clutter
     return total, np.exp(of_clutter - total)
 
 
-def _prior_of(candidates: list[Candidate]) -> Prior:
+def _prior_of(candidates: list[MotionCandidate]) -> Prior:
     return Prior(
         np.array([each.mean for each in candidates]), np.array([np.linalg.inv(each.covariance) for each in candidates])
     )

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from services.estimator.precise.gauss_newton import View
     from services.estimator.precise.likelihood import Evidence
-    from services.estimator.precise.motion_model import Fused
+    from services.estimator.precise.motion_model import FusedMotion
 
 NEAR_POSITION_M, NEAR_HEADING_RAD = 0.2, math.radians(5)  # a pose with a larger error is wrong
 SAME_POSITION_M, SAME_HEADING_RAD = 0.1, 0.1  # hypotheses nearer to one another than this are merged
@@ -164,7 +164,7 @@ def _log_volume_of_place(curvature: Array) -> float:
     return float(1.5 * np.log(2 * np.pi) - 0.5 * float(np.linalg.slogdet(curvature + place)[1]))
 
 
-def update_mode(mode: Mode, fused: Fused, evidence: Evidence, k: int, period: float, *, unobserved: bool) -> Mode:
+def update_mode(mode: Mode, fused: FusedMotion, evidence: Evidence, k: int, period: float, *, unobserved: bool) -> Mode:
     """The hypothesis after a scan, from its fused prior and the k-th evidence.
 
     The scan's information reduces the noise covariance. The model's errors are alike from scan to scan, so instead of

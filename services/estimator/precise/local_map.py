@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from common.geometry import se2
 from common.geometry.se2 import Array
 from services.estimator.precise.gauss_newton import View, difference, position_information
-from services.estimator.precise.motion_model import Candidate
+from services.estimator.precise.motion_model import MotionCandidate
 from services.estimator.precise.scan_surfaces import MIN_BEAMS
 
 MAX_SCANS = 12  # in the local map
@@ -157,7 +157,7 @@ class LocalMap:
         widths = np.hypot(*(points[last[many]] - points[first[many]]).T) if len(points) else np.zeros(0)
         return int((widths[widths > width] / width).sum())
 
-    def match(self, starts: Array, points: Array, prior: Candidate) -> Match | None:
+    def match(self, starts: Array, points: Array, prior: MotionCandidate) -> Match | None:
         """Returns the pose at which a scan matches the key scans; None if there is none.
 
         ``starts`` (N, 3) and ``prior`` are poses in map, ``points`` (K, 2) m in the laser frame.
@@ -176,13 +176,13 @@ class LocalMap:
                 found = again
         return None if found is None or found.share < MIN_SHARE or found.degenerate else found
 
-    def candidate(self, match: Match) -> Candidate:
+    def candidate(self, match: Match) -> MotionCandidate:
         """The pose in map that a match gives."""
         turn = se2.rotation(float(self.frame[2]))
         covariance = self.covariance + turn @ match.covariance @ turn.T
-        return Candidate("recent scans", se2.compose(self.frame, match.pose), covariance, 1.0)
+        return MotionCandidate("recent scans", se2.compose(self.frame, match.pose), covariance, 1.0)
 
-    def _best_match(self, starts: Array, points: Array, prior: Candidate) -> Match | None:
+    def _best_match(self, starts: Array, points: Array, prior: MotionCandidate) -> Match | None:
         information = np.asarray(np.linalg.inv(prior.covariance), float)
         found = [self._register(start, points, prior.mean, information) for start in starts]
         plausible = [

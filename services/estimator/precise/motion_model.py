@@ -55,7 +55,7 @@ class MotionNoise:
 
 
 @dataclass(frozen=True)
-class Candidate:
+class MotionCandidate:
     """One way the robot may have moved, as a Gaussian over its present pose."""
 
     name: str
@@ -84,7 +84,7 @@ def predict_motion(
     command: Array | None = None,
     velocity: Array | None = None,
     drift: Array | None = None,
-) -> list[Candidate]:
+) -> list[MotionCandidate]:
     """Returns the candidates after ``period`` s, from the last posterior (3,), (3, 3); the last one is the widest.
 
     ``drift`` (3, 3) is the posterior's covariance with the drift; 0 by default. ``odom`` (3,) is the motion since then
@@ -93,7 +93,7 @@ def predict_motion(
     """
     max_motion = np.array([noise.speed, noise.speed, noise.turn]) * period
     rest = 1 - noise.surprise
-    before = Candidate("before", pose, covariance, 1.0, np.zeros((3, 3)) if drift is None else drift)
+    before = MotionCandidate("before", pose, covariance, 1.0, np.zeros((3, 3)) if drift is None else drift)
     found = []
     if odom is not None:
         moved, turned = float(np.hypot(odom[0], odom[1])), abs(float(odom[2]))
@@ -137,13 +137,15 @@ def _velocity_variance(pose: Array, covariance: Array, period: float) -> Array:
     return np.asarray(2 * share * (1 + share) * np.diagonal(turn @ covariance @ turn.T))
 
 
-def _propagate(name: str, before: Candidate, step: Array, deviation: Array, probability: float) -> Candidate:
+def _propagate(
+    name: str, before: MotionCandidate, step: Array, deviation: Array, probability: float
+) -> MotionCandidate:
     by_pose, by_step = se2.compose_jacobians(before.mean, step)
     covariance = by_pose @ before.covariance @ by_pose.T + (by_step * deviation**2) @ by_step.T
-    return Candidate(name, se2.compose(before.mean, step), covariance, probability, by_pose @ before.drift)
+    return MotionCandidate(name, se2.compose(before.mean, step), covariance, probability, by_pose @ before.drift)
 
 
-def _add_drift(candidate: Candidate, lost: Array, yaw: float) -> Candidate:
+def _add_drift(candidate: MotionCandidate, lost: Array, yaw: float) -> MotionCandidate:
     """Adds the drift of one period: the motion that slipping may have ``lost`` (3,) in base_link at the heading."""
     growth = se2.rotation(yaw) * lost
     covariance = candidate.covariance + growth @ candidate.drift.T + candidate.drift @ growth.T + growth @ growth.T
@@ -151,8 +153,8 @@ def _add_drift(candidate: Candidate, lost: Array, yaw: float) -> Candidate:
 
 
 def widen_unobserved(
-    noise: MotionNoise, candidate: Candidate, directions: Array, scans: int, period: float
-) -> Candidate:
+    noise: MotionNoise, candidate: MotionCandidate, directions: Array, scans: int, period: float
+) -> MotionCandidate:
     """Adds the motion at full speed along ``directions`` (K, 3), which the last ``scans`` scans did not observe.
 
     The directions are unit vectors of x, y, yaw. The standard deviation grows in proportion to time.
@@ -161,7 +163,7 @@ def widen_unobserved(
     return replace(candidate, covariance=candidate.covariance + (2 * scans + 1) * motion @ motion.T)
 
 
-def decouple(candidate: Candidate, directions: Array) -> Candidate:
+def decouple(candidate: MotionCandidate, directions: Array) -> MotionCandidate:
     """Removes the correlation of the position along ``directions`` (K, 3) with the rest of the pose.
 
     Each scan shows these unobserved unit vectors tilted by the ripple of its walls. With the correlation, the
@@ -172,7 +174,7 @@ def decouple(candidate: Candidate, directions: Array) -> Candidate:
     return replace(candidate, covariance=along @ candidate.covariance @ along + across @ candidate.covariance @ across)
 
 
-def limit_to_map(candidate: Candidate, unknown: Array) -> Candidate:
+def limit_to_map(candidate: MotionCandidate, unknown: Array) -> MotionCandidate:
     """Limits the variances to those of a completely unknown pose, ``unknown`` (3, 3)."""
     excess = np.sqrt(np.diag(candidate.covariance) / np.diag(unknown))
     if (excess <= 1).all():
@@ -195,17 +197,17 @@ def reachable_poses(noise: MotionNoise, pose: Array, period: float, basin: float
 
 
 @dataclass(frozen=True)
-class Fused:
+class FusedMotion:
     """A candidate updated by a scan."""
 
-    candidate: Candidate
+    candidate: MotionCandidate
     mean: Array  # (3,)
     information: Array  # (3, 3) H + P^-1
     complexity: float  # nats, Kullback-Leibler divergence of the posterior from the prior
     surprise: float  # nats, -ln(prior probability times evidence), without the scan's constant
 
 
-def fuse(candidate: Candidate, mode: Array, slope: Array, curvature: Array) -> Fused:
+def fuse(candidate: MotionCandidate, mode: Array, slope: Array, curvature: Array) -> FusedMotion:
     """Updates a candidate by Laplace's approximation of the scan's likelihood.
 
     The scan's -ln p is approximated by a parabola at ``mode`` (3,), with ``slope`` (3,) minus its gradient there and
@@ -232,4 +234,4 @@ def fuse(candidate: Candidate, mode: Array, slope: Array, curvature: Array) -> F
     kl = 0.5 * (float(np.trace(information @ posterior)) - 3 + float(step @ information @ step) + logdet)
     mean = candidate.mean + step
     mean[2] = se2.wrap(mean[2])
-    return Fused(candidate, mean, total, kl, float(surprise))
+    return FusedMotion(candidate, mean, total, kl, float(surprise))

@@ -17,7 +17,7 @@ from services.estimator.precise.gauss_newton import MAX_STEP, Prior, View, desce
 from services.estimator.precise.global_seeds import Seeds, thin_places
 from services.estimator.precise.hypotheses import Mode, constraining_beams, select_distinct, weigh
 from services.estimator.precise.likelihood import Likelihood
-from services.estimator.precise.motion_model import Candidate, MotionNoise, fuse, predict_motion, widen_unobserved
+from services.estimator.precise.motion_model import MotionCandidate, MotionNoise, fuse, predict_motion, widen_unobserved
 from services.estimator.precise.search import NEAR_SCHEDULE_M
 from services.estimator.shared.generative_models import Expected, RayCaster
 from tests.estimator.models import ROOM
@@ -177,7 +177,7 @@ def test_fusion_is_bayes_rule(seed):
     P, H = a @ a.T + 0.01 * np.eye(3), np.linalg.inv(b @ b.T + 0.01 * np.eye(3))
     prior, seen = rng.normal(0, 0.2, (2, 3))
     mode = seen + rng.normal(0, 0.05, 3)  # the parabola may be expanded at any point
-    found = fuse(Candidate("x", prior, P, 0.5), mode, H @ (seen - mode), H)
+    found = fuse(MotionCandidate("x", prior, P, 0.5), mode, H @ (seen - mode), H)
     information = np.linalg.inv(P) + H
     assert found.mean == pytest.approx(np.linalg.solve(information, np.linalg.inv(P) @ prior + H @ seen), abs=1e-6)
     assert found.information == pytest.approx(information, rel=1e-6)
@@ -198,7 +198,7 @@ def test_fusion_is_bayes_rule(seed):
 def test_trust_region(numbers, curvatures, deviations):
     mean, mode, slope = np.array(numbers).reshape(3, 3)
     mean[2] = se2.wrap(mean[2])
-    found = fuse(Candidate("x", mean, np.diag(deviations) ** 2, 0.5), mode, slope, np.diag(curvatures))
+    found = fuse(MotionCandidate("x", mean, np.diag(deviations) ** 2, 0.5), mode, slope, np.diag(curvatures))
     taken, off = (np.abs(difference(pose[None], mean[None])[0]) for pose in (found.mean, mode))
     assert (taken <= (off + MAX_STEP) * (1 + 1e-6) + 1e-6).all()
     assert (taken <= (3 * np.array(deviations) + 5 * MAX_STEP) * (1 + 1e-6) + 1e-6).all()
@@ -239,7 +239,7 @@ def test_drift():
 
 def test_unobserved_motion():
     """The deviation grows at full speed along the unobserved directions alone."""
-    noise, found = MotionNoise(speed=1.0, turn=2.0), Candidate("x", TRUTH, 1e-6 * np.eye(3), 1.0)
+    noise, found = MotionNoise(speed=1.0, turn=2.0), MotionCandidate("x", TRUTH, 1e-6 * np.eye(3), 1.0)
     along = np.array([[0.6, 0.8, 0.0]])
     one, every = found, found
     for k in range(30):

@@ -13,7 +13,7 @@ from lab.accuracy.scenes import Scene
 from services.estimator.precise.gauss_newton import View
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.local_map import MIN_DISTANCE_M, LocalMap, LocalMapScan, LocalScan, _beams_towards
-from services.estimator.precise.motion_model import Candidate
+from services.estimator.precise.motion_model import MotionCandidate
 from services.estimator.shared.generative_models import RayCaster
 from tests.estimator.models import ROOM
 from tests.estimator.precise.test_changes import HALL
@@ -48,7 +48,7 @@ def test_match_in_any_frame(offset, frame, seed):
     scene = Scene.of(ROOM, 361, seed)
     there = se2.compose(HERE, offset)
     made = local_map(scene, HERE, frame=frame)
-    match = made.match(HERE[None], view(scene, there).points, Candidate("any", HERE, STEP, 1.0))
+    match = made.match(HERE[None], view(scene, there).points, MotionCandidate("any", HERE, STEP, 1.0))
     assert match is not None
     assert not match.degenerate
     assert match.share > 0.7
@@ -63,7 +63,7 @@ def test_covariance_turns_with_the_frame():
     found = []
     for yaw in (0.0, 1.2):
         made = local_map(scene, HERE, frame=(1.0, 2.0, yaw))
-        match = made.match(HERE[None], points, Candidate("any", HERE, STEP, 1.0))
+        match = made.match(HERE[None], points, MotionCandidate("any", HERE, STEP, 1.0))
         found.append(made.candidate(match).covariance)
     assert found[0] == pytest.approx(found[1], rel=0.1, abs=3e-7)
 
@@ -72,19 +72,19 @@ def test_covariance_turns_with_the_frame():
 def test_scan_from_elsewhere(there):
     scene = Scene.of(HALL, 361, 1)
     made = local_map(scene, (3.0, 2.0, 0.0))
-    assert made.match(HERE[None], view(scene, there).points, Candidate("any", HERE, STEP, 1.0)) is None
+    assert made.match(HERE[None], view(scene, there).points, MotionCandidate("any", HERE, STEP, 1.0)) is None
 
 
 def test_featureless_hall():
     bare = World(name="bare", boundary=[(0, 0), (60, 0), (60, 2), (0, 2)])
     scene, here = Scene.of(bare, 361, 1), np.array([30.0, 1.0, 0.0])
     made = local_map(scene, here)
-    assert made.match(here[None], view(scene, here).points, Candidate("any", here, STEP, 1.0)) is None
+    assert made.match(here[None], view(scene, here).points, MotionCandidate("any", here, STEP, 1.0)) is None
 
 
 def test_too_few_points():
     made = LocalMap(np.zeros(3))
-    any_motion = Candidate("any", np.zeros(3), STEP, 1.0)
+    any_motion = MotionCandidate("any", np.zeros(3), STEP, 1.0)
     assert made.match(np.zeros((1, 3)), np.ones((100, 2)), any_motion) is None
     assert local_map(Scene.of(ROOM, 361, 1), HERE).match(HERE[None], np.zeros((3, 2)), any_motion) is None
 
