@@ -317,7 +317,7 @@ class GeodesicPolicy:
         return Decision(reason=reason, state="blocked", path=path, refused=True) if arrived or stuck else None
 
     def _back_off(self, pose: Array, velocity: Array, surroundings: Surroundings, path: Array) -> Decision:
-        """Recover: drive towards the direction with the largest gap to walls and obstacles."""
+        """Recovers: drives towards the direction with the largest gap to walls and obstacles."""
         angle = np.arange(16) * np.pi / 8
         targets = 0.4 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         target = targets[int(np.argmax(surroundings.gaps(targets[:, None, :], np.zeros(1))[:, 0]))]
