@@ -11,7 +11,7 @@ from rich.progress import Progress
 
 from common.errors import UserError
 from common.geometry.occupancy_grid import FREE, OCCUPIED
-from common.geometry.rasterize import rasterise
+from common.geometry.rasterisation import rasterise
 from common.geometry.ros_map_writer import write_grid
 from common.geometry.se2 import Array
 from common.geometry.tum import write_tum

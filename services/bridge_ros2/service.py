@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 from common.bus.inbox import Sample
-from common.geometry.rasterize import rasterise
+from common.geometry.rasterisation import rasterise
 from common.geometry.se2 import Array
 from common.geometry.world import load_world
 from common.messages.definitions import Belief, CmdVel, Goal, Stamped
