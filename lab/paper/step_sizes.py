@@ -26,7 +26,7 @@ from common.messages.definitions import Belief, Goal, Pose
 from common.robot.base import Robot
 from lab.experiments import results
 from lab.experiments.estimators import ExperimentWorld
-from lab.experiments.journeys import ARRIVAL_DISTANCE, Journey, draw_journey, least_time
+from lab.experiments.start_and_goal import ARRIVAL_DISTANCE, StartAndGoal, draw_start_and_goal, least_time
 from lab.experiments.trials import run_trials
 from lab.paper import e3_navigation as navigation
 from lab.paper.teleports import StepSizes, travel
@@ -94,9 +94,9 @@ def settings() -> list[Setting]:
 def trial(job: StepSizeJob) -> dict[str, Any]:
     """Runs one journey. Returns its number of iterations, and in the velocity loop its time over the minimum."""
     world = job.field.scene(0).world
-    journey = draw_journey(world, np.random.default_rng((job.seed, navigation.EXPERIMENT_ID, job.index)), Robot())
-    row = {"setting": job.setting.name, "straight_m": journey.straight}
-    return row | (_run_displacement if job.setting.loop == "displacement" else _run_velocity)(job, world, journey)
+    ends = draw_start_and_goal(world, np.random.default_rng((job.seed, navigation.EXPERIMENT_ID, job.index)), Robot())
+    row = {"setting": job.setting.name, "straight_m": ends.straight}
+    return row | (_run_displacement if job.setting.loop == "displacement" else _run_velocity)(job, world, ends)
 
 
 @functools.lru_cache(maxsize=2)
@@ -105,13 +105,13 @@ def _model(field: ExperimentWorld) -> tuple[PaperModel, weights.ModelCard]:
     return weights.load(weights.find(SHIPPED, field.world, "paper", field.beams))
 
 
-def _run_displacement(job: StepSizeJob, world: World, journey: Journey) -> dict[str, Any]:
+def _run_displacement(job: StepSizeJob, world: World, ends: StartAndGoal) -> dict[str, Any]:
     scene = job.field.scene(job.seed, EXPERIMENT_ID, job.index)
 
     def look(pose: Array) -> Array:
         return usable_ranges(scene.observe(scene.clean(pose[None])[0], 0.0).ranges, scene.scanner.range_max)
 
-    outcome = travel(journey, job.setting.steps, _model(job.field)[0], look, world, job.field.heading, job.limit)
+    outcome = travel(ends, job.setting.steps, _model(job.field)[0], look, world, job.field.heading, job.limit)
     return {
         "reached": outcome.reached,
         "iterations": outcome.iterations,
@@ -121,12 +121,12 @@ def _run_displacement(job: StepSizeJob, world: World, journey: Journey) -> dict[
     }
 
 
-def _run_velocity(job: StepSizeJob, world: World, journey: Journey) -> dict[str, Any]:
+def _run_velocity(job: StepSizeJob, world: World, ends: StartAndGoal) -> dict[str, Any]:
     """Runs the journey as in E3, but in one process and with the job's step sizes."""
     from services.simulator.simulation import Simulation, SimulationSetup  # pybullet, for this alone
 
     scanner, steps = job.field.scene(0).scanner, job.setting.steps
-    pose, goal = (*journey.start, job.field.heading), np.array([*journey.goal, job.field.heading])
+    pose, goal = (*ends.start, job.field.heading), np.array([*ends.goal, job.field.heading])
     model, card = _model(job.field)
     perception = PaperEstimator(model, card, Descent(beta=steps.beta), np.array(pose))
     navigator = Navigator(Robot(), ActionParameters(gamma=steps.gamma), world)
@@ -157,7 +157,7 @@ def _run_velocity(job: StepSizeJob, world: World, journey: Journey) -> dict[str,
             simulation.advance()
     finally:
         simulation.close()
-    over = simulation.stamp_ns * 1e-9 / least_time(journey.straight, Robot())
+    over = simulation.stamp_ns * 1e-9 / least_time(ends.straight, Robot())
     return {
         "reached": away <= ARRIVAL_DISTANCE,
         "iterations": simulation.steps,
