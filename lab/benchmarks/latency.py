@@ -26,7 +26,7 @@ from common.messages.topics import CMD_VEL, ODOM, SCAN, TRUTH
 from common.robot.base import Robot
 from common.robot.scanner import SCANNERS
 from common.versions import commit, versions
-from presage.session.running import credentials_for
+from presage.session.running_sessions import credentials_for
 from presage.session.stack import Stack
 from presage.terminal.output import check_file, write_json
 

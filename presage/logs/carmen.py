@@ -20,7 +20,7 @@ from common.geometry.se2 import Array
 from common.robot.ranges import normalise_driver_ranges
 from presage.logs.carmen_lines import LINE_TYPE, LaserLine, is_laser, laser_line, pose_line
 from presage.logs.log import Log, LoggedScan, Reading
-from presage.logs.poses import PoseTrack
+from presage.logs.pose_track import PoseTrack
 from presage.logs.resampling import resample
 
 MAX_LINE_CHARACTERS = 1 << 22  # far more than the lines of real logs; limits the memory for other files

@@ -20,7 +20,7 @@ from common.messages.definitions import Goal, Scan
 from common.robot.ranges import is_surface
 from common.runtime import safety
 from presage.plotting.maps import draw_walls
-from presage.recordings.gathering import RecordedSession, load_session
+from presage.recordings.recorded_session import RecordedSession, load_session
 from presage.recordings.session_summary import summary_of
 
 # Palette of Okabe and Ito, suitable for colour-blind readers.

@@ -11,7 +11,7 @@ import numpy as np
 
 from common.geometry.se2 import Array
 from common.messages.definitions import Goal
-from presage.recordings.gathering import RecordedSession, load_session
+from presage.recordings.recorded_session import RecordedSession, load_session
 
 
 @dataclass(frozen=True)

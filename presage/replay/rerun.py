@@ -31,9 +31,9 @@ from common.messages.wire import DecodeError
 from common.versions import commit, versions
 from presage.logs.scan_files import Scans, read_scans
 from presage.recordings.selection import robot_of
+from presage.replay.estimator_comparison import BeliefSeries, compare, comparison_table, draw_comparison
 from presage.replay.localize import TimedBelief, prepare_estimator, run_estimator
-from presage.replay.recorded_session import estimator_settings, recorded_settings, settings_with
-from presage.replay.report import BeliefSeries, compare, comparison_table, draw_comparison
+from presage.replay.recorded_settings import estimator_settings, recorded_settings, settings_with
 from presage.terminal.output import check_file, write_json
 from presage.terminal.progress import progress
 from services.estimator.service import belief_message, estimator_options, prediction_message

@@ -11,8 +11,8 @@ from rich.console import Console
 from common.bus.bus import open_bus
 from common.errors import UserError
 from presage.session.page import show_page_link
-from presage.session.preflight import SessionPlan, plan_session
-from presage.session.running import announced, credentials_for
+from presage.session.running_sessions import announced, credentials_for
+from presage.session.session_plan import SessionPlan, plan_session
 from presage.session.stack import Stack
 from presage.terminal.options import arguments
 
