@@ -173,10 +173,10 @@ def _copy(
         message = _decode(topic, raw) if raw.key in (SCAN.key(robot), BELIEF.key(robot)) else None
         if isinstance(message, Scan) and len(new.stamps) < len(stamps) and message.stamp_ns == stamps[len(new.stamps)]:
             scan_published_ns, scan_logged_ns = raw.published_ns, raw.logged_ns
-            one = next(localised)
-            belief = belief_message(message, one.posterior, estimator)
-            new.add(belief, one.update_ms)
-            pending += [(PREDICTION, prediction_message(message, one.posterior)), (BELIEF, belief)]
+            timed = next(localised)
+            belief = belief_message(message, timed.posterior, estimator)
+            new.add(belief, timed.update_ms)
+            pending += [(PREDICTION, prediction_message(message, timed.posterior)), (BELIEF, belief)]
         elif isinstance(message, Belief):
             old.add(message, (raw.published_ns - scan_published_ns) * 1e-6)
             if new.stamps and message.stamp_ns == new.stamps[-1]:
