@@ -45,19 +45,16 @@ def localisation(world: str, beams: int, trials: int, scans: int, seed: int, con
         errors.append(float(np.hypot(*(estimate.pose - pose)[:2])))
         is_tracking.append(estimate.state == "tracking")
     error, tracking = np.array(errors), np.array(is_tracking)
+    found = error[error < FOUND_DISTANCE]
     return {
         "trials": trials,
         "scans": scans,
         "steps_a_scan": estimator.settings.iterations,
         "alpha_m2": estimator.settings.alpha,
-        "found_within_1_m": int((error < FOUND_DISTANCE).sum()),
+        "found_within_1_m": len(found),
         "position_error_median_m": float(np.median(error)),
-        "position_error_of_found_mean_m": float(error[error < FOUND_DISTANCE].mean())
-        if (error < FOUND_DISTANCE).any()
-        else None,
-        "position_error_of_found_std_m": float(error[error < FOUND_DISTANCE].std())
-        if (error < FOUND_DISTANCE).any()
-        else None,
+        "position_error_of_found_mean_m": float(found.mean()) if len(found) else None,
+        "position_error_of_found_std_m": float(found.std()) if len(found) else None,
         "claimed_tracking": int(tracking.sum()),
         "claimed_tracking_but_wrong": int((tracking & (error >= FOUND_DISTANCE)).sum()),
         "world": world,
