@@ -154,7 +154,7 @@ def run(job: PaperNavigationJob, trials: int, out: Path, workers: int, console: 
             curves[f"{name} {what} mean m"], curves[f"{name} {what} std m"] = mean, std
             curves["iteration"] = list(range(len(mean)))
     straight = [row["straight_m"] for row in rows]
-    drawn = {name: sum(row[name] for row in rows) for name in ("too_near", "obstructed")}
+    redrawn = {name: sum(row[name] for row in rows) for name in ("too_near", "obstructed")}
     parameters = asdict(job) | {
         "trials": trials,
         "close_m": ARRIVAL_DISTANCE,
@@ -162,17 +162,9 @@ def run(job: PaperNavigationJob, trials: int, out: Path, workers: int, console: 
         "robot": Robot().model_dump(),
         "straight_mean_m": float(np.mean(straight)),
         "straight_max_m": float(np.max(straight)),
-        "pairs_redrawn_too_near": drawn["too_near"],
-        "pairs_redrawn_obstructed": drawn["obstructed"],
+        "pairs_redrawn_too_near": redrawn["too_near"],
+        "pairs_redrawn_obstructed": redrawn["obstructed"],
     }
-    note = f"{trials} pairs at random, though this controller goes straight: what stands between holds the robot."
-    if job.free:
-        note = (
-            f"{trials} of {trials + drawn['obstructed']} pairs far enough apart were taken. Of the others the straight "
-            f"line comes nearer than {Robot().radius + CLEARANCE:.2f} m to something, and this controller goes "
-            "straight."
-        )
-    note += f" On average the goal is {np.mean(straight):.1f} m from the start (the paper: about 11 to 13.5 m)."
     result = results.Result(
         "e3",
         "E3: navigation through the real processes",
@@ -181,10 +173,26 @@ def run(job: PaperNavigationJob, trials: int, out: Path, workers: int, console: 
         {name: summarise(rows, name) for name in job.estimators},
         curves,
         rows,
-        [note],
+        [_note_on_pairs(trials, redrawn["obstructed"] if job.free else None, float(np.mean(straight)))],
     )
     result.write(out, draw(rows, job))
     return result
+
+
+def _note_on_pairs(trials: int, obstructed: int | None, straight_mean_m: float) -> str:
+    """How starts and goals were chosen.
+
+    ``obstructed`` counts pairs left out because something stood between; None if those were taken too.
+    """
+    if obstructed is None:
+        note = f"{trials} pairs at random, though this controller goes straight: what stands between holds the robot."
+    else:
+        note = (
+            f"{trials} of {trials + obstructed} pairs far enough apart were taken. Of the others the straight "
+            f"line comes nearer than {Robot().radius + CLEARANCE:.2f} m to something, and this controller goes "
+            "straight."
+        )
+    return f"{note} On average the goal is {straight_mean_m:.1f} m from the start (the paper: about 11 to 13.5 m)."
 
 
 def _rows(rows: Sequence[dict[str, Any]], name: str, quantity: str, names: Sequence[str]) -> Array:
