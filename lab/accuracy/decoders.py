@@ -15,9 +15,8 @@ from rich.table import Table
 from common.geometry.world import load_world
 from common.robot.scanner import SCANNERS
 from lab.accuracy.panorama import PanoramaShape, train_panorama
-from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import Scene
-from presage.terminal.output import check_file, write_json
+from presage.terminal.output import check_file, provenance, write_json
 from services.estimator.paper import decoder, training
 from services.estimator.paper.decoder import Normalisation
 from services.estimator.paper.estimator import PaperGenerativeModel

@@ -16,10 +16,10 @@ from common.geometry.world import load_world
 from common.robot.scanner import Scanner
 from common.robot.scanner_options import chosen_scanner
 from lab.accuracy.compared_estimators import COMPARED_ESTIMATORS
-from lab.accuracy.runner import TASKS, AccuracyJob, provenance, run_all
+from lab.accuracy.runner import TASKS, AccuracyJob, run_all
 from lab.accuracy.tasks import FOUND_DISTANCE, FOUND_YAW, TWINS_REQUIRED_FROM_SCAN
 from presage.plotting.style import empty_figure
-from presage.terminal.output import check_file, write_json
+from presage.terminal.output import check_file, provenance, write_json
 
 # Colour-blind safe colours (Okabe & Ito), marker, and the vertical offset of the annotation in points.
 MARKS = {

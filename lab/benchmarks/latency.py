@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -26,10 +25,9 @@ from common.messages.definitions import CmdVel, Pose, Scan
 from common.messages.topics import CMD_VEL, ODOM, SCAN, TRUTH
 from common.robot.base import Robot
 from common.robot.scanner import SCANNERS, Scanner
-from common.versions import commit, versions
 from presage.session.running_sessions import credentials_for
 from presage.session.stack import Stack
-from presage.terminal.output import check_file, write_json
+from presage.terminal.output import check_file, provenance, write_json
 
 # The echo process uses the keys of a separate robot: it receives any bytes on `odom` and returns them on `truth`.
 ECHO_ROBOT, ECHO = "echo", "simulator"
@@ -120,11 +118,8 @@ def _measure(
         "scans": scans,
         "rate_hz": rate,
         "unanswered": lost,
-        "seed": 0,
-        "commit": commit(),
-        "versions": versions(),
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
-        "arguments": sys.argv[1:],
+        **provenance(seed=0),
     }
 
 

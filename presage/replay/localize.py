@@ -20,14 +20,13 @@ from common.geometry import se2
 from common.geometry.pose_text import start_of_text
 from common.geometry.se2 import Array
 from common.geometry.world import load_world
-from common.versions import commit, versions
 from presage.estimator import Estimator
 from presage.interrupts import ignoring_interrupts
 from presage.laser_scan import LaserScan
 from presage.logs.log import Reading
 from presage.logs.opening import kind_of
 from presage.logs.scan_files import Prior, Scans, read_scans
-from presage.terminal.output import check_file
+from presage.terminal.output import check_file, provenance
 from presage.terminal.progress import progress, working
 from services.estimator.factory import EstimatorOptions, EstimatorPreset, check_start
 from services.estimator.shared.interface import Posterior
@@ -299,10 +298,7 @@ def _write_json(options: LocalizeOptions, out: Path, rows: list[dict[str, Any]],
         "end": options.end,
         "every": options.every,
         "complete": complete,
-        "seed": options.estimator_options.seed,
-        "commit": commit(),
-        "versions": versions(),
-        "arguments": sys.argv[1:],
+        **provenance(options.estimator_options.seed),
     }
     out.write_text(json.dumps({**meta, "rows": rows}, indent=1) + "\n", encoding="utf-8")
 
