@@ -13,7 +13,7 @@ import yaml
 from pydantic import Field, ValidationError, model_validator
 
 from common.errors import UserError
-from common.geometry import ros_map as map_file
+from common.geometry import ros_map
 from common.geometry.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from common.geometry.shapes import Box, Circle, Degrees, Obstacle, Ring, WorldPart, check_ring
 from common.geometry.yaml_text import TooLargeError, parse_yaml
@@ -297,11 +297,11 @@ def load_world(name: str) -> World:
     path = FOLDER / f"{name}.yaml" if name in known_worlds() else Path(name)
     try:
         data: Any = parse_yaml(path.read_text(encoding="utf-8"))
-        return World.model_validate(map_file.read_map(path, data) if map_file.is_map(data) else data)
+        return World.model_validate(ros_map.read_map(path, data) if ros_map.is_map(data) else data)
     except (FileNotFoundError, NotADirectoryError):
         raise UserError(f"no world {name!r}: give a file or one of {', '.join(known_worlds())}") from None
     except UnicodeDecodeError:
-        image = path.suffix.lower() in map_file.IMAGES
+        image = path.suffix.lower() in ros_map.IMAGES
         hint = (
             f"an image: give the map.yaml that names it, such as {path.with_suffix('.yaml')}" if image else "not text"
         )
