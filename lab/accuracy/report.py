@@ -21,15 +21,20 @@ from lab.accuracy.tasks import FOUND_DISTANCE, FOUND_YAW, TWINS_REQUIRED_FROM_SC
 from presage.plotting.style import empty_figure
 from presage.terminal.output import check_file, provenance, write_json
 
-# Colour-blind safe colours (Okabe & Ito), marker, and the vertical offset of the annotation in points.
+# Colour (colour-blind safe, Okabe & Ito) and marker of each estimator in the figure.
 MARKS = {
-    "precise": ("#0072B2", "o", 7),
-    "precise-exact": ("#56B4E9", "s", -14),
-    "particle-filter": ("#D55E00", "^", 7),
-    "amcl-defaults": ("#CC79A7", "v", -14),
+    "precise": ("#0072B2", "o"),
+    "precise-exact": ("#56B4E9", "s"),
+    "particle-filter": ("#D55E00", "^"),
+    "amcl-defaults": ("#CC79A7", "v"),
+    "particle-filter-all-beams": ("#009E73", "D"),
+    "particle-filter-no-recovery": ("#E69F00", "<"),
+    "particle-filter-learned-field": ("#999999", "X"),
+    "particle-filter-beam-model": ("#000000", "*"),
+    "particle-filter-scan-matching": ("#56B4E9", "P"),
+    "correlative": ("#D55E00", "d"),
 }
-# Of others that share a figure with these.
-OTHER_MARKS = (("#009E73", "D", 7), ("#E69F00", "P", -14), ("#F0E442", "X", 7), ("#000000", "*", -14))
+FEW_FOUND = 0.9  # the mark of an estimator that found a smaller share of a task's poses is pale
 # Printed below each --markdown table.
 LEGEND = f"""Errors are of the position, in mm. *Found*: trials within {FOUND_DISTANCE:g} m and
 {np.rad2deg(FOUND_YAW):g}° of the true pose, with Wilson's 95 % interval, where trials are independent; median, RMS and
@@ -210,11 +215,10 @@ def _draw(rows: list[dict[str, Any]], file: Path) -> None:
     tasks = list(dict.fromkeys(row["task"] for row in rows))
     figure = empty_figure(9, 0.55 * len(tasks) + 2)
     axes = figure.add_subplot()
-    others = iter(OTHER_MARKS * len(rows))
     for name in dict.fromkeys(row["estimator"] for row in rows):
         own = [row for row in rows if row["estimator"] == name]
-        _draw_estimator(axes, own, tasks, name, MARKS.get(name) or next(others))
-    bounds = [row for row in rows if row["bound_rms_m"] is not None]
+        _draw_estimator(axes, own, tasks, name)
+    bounds = list({row["task"]: row for row in reversed(rows) if row["bound_rms_m"] is not None}.values())
     axes.scatter(
         [row["bound_rms_m"] * 1e3 for row in bounds],
         [tasks.index(row["task"]) for row in bounds],
@@ -229,32 +233,21 @@ def _draw(rows: list[dict[str, Any]], file: Path) -> None:
     axes.set(
         xscale="log",
         xlabel="position error, RMS (mm)",
-        title=f"{title}; numbers: trials found, where some were not",
+        title=f"{title}; pale: less than {FEW_FOUND:.0%} of the poses found",
     )
     axes.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter("{x:g}")
     axes.grid(alpha=0.3, which="both", axis="x")
-    figure.legend(loc="outside lower center", ncols=len(MARKS) + 1)
+    figure.legend(loc="outside lower center", ncols=4, fontsize=8)
     figure.savefig(file, dpi=150)
 
 
-def _draw_estimator(
-    axes: Axes, rows: list[dict[str, Any]], tasks: list[str], name: str, style: tuple[str, str, int]
-) -> None:
-    """Draws one estimator's errors, with the number of trials found where some were not."""
-    colour, mark, points_above = style
+def _draw_estimator(axes: Axes, rows: list[dict[str, Any]], tasks: list[str], name: str) -> None:
+    """Draws one estimator's errors."""
+    colour, mark = MARKS[name]
     errors_mm = [row["position_error_rms_m"] * 1e3 for row in rows]
     lines = [tasks.index(row["task"]) for row in rows]
-    axes.scatter(errors_mm, lines, color=colour, marker=mark, s=50, label=name, zorder=3)
-    for row, *place in zip(rows, errors_mm, lines, strict=True):
-        if row["found"] < row["of"]:
-            axes.annotate(
-                f"{row['found']}/{row['of']}",
-                tuple(place),
-                textcoords="offset points",
-                xytext=(0, points_above),
-                ha="center",
-                fontsize=7,
-                color=colour,
-            )
+    opacity = [1.0 if row["found"] >= FEW_FOUND * row["of"] else 0.25 for row in rows]
+    axes.scatter(errors_mm, lines, color=colour, alpha=opacity, marker=mark, s=50, zorder=3)
+    axes.scatter([], [], color=colour, marker=mark, s=50, label=name)
