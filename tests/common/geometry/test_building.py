@@ -9,12 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.errors import UserError
-from common.geometry.building import GAP_M, GRID_GAP_M, BuildingFile, lay_out
+from common.geometry.building import GAP_M, GRID_GAP_M
 from common.geometry.occupancy_grid import OccupancyGrid
 from common.geometry.rasterize import rasterise
 from common.geometry.world import World, load_world, save_world
 from common.messages.requests import WorldReply
-from tests.common.geometry.maps import HUT, ROOM, write_map
+from tests.common.geometry.maps import HUT, ROOM, building, write_map
 
 HALL = World(
     name="hall",
@@ -23,11 +23,6 @@ HALL = World(
     start={"x": -2, "y": 1, "yaw_deg": 30},
 )
 ANGLES = np.linspace(-np.pi, np.pi, 40)
-
-
-def building(lifts=(), start=None, **floors) -> World:
-    file = BuildingFile(name="tower", floors=dict.fromkeys(floors, ""), lifts=list(lifts), start=start)
-    return World.model_validate(lay_out(file, floors))
 
 
 def grid_world(values, origin, resolution=0.5, name="map") -> World:
