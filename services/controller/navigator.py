@@ -206,8 +206,8 @@ class Navigator:
         self._begin_exploration()
         if self.explorer is not None:
             self.explorer.move(pose, located=belief.state == "tracking")
-        if self._scan is not None and self._scan.stamp_ns == belief.stamp_ns:
-            self.policy.observe(self._scan, belief)
+        has_its_scan = self._scan is not None and self._scan.stamp_ns == belief.stamp_ns
+        self.policy.observe(self._scan if has_its_scan else None, belief)
         self._follow_floor()
         if manual_twist is not None:
             self._suspend_goal()

@@ -13,7 +13,7 @@ from services.controller.policies.planner import GeodesicPolicy
 from services.controller.service import ControllerService
 from services.controller.settings import ControllerSettings
 from tests.common.geometry.maps import building
-from tests.controller.driving import belief, goal, room, session
+from tests.controller.driving import PERIOD_NS, belief, goal, room, scan, session
 
 FLOORS = {"ground": room(6, 4), "first": room(5, 4)}
 LIFTS = [{"ground": (5, 2), "first": (4, 3)}, {"ground": (1, 3.5), "first": (1, 3)}]
@@ -78,6 +78,16 @@ def test_ride(make):
     assert log[-1][1].state == "reached"
     np.testing.assert_allclose(FIRST.from_map(log[-1][2])[:2], [4, 1], atol=0.02)
     assert not any("lift" in reason for reason in reasons(log))
+
+
+def test_belief_that_came_late(make):
+    """The first belief on the other floor is of a scan that is no longer the latest."""
+    navigator = make(TOWER)
+    session(navigator, START, [None], TOWER)
+    navigator.on_goal(goal(4, 1, map_id="first"))
+    navigator.on_scan(scan(3 * PERIOD_NS, FIRST.to_map([4, 3, 2]), TOWER))
+    _, status = navigator.step(belief(2 * PERIOD_NS, FIRST.to_map([4, 3, 2])))
+    assert (status.state, status.refused) == ("navigating", False)
 
 
 def test_goal_before_the_robot_is_localised(make):
