@@ -91,13 +91,15 @@ bench: install ## measure the latency from scan to command and zenoh's own round
 chaos: install ## inject faults into a system on three hosts; measure detection, stop and recovery
 	$(BIN)/presage bench chaos $(ARGS)
 
-# The command of each table also stands beside it. PEERS: a folder as described in docs/peers.md; without it, that table
-# stays, as do those of real logs. Interrupted experiments continue, benchmarks begin again.
+# The command of each table also stands beside it. PEERS: a folder as described in docs/peers.md. LOGS: a folder with the logs
+# of docs/real_logs.md, fr079.npz and uwb.npz. Without them, those tables stay. Interrupted experiments continue, benchmarks
+# begin again. All is written to a folder that git ignores, so that every result names the same unchanged commit.
 PEERS ?=
-RESULTS := docs/experiments
+LOGS ?=
+RESULTS := experiments/tables
 tables: install ## measure the generated tables of README and docs/ at this commit, and fill them (many hours)
-	$(BIN)/presage bench accuracy --seed 2801 --seeds 5 --trials 20 --minutes 0.5 --json $(RESULTS)/accuracy.json --figure docs/accuracy.png
-	$(BIN)/presage bench accuracy --estimators all --tasks standing,blocked,furnished,tracking,odometry --seed 2801 --seeds 5 --trials 10 --minutes 0.2 --json $(RESULTS)/accuracy-rivals.json
+	mkdir -p $(RESULTS)
+	$(BIN)/presage bench accuracy --estimators all --seed 3211 --seeds 5 --trials 10 --minutes 0.2 --json $(RESULTS)/accuracy.json --figure $(RESULTS)/accuracy.png
 	$(BIN)/presage experiment --out $(RESULTS) all
 	$(BIN)/presage experiment --out $(RESULTS) navigation
 	$(BIN)/presage experiment --out $(RESULTS) navigation --start unknown
@@ -110,17 +112,27 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	$(BIN)/presage experiment --seed 2611 --out $(RESULTS) docking --trials 64
 	$(BIN)/presage experiment --seed 51 --out $(RESULTS) exploration
 	$(BIN)/presage bench mapping-faults --worlds 2 --seed 990 --seconds 60 --json $(RESULTS)/mapping-faults.json
-	$(BIN)/presage bench refinement --worlds 1 --seed 4110 --seconds 300 --out experiments/refinement --json $(RESULTS)/refinement.json
-	$(BIN)/presage bench visits --worlds 0 --visits 6 --scans 100 --seed 4711 --out experiments/visits --json $(RESULTS)/visits-office.json
+	$(BIN)/presage bench refinement --worlds 1 --seed 4110 --seconds 300 --out $(RESULTS)/refinement --json $(RESULTS)/refinement.json
+	$(BIN)/presage bench visits --worlds 0 --visits 6 --scans 100 --seed 4711 --out $(RESULTS)/visits --json $(RESULTS)/visits-office.json
 	$(BIN)/python -m lab.benchmarks.live_refinement --worlds office,4712 --seed 4712 --json $(RESULTS)/live-refinement.json
-	$(if $(PEERS),OMP_NUM_THREADS=1 PRESAGE_WORKERS=1 $(BIN)/presage experiment --seed 2801 --out $(RESULTS) peers '$(PEERS)')
-	$(BIN)/presage bench integrity --out experiments/integrity --worlds 3 --seed 3114 --model exact --seconds 10
-	$(BIN)/presage bench integrity --out experiments/integrity-long-corridor --worlds 20 --seed 3116 --model exact --seconds 10 --cases long-corridor --estimators precise
-	$(BIN)/presage bench integrity --out experiments/integrity-moved-50 --worlds 20 --seed 2611 --model exact --cases moved-50
-	$(BIN)/presage bench integrity --out experiments/integrity-single-scan --worlds 20 --seed 3115 --model exact --cases single-scan-moved-50 --estimators precise
-	for folder in experiments/integrity*; do cp $$folder/integrity.json $(RESULTS)/$${folder#*/}.json || exit 1; done
-	cp experiments/integrity/integrity.png $(RESULTS)/
-	for page in README.md docs/*.md; do $(BIN)/presage experiment --out $(RESULTS) tables --page $$page || exit 1; done
+	$(if $(PEERS),OMP_NUM_THREADS=1 $(BIN)/presage experiment --seed 3611 --out $(RESULTS) peers '$(PEERS)' --trials 10)
+	$(if $(LOGS),$(call measure_log,fr079_exchanged,fr079.npz,--half second,--exchange --every 200))
+	$(if $(LOGS),$(call measure_log,uwb,uwb.npz,--half first,--every 10))
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity --worlds 3 --seed 3114 --model exact --seconds 10
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-long-corridor --worlds 20 --seed 3116 --model exact --seconds 10 --cases long-corridor --estimators precise
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-50 --worlds 20 --seed 3311 --model exact --cases moved-50
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-single-scan --worlds 20 --seed 3115 --model exact --cases single-scan-moved-50 --estimators precise
+	for folder in $(RESULTS)/integrity*/; do cp $$folder/integrity.json docs/experiments/$$(basename $$folder).json || exit 1; done
+	cp $(RESULTS)/integrity/integrity.png $(RESULTS)/*.json $(RESULTS)/*.csv $(RESULTS)/*.png $(RESULTS)/*.pdf docs/experiments/
+	mv docs/experiments/accuracy.png docs/accuracy.png
+	cp $(RESULTS)/within_2cm/* docs/experiments/within_2cm/
+	for page in README.md docs/*.md; do $(BIN)/presage experiment --out docs/experiments tables --page $$page || exit 1; done
+
+# A real log: NAME of the result, FILE in $(LOGS), the half on which to learn, and other options.
+define measure_log
+$(BIN)/presage map '$(LOGS)/$2' --mount 0,0,0 --poses reference $3 --no-learn -o $(RESULTS)/$1.yaml \
+  && $(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/$2' --mount 0,0,0 --world $(RESULTS)/$1.yaml $4 --name $1
+endef
 
 screenshots: install ## docs/page.png and docs/page.webp of the live page; needs Chromium
 	$(BIN)/python -m tests.viewer.screenshots $(ARGS)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from common.messages.requests import Reply
-from common.messages.topics import MAX_BYTES, Query, Topic
+from common.messages.topics import MAX_BYTES, MAX_REQUEST_BYTES, Query, Topic
 from common.messages.wire import DecodeError
 
 MAX_KEYS = 1000  # number of keys that have their own counters, so that a sender that invents keys cannot fill memory
@@ -94,7 +94,7 @@ class Inbox:
         with self._lock:
             key = self.counter_name(full_key)
             self.received[key] += 1
-            if size > (MAX_BYTES if isinstance(entry, Sample) else 64 * MAX_BYTES):
+            if size > (MAX_BYTES if isinstance(entry, Sample) else MAX_REQUEST_BYTES):
                 self.oversized[key] += 1
                 if isinstance(entry, IncomingRequest):
                     entry.refuse(f"the request of {size} bytes is too large")

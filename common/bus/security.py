@@ -40,9 +40,11 @@ ROLES: dict[str, str] = {
     "replay": "publishes a recording in place of the robot's services",
 }
 EVERY_ROBOT = ("*",)
-READ = ("declare_subscriber", "liveliness_query", "declare_liveliness_subscriber")
+# Kinds of zenoh messages.
+SUBSCRIBE = ("declare_subscriber",)
+WATCH_LIVELINESS = ("liveliness_query", "declare_liveliness_subscriber")
 ANSWER = ("declare_queryable", "reply")
-EVERYTHING = (*READ, *ANSWER, "put", "delete", "query", "liveliness_token")
+EVERYTHING = (*SUBSCRIBE, *WATCH_LIVELINESS, *ANSWER, "put", "delete", "query", "liveliness_token")
 Rule = tuple[tuple[str, ...], list[str]]  # kinds of zenoh messages, key expressions
 
 
@@ -102,8 +104,8 @@ def rules_of(member: Member) -> list[Rule]:
     # A replay publishes the health of all recorded services.
     own = "*" if role == "replay" else service
     rules: list[Rule] = [
-        (READ[:1], [f"{ROOT}/{robot}/**" for robot in member.robots]),
-        (READ[1:], [f"{ROOT}/**"]),
+        (SUBSCRIBE, [f"{ROOT}/{robot}/**" for robot in member.robots]),
+        (WATCH_LIVELINESS, [f"{ROOT}/**"]),
         (("put",), keys([t for t in TOPICS if may_put(role, t)], own)),
         (("query",), keys([*(q for q in QUERIES if may_query(role, q)), *latched])),
         (ANSWER, keys([*(q for q in QUERIES if may_answer(role, q)), *latched], service)),

@@ -13,8 +13,7 @@ import yaml
 from pydantic import Field, ValidationError, model_validator
 
 from common.errors import UserError
-from common.geometry import building
-from common.geometry import ros_map as map_file
+from common.geometry import building, ros_map
 from common.geometry.floors import Floor, Lift, bounds_of, check_floors, corners_of, no_floor
 from common.geometry.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from common.geometry.shapes import Box, Circle, Degrees, Obstacle, Ring, WorldName, WorldPart, check_ring
@@ -365,11 +364,11 @@ def _load(name: str, folder: Path, *, is_floor: bool = False) -> World:
             if is_floor:
                 raise UserError("a floor cannot be a building with floors of its own")
             return _load_building(path, data)
-        return World.model_validate(map_file.read_map(path, data) if map_file.is_map(data) else data)
+        return World.model_validate(ros_map.read_map(path, data) if ros_map.is_map(data) else data)
     except (FileNotFoundError, NotADirectoryError):
         raise UserError(f"no world {str(path)!r}: give a file or one of {', '.join(known_worlds())}") from None
     except UnicodeDecodeError:
-        image = path.suffix.lower() in map_file.IMAGES
+        image = path.suffix.lower() in ros_map.IMAGES
         hint = (
             f"an image: give the map.yaml that names it, such as {path.with_suffix('.yaml')}" if image else "not text"
         )

@@ -15,12 +15,13 @@ from common.geometry import shapes as furniture
 from common.limits import MAX_BEAMS, MAX_COORDINATE_M, MAX_DISTANCE_M
 from common.messages import definitions as messages
 from common.messages import pose, requests
-from common.messages.topics import MAX_BYTES, QUERIES, ROOT, TOPICS, alive_key
+from common.messages.topics import MAX_BYTES, MAX_REQUEST_BYTES, QUERIES, ROOT, TOPICS, alive_key
 from common.robot import base as robot
 from common.robot import scanner
 
 BASES = (messages.Stamped, requests.Reply)  # their fields are listed once
 USUAL_LIMITS = (MAX_COORDINATE_M, MAX_DISTANCE_M)
+REQUEST_MIB = MAX_REQUEST_BYTES >> 20
 
 HEAD = f"""# Messages
 
@@ -37,7 +38,7 @@ Units are SI. Frames: `map` is fixed to the world, `odom` drifts, `base_link` is
 scanner. Stamps are ns of simulation or sensor time; in health, of wall time.
 
 Limits (`common/limits.py`) where no others are given: coordinates and angles ±{MAX_COORDINATE_M:g}, distances 0 to
-{MAX_DISTANCE_M:g} m, {MAX_BEAMS} beams, payload {MAX_BYTES >> 20} MiB (requests {64 * MAX_BYTES >> 20} MiB). Receivers
+{MAX_DISTANCE_M:g} m, {MAX_BEAMS} beams, payload {MAX_BYTES >> 20} MiB (requests {REQUEST_MIB} MiB). Receivers
 drop messages outside the limits and count them as undecodable.
 """
 

@@ -19,6 +19,7 @@ GOAL_ROLES = (*CONTROL_ROLES, "bridge_ros2")  # may set goals and poses; with th
 COMPUTE_ROLES = (*SERVICE_ROLES, "operator")  # may send requests that need much computing time
 ALL_ROLES = (*SERVICE_ROLES, "operator", "observer", "replay", "remote")
 MAX_BYTES = 1 << 20  # larger payloads are dropped before they are queued
+MAX_REQUEST_BYTES = 64 * MAX_BYTES  # the same for requests and replies
 
 
 @dataclass(frozen=True)

@@ -107,8 +107,12 @@ def start_command(service: str, robot: str, connect: str = "") -> str:
     """The shell command that starts a service. ``connect``: endpoints, or empty for the default."""
     if service == "router":
         return "python -m common.router"
-    options = [f"--robot {robot}"] * (robot != "robot") + [f"--connect {connect}"] * bool(connect)
-    return " ".join([f"python -m services.{service}", *options])
+    command = f"python -m services.{service}"
+    if robot != "robot":
+        command += f" --robot {robot}"
+    if connect:
+        command += f" --connect {connect}"
+    return command
 
 
 class CountTimes:

@@ -15,9 +15,8 @@ from rich.table import Table
 from common.geometry.world import load_world
 from common.robot.scanner import SCANNERS
 from lab.accuracy.panorama import PanoramaShape, train_panorama
-from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import Scene
-from presage.terminal.output import check_file, write_json
+from presage.terminal.output import check_file, provenance, write_json
 from services.estimator.paper import decoder, training
 from services.estimator.paper.decoder import Normalisation
 from services.estimator.paper.estimator import PaperGenerativeModel
@@ -96,7 +95,23 @@ def paper(epochs: int) -> Learn:
 def bench_decoders(world: str, samples: int, steps: int, seed: int, json_file: Path | None, console: Console) -> int:
     """Trains and evaluates the models, prints a table and writes ``json_file`` if given. Returns exit status 0."""
     check_file(json_file, "--json")
-    learners: dict[str, Learn] = {
+    any_heading, one_heading = TrainingScans(world, samples, seed), TrainingScans(world, samples, seed, HEADING)
+    rows = [
+        _learn_and_evaluate(name, learn, one_heading if name == PAPER else any_heading)
+        for name, learn in track(list(_learners(steps).items()), "learning", console=console, transient=True)
+    ]
+    console.print(_table(rows, f"{world}, {samples} scans of 811 beams with noise of 0.02 m"))
+    console.print(
+        "position: error of the pose estimated from noise-free scans, starting at the true pose. Only the model "
+        "causes it"
+    )
+    write_json(json_file, {"rows": rows, "samples": samples, "network_steps": steps, **provenance(seed)})
+    return 0
+
+
+def _learners(steps: int) -> dict[str, Learn]:
+    """The compared models by name."""
+    return {
         PAPER: paper(max(1, steps // 50)),
         "panorama, Fourier features, SiLU, L1": panorama(steps, loss="l1"),
         "panorama, Fourier features, SiLU, learned precision": panorama(steps),
@@ -109,27 +124,28 @@ def bench_decoders(world: str, samples: int, steps: int, seed: int, json_file: P
         "distance field, 0.04 m": field(0.04),
         "distance field, 0.02 m": field(0.02),
     }
-    any_heading, one_heading = TrainingScans(world, samples, seed), TrainingScans(world, samples, seed, HEADING)
-    rows: list[dict[str, Any]] = []
-    for name, learn in track(list(learners.items()), "learning", console=console, transient=True):
-        scans = one_heading if name == PAPER else any_heading
-        began = time.monotonic()
-        model, size = learn(scans)
-        took = time.monotonic() - began
-        errors = evaluate_model(model, scans.test, np.zeros(3), scans.angles, scans.test_ranges, 25.0, scans.sigma)
-        rows.append(
-            {
-                "decoder": name,
-                "learning_s": round(took, 1),
-                "numbers": size,
-                "range_error_median_m": errors.range_error_median,
-                "range_error_mean_m": errors.range_error_mean,
-                "share_above_5_cm": errors.share_above_5_cm,
-                "position_error_median_m": errors.position_error_median,
-                "position_error_rms_m": errors.position_error_rms,
-            }
-        )
-    table = Table(title=f"{world}, {samples} scans of 811 beams with noise of 0.02 m", title_justify="left")
+
+
+def _learn_and_evaluate(name: str, learn: Learn, scans: TrainingScans) -> dict[str, Any]:
+    """One row of the table."""
+    began = time.monotonic()
+    model, size = learn(scans)
+    took = time.monotonic() - began
+    errors = evaluate_model(model, scans.test, np.zeros(3), scans.angles, scans.test_ranges, 25.0, scans.sigma)
+    return {
+        "decoder": name,
+        "learning_s": round(took, 1),
+        "numbers": size,
+        "range_error_median_m": errors.range_error_median,
+        "range_error_mean_m": errors.range_error_mean,
+        "share_above_5_cm": errors.share_above_5_cm,
+        "position_error_median_m": errors.position_error_median,
+        "position_error_rms_m": errors.position_error_rms,
+    }
+
+
+def _table(rows: list[dict[str, Any]], title: str) -> Table:
+    table = Table(title=title, title_justify="left")
     table.add_column("decoder")
     for column in COLUMNS:
         table.add_column(column, justify="right")
@@ -144,10 +160,4 @@ def bench_decoders(world: str, samples: int, steps: int, seed: int, json_file: P
             f"{row['position_error_median_m'] * 1e3:.2f}",
             f"{row['position_error_rms_m'] * 1e3:.2f}",
         )
-    console.print(table)
-    console.print(
-        "position: error of the pose estimated from noise-free scans, starting at the true pose. Only the model "
-        "causes it"
-    )
-    write_json(json_file, {"rows": rows, "samples": samples, "network_steps": steps, **provenance(seed)})
-    return 0
+    return table

@@ -23,10 +23,9 @@ from common.geometry.se2 import Array
 from common.geometry.world import load_world
 from common.robot.motion_distortion import beam_times
 from lab.accuracy.compared_estimators import COMPARED_ESTIMATORS, EstimatorSetup
-from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import Scene
 from lab.accuracy.tasks import is_at
-from presage.terminal.output import check_file, write_json
+from presage.terminal.output import check_file, provenance, write_json
 from services.estimator.factory import ScannerGeometry
 from services.estimator.shared.interface import Observation
 from services.simulator.odometry import Odometer, OdometryNoise

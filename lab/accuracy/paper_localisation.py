@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +11,7 @@ from rich.progress import track
 
 from common.geometry import se2
 from common.robot.base import Robot
-from common.versions import commit, versions
+from presage.terminal.output import provenance, write_json
 from services.estimator.paper import weights
 from services.estimator.paper.decoder import use_one_core
 from services.estimator.paper.perception import PaperPerception
@@ -45,27 +43,21 @@ def localisation(world: str, beams: int, trials: int, scans: int, seed: int, con
         errors.append(float(np.hypot(*(estimate.pose - pose)[:2])))
         is_tracking.append(estimate.state == "tracking")
     error, tracking = np.array(errors), np.array(is_tracking)
+    found = error[error < FOUND_DISTANCE]
     return {
         "trials": trials,
         "scans": scans,
         "steps_a_scan": estimator.settings.iterations,
         "alpha_m2": estimator.settings.alpha,
-        "found_within_1_m": int((error < FOUND_DISTANCE).sum()),
+        "found_within_1_m": len(found),
         "position_error_median_m": float(np.median(error)),
-        "position_error_of_found_mean_m": float(error[error < FOUND_DISTANCE].mean())
-        if (error < FOUND_DISTANCE).any()
-        else None,
-        "position_error_of_found_std_m": float(error[error < FOUND_DISTANCE].std())
-        if (error < FOUND_DISTANCE).any()
-        else None,
+        "position_error_of_found_mean_m": float(found.mean()) if len(found) else None,
+        "position_error_of_found_std_m": float(found.std()) if len(found) else None,
         "claimed_tracking": int(tracking.sum()),
         "claimed_tracking_but_wrong": int((tracking & (error >= FOUND_DISTANCE)).sum()),
         "world": world,
         "beams": beams,
-        "seed": seed,
-        "commit": commit(),
-        "versions": versions(),
-        "arguments": sys.argv[1:],
+        **provenance(seed),
     }
 
 
@@ -81,6 +73,5 @@ def bench_localisation(
         + f"median error of all trials {result['position_error_median_m']:.3f} m\n"
         f"reported as tracking: {result['claimed_tracking']}, of these wrong: {result['claimed_tracking_but_wrong']}"
     )
-    if json_file is not None:
-        json_file.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    write_json(json_file, result)
     return 0

@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator
 from rich.console import Console
 from rich.table import Table
@@ -17,9 +16,10 @@ from common.geometry.world import load_world
 from common.robot.scanner import Scanner
 from common.robot.scanner_options import chosen_scanner
 from lab.accuracy.compared_estimators import COMPARED_ESTIMATORS
-from lab.accuracy.runner import TASKS, AccuracyJob, provenance, run_all
+from lab.accuracy.runner import TASKS, AccuracyJob, run_all
 from lab.accuracy.tasks import FOUND_DISTANCE, FOUND_YAW, TWINS_REQUIRED_FROM_SCAN
-from presage.terminal.output import check_file, write_json
+from presage.plotting.style import empty_figure
+from presage.terminal.output import check_file, provenance, write_json
 
 # Colour-blind safe colours (Okabe & Ito), marker, and the vertical offset of the annotation in points.
 MARKS = {
@@ -208,33 +208,12 @@ def _draw(rows: list[dict[str, Any]], file: Path) -> None:
     title, rows = next(iter(_by_title(rows).items()))
     rows = [row for row in rows if row["position_error_rms_m"] is not None]
     tasks = list(dict.fromkeys(row["task"] for row in rows))
-    figure = Figure(figsize=(9, 0.55 * len(tasks) + 2), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = empty_figure(9, 0.55 * len(tasks) + 2)
     axes = figure.add_subplot()
     others = iter(OTHER_MARKS * len(rows))
     for name in dict.fromkeys(row["estimator"] for row in rows):
         own = [row for row in rows if row["estimator"] == name]
-        colour, mark, above = MARKS.get(name) or next(others)
-        axes.scatter(
-            [row["position_error_rms_m"] * 1e3 for row in own],
-            [tasks.index(row["task"]) for row in own],
-            color=colour,
-            marker=mark,
-            s=50,
-            label=name,
-            zorder=3,
-        )
-        for row in own:
-            if row["found"] < row["of"]:
-                axes.annotate(
-                    f"{row['found']}/{row['of']}",
-                    (row["position_error_rms_m"] * 1e3, tasks.index(row["task"])),
-                    textcoords="offset points",
-                    xytext=(0, above),
-                    ha="center",
-                    fontsize=7,
-                    color=colour,
-                )
+        _draw_estimator(axes, own, tasks, name, MARKS.get(name) or next(others))
     bounds = [row for row in rows if row["bound_rms_m"] is not None]
     axes.scatter(
         [row["bound_rms_m"] * 1e3 for row in bounds],
@@ -258,3 +237,24 @@ def _draw(rows: list[dict[str, Any]], file: Path) -> None:
     axes.grid(alpha=0.3, which="both", axis="x")
     figure.legend(loc="outside lower center", ncols=len(MARKS) + 1)
     figure.savefig(file, dpi=150)
+
+
+def _draw_estimator(
+    axes: Axes, rows: list[dict[str, Any]], tasks: list[str], name: str, style: tuple[str, str, int]
+) -> None:
+    """Draws one estimator's errors, with the number of trials found where some were not."""
+    colour, mark, points_above = style
+    errors_mm = [row["position_error_rms_m"] * 1e3 for row in rows]
+    lines = [tasks.index(row["task"]) for row in rows]
+    axes.scatter(errors_mm, lines, color=colour, marker=mark, s=50, label=name, zorder=3)
+    for row, *place in zip(rows, errors_mm, lines, strict=True):
+        if row["found"] < row["of"]:
+            axes.annotate(
+                f"{row['found']}/{row['of']}",
+                tuple(place),
+                textcoords="offset points",
+                xytext=(0, points_above),
+                ha="center",
+                fontsize=7,
+                color=colour,
+            )

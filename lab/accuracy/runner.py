@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,7 +14,6 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.world import World, load_world
 from common.robot.scanner import Scanner
-from common.versions import commit, versions
 from lab.accuracy import tasks
 from lab.accuracy.compared_estimators import COMPARED_ESTIMATORS, EstimatorSetup
 from lab.accuracy.scenes import TWINS, Scene
@@ -151,8 +149,3 @@ def _row(job: AccuracyJob, world: str, task: str, outcome: tasks.TaskOutcome) ->
         "nees_band": [DEGREES_OF_FREEDOM - half, DEGREES_OF_FREEDOM + half] if len(nees) else None,
         "update_ms_median": float(np.median(outcome.update_ms)) if outcome.update_ms else None,
     }
-
-
-def provenance(seed: int) -> dict[str, Any]:
-    """The information needed to reproduce a result: seed, commit, versions and command-line arguments."""
-    return {"seed": seed, "commit": commit(), "versions": versions(), "arguments": sys.argv[1:]}

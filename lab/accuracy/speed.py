@@ -14,10 +14,9 @@ from rich.table import Table
 
 from common.geometry.world import load_world
 from lab.accuracy.compared_estimators import COMPARED_ESTIMATORS, EstimatorSetup
-from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import Scene
 from lab.workers import pool
-from presage.terminal.output import check_file, write_json
+from presage.terminal.output import check_file, provenance, write_json
 from services.estimator.factory import ScannerGeometry
 
 LIMITS = {"tracking": 5.0, "from nothing": 500.0}  # ms per update, the requirement for preset precise

@@ -15,13 +15,13 @@ from rich.table import Table
 
 from common.geometry import se2
 from common.geometry.se2 import Array
-from lab.accuracy.runner import provenance, quick_field
+from lab.accuracy.runner import quick_field
 from lab.accuracy.scenes import TIM571, Scene
 from lab.accuracy.tasks import is_at
 from lab.integrity import changes
 from lab.integrity.buildings import make_building
 from lab.workers import pool
-from presage.terminal.output import check_file, make_folder, write_json
+from presage.terminal.output import check_file, make_folder, provenance, write_json
 from services.estimator.factory import ScannerGeometry
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.field import DistanceField, FieldModel

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -19,12 +18,11 @@ from rich.table import Table
 from common.bus.bus import open_bus
 from common.messages.definitions import Belief, Goal, Pose, Status
 from common.messages.topics import BELIEF, GOAL, STATUS
-from common.versions import commit, versions
 from lab.benchmarks.viewer import ROBOT, FrameCounter
 from presage.live.latest_messages import LatestMessages
 from presage.session.ports import free_port
 from presage.session.stack import Stack
-from presage.terminal.output import check_file, write_json
+from presage.terminal.output import check_file, provenance, write_json
 
 ON_THE_ROBOT = ("router", "estimator", "controller", "recorder")
 SERVICES = (*ON_THE_ROBOT, "simulator", "viewer")
@@ -98,10 +96,8 @@ def bench_cpu(seconds: float, beams: int, json_file: Path | None, console: Conso
     result |= {
         "seconds": seconds,
         "beams": beams,
-        "commit": commit(),
-        "versions": versions(),
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
-        "arguments": sys.argv[1:],
+        **provenance(),
     }
     write_json(json_file, result)
     return 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -17,11 +16,10 @@ from rich.console import Console
 from common.bus.bus import open_bus
 from common.errors import UserError
 from common.geometry.world import load_world
-from common.versions import commit, versions
 from lab.benchmarks.fleet_load import AnswerStatistics, FleetLoad
 from lab.benchmarks.fleet_table import DEPLOYMENTS, show
 from presage.session.stack import Stack
-from presage.terminal.output import check_file, write_json
+from presage.terminal.output import check_file, provenance, write_json
 
 STARTUP_TIMEOUT_S = 120.0
 # Before a measurement, scans at a low rate let the estimators localise; repeated until all robots track.
@@ -245,11 +243,8 @@ def bench_fleet(estimators: str, plan: FleetPlan, json_file: Path | None, consol
             "rows": rows,
             "ratio_one_process_to_one_each": ratios,
             "load_average_1min": load_average,
-            "arguments": sys.argv[1:],
-            "seed": plan.seed,
-            "commit": commit(),
-            "versions": versions(),
             "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+            **provenance(plan.seed),
         },
     )
     return 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -20,15 +19,15 @@ from common.bus.inbox import Inbox, Sample
 from common.bus.security import read_credentials
 from common.errors import UserError
 from common.geometry import se2
+from common.geometry.se2 import Array
 from common.geometry.world import load_world
 from common.messages.definitions import CmdVel, Pose, Scan
 from common.messages.topics import CMD_VEL, ODOM, SCAN, TRUTH
 from common.robot.base import Robot
-from common.robot.scanner import SCANNERS
-from common.versions import commit, versions
-from presage.session.running import credentials_for
+from common.robot.scanner import SCANNERS, Scanner
+from presage.session.running_sessions import credentials_for
 from presage.session.stack import Stack
-from presage.terminal.output import check_file, write_json
+from presage.terminal.output import check_file, provenance, write_json
 
 # The echo process uses the keys of a separate robot: it receives any bytes on `odom` and returns them on `truth`.
 ECHO_ROBOT, ECHO = "echo", "simulator"
@@ -82,8 +81,8 @@ def _wait_echo(echo_bus: Bus, stack: Stack) -> None:
 def _measure(
     bus: Bus,
     echo_bus: Bus,
-    scanner: Any,
-    clean: Any,
+    scanner: Scanner,
+    clean: Array,
     rng: np.random.Generator,
     scans: int,
     rate: float,
@@ -93,21 +92,10 @@ def _measure(
     bus.subscribe(CMD_VEL, commands, keep_all=True)
     echo_bus.subscribe(TRUTH, returns, keep_all=True)
     loop_ms, raw_ms, lost = [], [], 0
-    mount = Pose.of(scanner.mount)
     for number in track(range(WARM_UP_SCANS + scans), "scan to command", console=console, transient=True):
         stamp = int(number / rate * 1e9)
         noisy = clean + scanner.sigma * rng.standard_normal(len(clean))
-        payload = Scan(
-            stamp_ns=stamp,
-            seq=number,
-            angle_min=scanner.angle_min,
-            angle_increment=scanner.angle_increment,
-            range_min=scanner.range_min,
-            range_max=scanner.range_max,
-            ranges=noisy,
-            mount=mount,
-            scan_time=1 / rate,
-        ).encode()
+        payload = _scan(scanner, noisy, number, stamp, rate).encode()
         began = time.perf_counter()
         bus.put(SCAN, payload)
         answered = _wait_for(commands, lambda p, s=stamp: CmdVel.decode(p).stamp_ns == s)
@@ -130,12 +118,23 @@ def _measure(
         "scans": scans,
         "rate_hz": rate,
         "unanswered": lost,
-        "seed": 0,
-        "commit": commit(),
-        "versions": versions(),
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
-        "arguments": sys.argv[1:],
+        **provenance(seed=0),
     }
+
+
+def _scan(scanner: Scanner, ranges: Array, number: int, stamp_ns: int, rate: float) -> Scan:
+    return Scan(
+        stamp_ns=stamp_ns,
+        seq=number,
+        angle_min=scanner.angle_min,
+        angle_increment=scanner.angle_increment,
+        range_min=scanner.range_min,
+        range_max=scanner.range_max,
+        ranges=ranges.astype(np.float32),
+        mount=Pose.of(scanner.mount),
+        scan_time=1 / rate,
+    )
 
 
 def _wait_for(inbox: Inbox, wanted: Any) -> bool:

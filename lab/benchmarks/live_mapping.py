@@ -20,7 +20,7 @@ from common.messages.topics import BELIEF, DRIVE, HEALTH, MAP, TRUTH
 from lab.accuracy.scenes import Scene
 from lab.benchmarks.mapping import trajectory_errors
 from presage.live.latest_messages import LatestMessages
-from presage.session.running import link_of
+from presage.session.running_sessions import link_of
 
 GAIN = 3.0  # 1/s, commanded speed per distance from the next point of the path
 REACHED_M = 0.25  # distance from a point at which the robot turns to the next one

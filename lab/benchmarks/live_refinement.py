@@ -16,14 +16,13 @@ import psutil
 
 from common.geometry.se2 import Array
 from common.geometry.world import World, load_world
-from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import Scene
 from lab.benchmarks.mapping import fitted
 from lab.experiments.results import markdown, millimetres
 from lab.integrity.buildings import make_building
 from lab.integrity.cases import BEAMS, START_DEVIATION
 from lab.integrity.maps import noisy_grid
-from presage.terminal.output import check_file, write_json
+from presage.terminal.output import check_file, provenance, write_json
 from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.learning import weights

@@ -16,11 +16,10 @@ from rich.table import Table
 from common.errors import UserError
 from common.geometry import se2
 from common.geometry.se2 import Array
-from lab.accuracy.runner import provenance
 from lab.integrity.cases import CASES, make_trial
 from presage.learning.map_of_log import raw_drive
 from presage.logs.scan_files import read_scans
-from presage.terminal.output import check_file, write_json
+from presage.terminal.output import check_file, provenance, write_json
 from services.mapper.slam.drive import Laser, RawDrive
 from services.mapper.slam.trajectory import build_trajectory
 

@@ -20,7 +20,6 @@ from common.geometry.occupancy_grid import OCCUPIED
 from common.geometry.ray_casting import cast_rays
 from common.geometry.se2 import Array
 from common.geometry.world import World
-from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import TWINS, Scene
 from lab.accuracy.tasks import is_at
 from lab.benchmarks.mapping import alignment
@@ -28,7 +27,7 @@ from lab.experiments.results import markdown, millimetres, number
 from lab.integrity.buildings import make_building
 from lab.integrity.cases import BEAMS
 from lab.integrity.changes import KidnappingPlaces, crowd
-from presage.terminal.output import check_file, write_json
+from presage.terminal.output import check_file, provenance, write_json
 from services.mapper.slam.drive import Laser, RawDrive
 from services.mapper.slam.grid import grid_of_scans
 from services.mapper.slam.trajectory import build_trajectory

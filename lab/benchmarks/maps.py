@@ -19,8 +19,7 @@ from common.geometry.world import World, load_world
 from common.messages.requests import WorldReply
 from common.robot.base import Robot
 from common.robot.scanner import SCANNERS
-from lab.accuracy.runner import provenance
-from presage.terminal.output import check_file, make_folder, write_json
+from presage.terminal.output import check_file, make_folder, provenance, write_json
 from services.controller.policies.free_space import FreeSpace
 from services.controller.policies.geodesic_field import FreeSpaceGraph
 from services.estimator.particle_filter.likelihood_field import SurfaceDistances

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import sys
 import time
 import urllib.request
 from collections import Counter
@@ -22,11 +21,10 @@ from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
 from common.messages.topics import SCAN
 from common.runtime.metrics import ServiceMetrics
-from common.versions import commit, versions
 from lab.benchmarks.cpu import cpu_seconds
 from presage.session.ports import free_port
 from presage.session.stack import Stack
-from presage.terminal.output import check_file, write_json
+from presage.terminal.output import check_file, provenance, write_json
 
 SERVICES = ("simulator", "estimator", "controller")
 WARM_UP_S = 3.0  # before the first round
@@ -111,10 +109,8 @@ def bench_metrics(seconds: float, rounds: int, json_file: Path | None, console: 
         "observation_us": observation_us(),
         "seconds": seconds,
         "rounds": rounds,
-        "commit": commit(),
-        "versions": versions(),
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
-        "arguments": sys.argv[1:],
+        **provenance(),
     }
     console.print(
         f"a scrape: {result['scrape_median_ms']:.1f} ms median, {result['scrape_p99_ms']:.1f} ms p99, "

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 import tempfile
 import time
 import zlib
@@ -23,10 +22,9 @@ from common.bus.bus import Bus, open_bus
 from common.errors import UserError
 from common.messages.definitions import Health, Scan
 from common.messages.topics import HEALTH, TOPICS, Topic
-from common.versions import commit, versions
 from presage.live.latest_messages import LatestMessages
 from presage.session.stack import Stack
-from presage.terminal.output import check_file, make_folder, write_json
+from presage.terminal.output import check_file, make_folder, provenance, write_json
 from services.recorder.files.message_counts import from_metadata
 from services.recorder.reader import read_recording
 
@@ -191,7 +189,6 @@ def bench_recorder(load: RecorderLoad, out: Path | None, json_file: Path | None,
     table.add_row("memory at most (MB)", f"{result['memory_mb']:.0f}", f"{LIMITS['memory_mb']:g}")
     table.add_row("file (MB)", f"{result['file_mb']:.1f}", "")
     console.print(table)
-    context = {"limits": LIMITS, "load": asdict(load), "commit": commit(), "versions": versions(), "seed": 0}
-    write_json(json_file, result | context | {"arguments": sys.argv[1:]})
+    write_json(json_file, {**result, "limits": LIMITS, "load": asdict(load), **provenance(seed=0)})
     whole = result["bytes_as_sent"] and result["written"] == result["received"] == result["sent"] == result["in_file"]
     return 0 if whole and not result["dropped"] and all(result[k] <= v for k, v in LIMITS.items()) else 1

@@ -16,7 +16,6 @@ from common.geometry import se2
 from common.geometry.ros_map_writer import write_grid
 from common.geometry.se2 import Array
 from common.geometry.world import World, load_world
-from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import Scene
 from lab.benchmarks.mapping import alignment
 from lab.benchmarks.visits import PERIOD_S, drive_through_rooms, office_building, write_drive_log
@@ -28,7 +27,7 @@ from lab.integrity.maps import noisy_grid
 from presage.learning.map_of_log import MapOptions, map_command
 from presage.learning.train_drive import TrainDriveOptions, train_from_drive
 from presage.logs.log import Reading
-from presage.terminal.output import check_file, make_folder, write_json
+from presage.terminal.output import check_file, make_folder, provenance, write_json
 from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.precise.learning import weights
 from services.estimator.shared.generative_models import GenerativeModel, RayCaster

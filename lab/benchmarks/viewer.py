@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import platform
-import sys
 import threading
 import time
 from dataclasses import dataclass, field
@@ -25,10 +24,9 @@ from common.bus.bus import Bus, open_bus, wait_until
 from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
 from common.messages.topics import CMD_VEL, SCAN
-from common.versions import commit, versions
 from presage.session.ports import free_port
 from presage.session.stack import Stack
-from presage.terminal.output import check_file, write_json
+from presage.terminal.output import check_file, provenance, write_json
 
 WARM_UP_S = 3.0  # at the start of every round, left out of the statistics
 TIMEOUT_S = 60.0
@@ -168,10 +166,8 @@ def _report(without: ViewerCost, viewed: ViewerCost, seconds: float, rounds: int
         "seconds": seconds,
         "rounds": rounds,
         "beams": beams,
-        "commit": commit(),
-        "versions": versions(),
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
-        "arguments": sys.argv[1:],
+        **provenance(),
     }
 
 

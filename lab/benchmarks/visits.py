@@ -23,7 +23,6 @@ from common.geometry.shapes import Obstacle
 from common.geometry.world import load_world
 from common.robot.scanner import Scanner
 from lab.accuracy.furniture import FurniturePiece
-from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import ROBOT, Scene
 from lab.accuracy.tasks import is_at
 from lab.experiments.results import markdown, millimetres
@@ -34,7 +33,7 @@ from lab.integrity.changes import MAX_PLACES
 from lab.navigation.shortest_path import ShortestPaths
 from presage.learning.map_of_log import MapOptions, map_command
 from presage.logs.log import Reading
-from presage.terminal.output import check_file, make_folder, write_json
+from presage.terminal.output import check_file, make_folder, provenance, write_json
 from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.learning import weights

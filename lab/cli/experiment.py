@@ -87,7 +87,7 @@ def e3(
     from lab.paper import e3_navigation as navigation
 
     seed, out = context.obj
-    job = navigation.JourneyJob(0, seed, free=free)
+    job = navigation.PaperNavigationJob(0, seed, free=free)
     job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
     show(navigation, lambda: navigation.run(job, trials, out, worker_count(), console), out)
 

@@ -1,6 +1,6 @@
-"""One journey through real processes in lockstep.
+"""One drive to a goal through the real processes, in lockstep.
 
-All processes but the router are restarted for every journey, so the results depend on the run's parameters alone and
+All processes but the router are restarted for every drive, so the results depend on the run's parameters alone and
 not on earlier runs. In lockstep each scan waits for the command that answers it, so the machine's speed does not
 matter either.
 """
@@ -20,7 +20,7 @@ from common.errors import UserError
 from common.geometry.se2 import Array
 from common.messages.definitions import Belief, Goal, Health, Pose, Stamped, Status, Truth
 from common.messages.topics import BELIEF, GOAL, HEALTH, STATUS, TRUTH
-from lab.experiments.journeys import ARRIVAL_DISTANCE, Journey
+from lab.experiments.start_and_goal import ARRIVAL_DISTANCE, StartAndGoal
 from lab.workers import THREAD_COUNT_VARIABLES
 from presage.live.latest_messages import LatestMessages
 from presage.session.stack import Stack
@@ -35,7 +35,7 @@ MAX_ROUTER_STARTS = 5  # another process may take the free port before the route
 class LockstepRun:
     """Parameters of a run; its results depend on nothing else."""
 
-    journey: Journey
+    ends: StartAndGoal
     yaw: float  # rad, of the robot at the start
     world: str
     beams: int
@@ -49,7 +49,7 @@ class LockstepRun:
     # Whether the run ends when the controller reports that the goal is reached or refused; otherwise it ends when the
     # robot truly is near the goal.
     ends_with_status: bool = False
-    goal: Goal | None = None  # defaults to the journey's, at any heading
+    goal: Goal | None = None  # defaults to the one of `ends`, at any heading
     scans_after_end: int = 0  # recorded after that, while the robot comes to a stand
 
 
@@ -117,7 +117,7 @@ def run(params: LockstepRun, stack: Stack) -> RunTrace:
     """
     # A unique robot name, so that messages of earlier runs or other sessions are not received.
     stack.robot = f"e3-{os.getpid()}-{time.monotonic_ns()}"
-    (x, y), yaw = params.journey.start, float(np.rad2deg(params.yaw))
+    (x, y), yaw = params.ends.start, float(np.rad2deg(params.yaw))
     pose, world, seed = f"{x!r},{y!r},{yaw!r}", ("--world", params.world), ("--seed", str(params.seed))
     with open_bus(stack.link()) as bus:
         messages = LatestMessages(bus, TRUTH, BELIEF, STATUS, *((HEALTH,) if params.ends_with_status else ()))
@@ -140,7 +140,7 @@ def run(params: LockstepRun, stack: Stack) -> RunTrace:
             *params.simulator,
         )
         stack.wait_alive(bus)
-        x, y = params.journey.goal
+        x, y = params.ends.goal
         answer = _send_goal(messages, stack, params.goal or Goal(stamp_ns=0, seq=1, pose=Pose(x=x, y=y)))
         if answer.state == "blocked" and not params.ends_with_status:
             raise UserError(answer.reason)
@@ -213,7 +213,7 @@ def _append(message: Stamped, trace: RunTrace, end: int | None) -> None:
 def _is_final(message: Stamped, trace: RunTrace, params: LockstepRun) -> bool:
     """Whether this message is about the last scan of the run."""
     if isinstance(message, Truth):
-        away = float(np.hypot(*(message.pose.array()[:2] - np.array(params.journey.goal))))
+        away = float(np.hypot(*(message.pose.array()[:2] - np.array(params.ends.goal))))
         return len(trace.truths) > params.limit or (not params.ends_with_status and away <= ARRIVAL_DISTANCE)
     if isinstance(message, Status) and params.ends_with_status and message.goal_seq:
         return message.state == "reached" or message.refused

@@ -48,27 +48,13 @@ def bench_chaos(
     missing = "--one-host was given" if one_host else missing_for_namespaces()
     if not missing and not os.environ.get(NAMESPACE_VARIABLE):
         enter_own_namespaces(["-m", "presage", *sys.argv[1:]])
-    outcomes: list[FaultOutcome] = []
-    skipped: dict[str, str] = {}
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PRESAGE_")}
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="presage-chaos-")))
         network = None if missing else stack.enter_context(Network())
         with console.status("starting the system"):
             system = stack.enter_context(System(folder, network, environment, quiet=quiet))
-        for fault in faults:
-            unavailable = (
-                f"needs several hosts: {missing}" if fault.needs_hosts and missing else ""
-            ) or fault.unavailable_reason()
-            if unavailable:
-                skipped[fault.name] = unavailable
-                console.print(f"[yellow]not tried[/] {fault.name}: {unavailable}", highlight=False)
-                continue
-            for repeat in range(repeats):
-                with console.status(f"{fault.name} ({repeat + 1} of {repeats}): {fault.about}"):
-                    outcomes.append(measure(system, fault))
-                problem = outcomes[-1].deviations
-                console.print(f"{'[red]no[/]' if problem else '[green]ok[/]'} {fault.name} {problem}", highlight=False)
+        outcomes, skipped = _inject(faults, repeats, system, missing, console)
     print(faults_table(outcomes))
     data = {
         "command": "presage bench chaos",
@@ -83,6 +69,29 @@ def bench_chaos(
     }
     write_json(json_file, data)
     return 1 if any(outcome.deviations for outcome in outcomes) else 0
+
+
+def _inject(
+    faults: Sequence[Fault], repeats: int, system: System, missing: str, console: Console
+) -> tuple[list[FaultOutcome], dict[str, str]]:
+    """Injects all faults that are possible here; returns the outcomes, and by name why others were skipped.
+
+    ``missing`` says why there are no several hosts; empty if there are.
+    """
+    outcomes: list[FaultOutcome] = []
+    skipped: dict[str, str] = {}
+    for fault in faults:
+        reason = f"needs several hosts: {missing}" if fault.needs_hosts and missing else fault.unavailable_reason()
+        if reason:
+            skipped[fault.name] = reason
+            console.print(f"[yellow]not tried[/] {fault.name}: {reason}", highlight=False)
+            continue
+        for repeat in range(repeats):
+            with console.status(f"{fault.name} ({repeat + 1} of {repeats}): {fault.about}"):
+                outcomes.append(measure(system, fault))
+            problem = outcomes[-1].deviations
+            console.print(f"{'[red]no[/]' if problem else '[green]ok[/]'} {fault.name} {problem}", highlight=False)
+    return outcomes, skipped
 
 
 HEAD = ("fault", "detected (s)", "stopped (s)", "restarted (s)", "recovered (s)", "lowest speed (m/s)", "as expected")

@@ -50,18 +50,7 @@ def bench_hosts(seconds: float, beams: int, json_file: Path | None, console: Con
         with console.status("starting the system"):
             system = stack.enter_context(System(folder, network, clean, beams=beams))
         with console.status("driving"):
-            system.drive_fast()
-            time.sleep(WARM_UP_S)
-            before, began = {name: traffic(name) for name in network.hosts}, time.monotonic()
-            while time.monotonic() < began + seconds:
-                system.drive_fast()
-                time.sleep(1.0)
-            took = time.monotonic() - began
-            links = {
-                name: {way: (traffic(name)[way] - count) / took for way, count in before[name].items()}
-                for name in network.hosts
-            }
-            rows = [row for row in system.timeline.rows if row["t"] >= began]
+            links, rows, took = _measure_links(system, network, seconds)
     delays_by_topic = {what: delays(rows, what) for what in ("belief", "cmd_vel")}
     table = Table("link of", "with", "out kB/s", "in kB/s", title=f"{beams} beams at 15 Hz, {took:.0f} s")
     for name, link in links.items():
@@ -79,6 +68,24 @@ def bench_hosts(seconds: float, beams: int, json_file: Path | None, console: Con
     }
     write_json(json_file, data)
     return 0
+
+
+def _measure_links(
+    system: System, network: Network, seconds: float
+) -> tuple[dict[str, dict[str, float]], list[Row], float]:
+    """Bytes per second of each link and way while the robot drives, the events meanwhile, and the time taken in s."""
+    system.drive_fast()
+    time.sleep(WARM_UP_S)
+    before, began = {name: traffic(name) for name in network.hosts}, time.monotonic()
+    while time.monotonic() < began + seconds:
+        system.drive_fast()
+        time.sleep(1.0)
+    took, after = time.monotonic() - began, {name: traffic(name) for name in network.hosts}
+    links = {
+        name: {way: (after[name][way] - count) / took for way, count in counts.items()}
+        for name, counts in before.items()
+    }
+    return links, [row for row in system.timeline.rows if row["t"] >= began], took
 
 
 def traffic(host: str) -> dict[str, int]:

@@ -30,7 +30,7 @@ SLIP_S, SLIP_PERIOD_S = 1.0, 10.0  # duration, and mean time between two slips
 
 
 @dataclass(frozen=True)
-class Case:
+class IntegrityCase:
     """How the real world, scanner and odometry of a trial differ from what the estimator is given."""
 
     name: str
@@ -64,39 +64,39 @@ class Case:
 CASES = {
     case.name: case
     for case in (
-        Case("unchanged"),
-        Case("moved-25", 120, moved=0.25),
-        Case("moved-50", 120, moved=0.5),
-        Case("moved-100", 120, moved=1.0),
-        Case("added", added=0.4),
-        Case("removed", removed=0.5),
-        Case("doors-closed", doors_closed=0.5),
-        Case("crowd", people_per_m2=0.08),
-        Case("kidnapped-anywhere", kidnapping="anywhere"),
-        Case("kidnapped-similar", kidnapping="similar"),
-        Case("kidnapped-nearby", kidnapping="nearby"),
-        Case("symmetric-rooms", building="symmetric", start_known=False),
-        Case("long-corridor", building="corridor", range_max=8.0),
-        Case("glass", glass=0.4),
-        Case("black", black=0.4),
-        Case("rotated-scanner", mount_yaw_deg=2.0),
-        Case("sigma-half", sigma=0.5),
-        Case("sigma-double", sigma=2.0),
-        Case("odometry", odometry=1.0),
-        Case("odometry-too-good", odometry=2.0),
-        Case("odometry-too-bad", odometry=0.5),
-        Case("slip", odometry=1.0, slip=True),
-        Case("scaled-map", map="scaled"),
-        Case("noisy-map", map="grid"),
-        Case("wrong-map", map="other", start_known=False),
-        Case("single-scan-moved-50", moved=0.5, single_scans=100, start_known=False),
-        Case("unknown-start", start_known=False),
+        IntegrityCase("unchanged"),
+        IntegrityCase("moved-25", 120, moved=0.25),
+        IntegrityCase("moved-50", 120, moved=0.5),
+        IntegrityCase("moved-100", 120, moved=1.0),
+        IntegrityCase("added", added=0.4),
+        IntegrityCase("removed", removed=0.5),
+        IntegrityCase("doors-closed", doors_closed=0.5),
+        IntegrityCase("crowd", people_per_m2=0.08),
+        IntegrityCase("kidnapped-anywhere", kidnapping="anywhere"),
+        IntegrityCase("kidnapped-similar", kidnapping="similar"),
+        IntegrityCase("kidnapped-nearby", kidnapping="nearby"),
+        IntegrityCase("symmetric-rooms", building="symmetric", start_known=False),
+        IntegrityCase("long-corridor", building="corridor", range_max=8.0),
+        IntegrityCase("glass", glass=0.4),
+        IntegrityCase("black", black=0.4),
+        IntegrityCase("rotated-scanner", mount_yaw_deg=2.0),
+        IntegrityCase("sigma-half", sigma=0.5),
+        IntegrityCase("sigma-double", sigma=2.0),
+        IntegrityCase("odometry", odometry=1.0),
+        IntegrityCase("odometry-too-good", odometry=2.0),
+        IntegrityCase("odometry-too-bad", odometry=0.5),
+        IntegrityCase("slip", odometry=1.0, slip=True),
+        IntegrityCase("scaled-map", map="scaled"),
+        IntegrityCase("noisy-map", map="grid"),
+        IntegrityCase("wrong-map", map="other", start_known=False),
+        IntegrityCase("single-scan-moved-50", moved=0.5, single_scans=100, start_known=False),
+        IntegrityCase("unknown-start", start_known=False),
     )
 }
 
 
 @dataclass(frozen=True)
-class Trial:
+class IntegrityTrial:
     """The scans of one trial, with what the estimator is given and what is true."""
 
     map_world: World
@@ -109,7 +109,7 @@ class Trial:
     separate: bool  # every scan is a trial of its own, from an unknown start
 
 
-def make_trial(case: Case, seed: int, seconds: float | None = None) -> Trial:
+def make_trial(case: IntegrityCase, seed: int, seconds: float | None = None) -> IntegrityTrial:
     """The trial of a case in the world of a seed; ``seconds`` defaults to the case's."""
     rng = np.random.default_rng([seed, zlib.crc32(case.name.encode())])
     stated = scanner_of(case)
@@ -130,17 +130,17 @@ def make_trial(case: Case, seed: int, seconds: float | None = None) -> Trial:
     if case.start_known:
         offset = START_DEVIATION * rng.standard_normal(3)
         start = truths[0] + offset, np.diag(START_DEVIATION**2)
-    return Trial(
+    return IntegrityTrial(
         map_of(case, seed), stated, observations, truths, start, case.map_is_correct, kidnappings, case.single_scans > 0
     )
 
 
-def scanner_of(case: Case) -> Scanner:
+def scanner_of(case: IntegrityCase) -> Scanner:
     """The scanner as stated to the estimator."""
     return Scanner.model_validate({**TIM571.model_dump(), "beams": BEAMS, "range_max": case.range_max})
 
 
-def map_of(case: Case, seed: int) -> World:
+def map_of(case: IntegrityCase, seed: int) -> World:
     """The map that the estimator is given. Its name is unique for each seed and map."""
     if case.map == "other":
         return make_building(seed + WRONG_MAP_SEED, case.building).world
@@ -150,13 +150,13 @@ def map_of(case: Case, seed: int) -> World:
     return world if case.map == "exact" else maps.noisy_grid(Scene.of(world, BEAMS, [seed, 5]))
 
 
-def _real_scanner(case: Case, stated: Scanner) -> Scanner:
+def _real_scanner(case: IntegrityCase, stated: Scanner) -> Scanner:
     x, y, yaw = stated.mount
     mount = (x, y, yaw + float(np.deg2rad(case.mount_yaw_deg)))
     return stated.model_copy(update={"sigma": case.sigma * stated.sigma, "mount": mount})
 
 
-def _changed(case: Case, building: Building, rng: np.random.Generator) -> Building:
+def _changed(case: IntegrityCase, building: Building, rng: np.random.Generator) -> Building:
     """The building with the case's changes of its furniture."""
     for share, change in (
         (case.moved, changes.move_furniture),
@@ -168,7 +168,7 @@ def _changed(case: Case, building: Building, rng: np.random.Generator) -> Buildi
     return building
 
 
-def _path(case: Case, scene: Scene, seconds: float) -> tuple[Array, npt.NDArray[np.int_]]:
+def _path(case: IntegrityCase, scene: Scene, seconds: float) -> tuple[Array, npt.NDArray[np.int_]]:
     """True poses (N, 3), and the indices at which the robot was carried to another place."""
     if case.single_scans:
         return scene.poses(case.single_scans), np.zeros(0, int)
@@ -181,7 +181,7 @@ def _path(case: Case, scene: Scene, seconds: float) -> tuple[Array, npt.NDArray[
     return np.concatenate(parts), np.cumsum([len(part) for part in parts[:-1]])
 
 
-def _ranges(case: Case, building: Building, scene: Scene, path: Array) -> Array:
+def _ranges(case: IntegrityCase, building: Building, scene: Scene, path: Array) -> Array:
     """Noise-free ranges (N, B) m along the path, with people and surfaces without return."""
     scanner = scene.scanner
     lasers = se2.compose(path, np.array(scanner.mount))
@@ -205,7 +205,7 @@ def _ranges(case: Case, building: Building, scene: Scene, path: Array) -> Array:
     return ranges
 
 
-def _odometry(case: Case, path: Array, rate: float, rng: np.random.Generator) -> Array | None:
+def _odometry(case: IntegrityCase, path: Array, rate: float, rng: np.random.Generator) -> Array | None:
     """Poses (N, 3) in odom, or None without odometry."""
     if case.odometry is None:
         return None
@@ -223,7 +223,7 @@ def _odometry(case: Case, path: Array, rate: float, rng: np.random.Generator) ->
     return np.array(poses)
 
 
-def _truths_in_map(case: Case, path: Array) -> Array:
+def _truths_in_map(case: IntegrityCase, path: Array) -> Array:
     """The places (N, 3) in the map that correspond to the true poses; NaN in the map of another building."""
     if case.map == "other":
         return np.full_like(path, np.nan)

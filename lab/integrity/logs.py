@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lab.integrity.cases import Trial
+from lab.integrity.cases import IntegrityTrial
 from lab.integrity.maps import grid_of
 from lab.real_logs.drive import START_COVARIANCE, drive_at
 from presage.learning.train_drive import TrainDriveOptions, card_of, scanner_of, split
@@ -54,7 +54,7 @@ def cases_of(log: str, mount: tuple[float, float, float] | None) -> list[LogCase
     return [LogCase(log, mount, exchanged, odometry) for exchanged in (False, True) for odometry in kinds]
 
 
-def log_trial(case: LogCase) -> Trial:
+def log_trial(case: LogCase) -> IntegrityTrial:
     """The scans of the half that is localised, in an occupancy grid of the other half."""
     learned, drive = case.halves()
     observations = [
@@ -67,7 +67,7 @@ def log_trial(case: LogCase) -> Trial:
         )
         for k, ranges in enumerate(drive.ranges)
     ]
-    return Trial(
+    return IntegrityTrial(
         map_world=grid_of(case.drive_name, learned),
         scanner=scanner_of(drive, 0.0, case.drive_name),
         observations=observations,

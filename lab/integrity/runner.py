@@ -11,7 +11,7 @@ from typing import Any, cast
 from rich.console import Console
 
 from lab.experiments.trials import run_trials
-from lab.integrity.cases import CASES, Trial, make_trial, map_of, scanner_of
+from lab.integrity.cases import CASES, IntegrityTrial, make_trial, map_of, scanner_of
 from lab.integrity.logs import LogCase, log_field_file, log_trial
 from lab.integrity.models import field_file
 from lab.integrity.scoring import Estimates, score_case, score_trial
@@ -37,7 +37,7 @@ class TrialSource:
     seconds: float | None = None  # of a drive; defaults to the case's
     log: LogCase | None = None
 
-    def trial(self) -> Trial:
+    def trial(self) -> IntegrityTrial:
         """The scans."""
         return log_trial(self.log) if self.log else make_trial(CASES[self.case], self.seed, self.seconds)
 
@@ -148,7 +148,7 @@ def run_trial(job: IntegrityJob) -> dict[str, Any]:
     }
 
 
-def make_factory(job: IntegrityJob, trial: Trial) -> EstimatorFactory:
+def make_factory(job: IntegrityJob, trial: IntegrityTrial) -> EstimatorFactory:
     """The estimators of a trial, made as by the estimator service."""
     model = job.model
     if job.estimator == "precise" and model == "learned":
@@ -158,7 +158,7 @@ def make_factory(job: IntegrityJob, trial: Trial) -> EstimatorFactory:
     )
 
 
-def localise(trial: Trial, factory: EstimatorFactory) -> Estimates:
+def localise(trial: IntegrityTrial, factory: EstimatorFactory) -> Estimates:
     """What an estimator reports for the scans of a trial."""
     geometry = ScannerGeometry.of(trial.scanner)
     factory(geometry).update(trial.observations[0])  # compiles what is compiled at the first scan

@@ -25,13 +25,13 @@ from common.messages.definitions import Goal, Pose
 from common.robot.base import Robot
 from common.robot.scanner import SCANNERS
 from lab.experiments import results
-from lab.experiments.journeys import Journey
 from lab.experiments.lockstep import LockstepRun, RunTrace, session
 from lab.experiments.lockstep import run as run_in_lockstep
+from lab.experiments.start_and_goal import StartAndGoal
 from lab.experiments.trials import run_trials
 from lab.navigation.experiment import DRIVES, WORLDS, columns
 from lab.navigation.in_process import SCANS_TO_STAND
-from lab.navigation.shortest_path import MAX_DRAWS, Trip, draw_trip, load_shortest_paths
+from lab.navigation.shortest_path import MAX_DRAWS, NavigationTask, draw_task, load_shortest_paths
 from lab.statistics import wilson_interval
 from presage.plotting import style as drawing
 from services.controller.docking import Docking
@@ -56,21 +56,21 @@ class DockingJob:
     beams: int = 622
     limit: float = 120.0  # s of simulated time
 
-    def goal(self, trip: Trip, approach: float) -> Goal:
-        """The goal at the end of a trip, approached in the direction ``approach`` rad."""
+    def goal(self, task: NavigationTask, approach: float) -> Goal:
+        """The goal of a task, approached in the direction ``approach`` rad."""
         yaw = float(se2.wrap(approach + np.pi * (self.index % 2)))
-        pose = Pose(x=trip.goal[0], y=trip.goal[1], yaw=yaw)
+        pose = Pose(x=task.goal[0], y=task.goal[1], yaw=yaw)
         return Goal(
             stamp_ns=0, seq=1, pose=pose, tolerance=TOLERANCE_M, yaw_tolerance=YAW_TOLERANCE_RAD, approach=approach
         )
 
-    def lockstep_run(self, trip: Trip, approach: float) -> LockstepRun:
+    def lockstep_run(self, task: NavigationTask, approach: float) -> LockstepRun:
         """Parameters for `lockstep.run`."""
         dead_bands = ("--dead-band", repr(self.dead_band), "--turn-dead-band", repr(self.turn_dead_band))
         base = ("--drive", self.drive, "--latency", repr(self.latency), *dead_bands)
         return LockstepRun(
-            Journey(trip.start[:2], trip.goal),
-            trip.start[2],
+            StartAndGoal(task.start[:2], task.goal),
+            task.start[2],
             self.world,
             self.beams,
             (self.seed * 100_003 + self.index) % 2**31,
@@ -81,29 +81,29 @@ class DockingJob:
             sweep=True,
             ends_with_status=True,
             scans_after_end=SCANS_TO_STAND,
-            goal=self.goal(trip, approach),
+            goal=self.goal(task, approach),
         )
 
 
-def draw_docking(job: DockingJob) -> tuple[Trip, float]:
-    """A random trip and approach direction in rad. Raises UserError if the world has no such place."""
+def draw_docking(job: DockingJob) -> tuple[NavigationTask, float]:
+    """A random task and approach direction in rad. Raises UserError if the world has no such place."""
     robot, rng = Robot.model_validate({"drive": job.drive}), np.random.default_rng((job.seed, EXPERIMENT_ID, job.index))
     world, _ = load_shortest_paths(job.world, robot.radius)
     for _ in range(MAX_DRAWS):
-        trip, approach = draw_trip(job.world, rng, robot), round(float(rng.uniform(-np.pi, np.pi)), 4)
-        line = Docking(job.goal(trip, approach), robot).line()
+        task, approach = draw_task(job.world, rng, robot), round(float(rng.uniform(-np.pi, np.pi)), 4)
+        line = Docking(job.goal(task, approach), robot).line()
         if (world.clearance(line) >= robot.radius + LINE_CLEARANCE_M).all():
-            return trip, approach
+            return task, approach
     raise UserError(f"world {world.name!r}: no place for the robot to dock")
 
 
 def trial(job: DockingJob) -> dict[str, Any]:
     """Runs one drive. Returns its statistics."""
-    trip, approach = draw_docking(job)
+    task, approach = draw_docking(job)
     with session() as stack:
-        trace = run_in_lockstep(job.lockstep_run(trip, approach), stack)
-    identity = {"drive": job.drive, "world": job.world, "trial": job.index, **asdict(trip), "approach": approach}
-    return identity | measure(trace, job.goal(trip, approach))
+        trace = run_in_lockstep(job.lockstep_run(task, approach), stack)
+    identity = {"drive": job.drive, "world": job.world, "trial": job.index, **asdict(task), "approach": approach}
+    return identity | measure(trace, job.goal(task, approach))
 
 
 def measure(trace: RunTrace, goal: Goal) -> dict[str, Any]:

@@ -25,9 +25,9 @@ from common.geometry.se2 import Array
 from common.geometry.world import World
 from common.messages.definitions import GOAL_TOLERANCE_M, Truth
 from common.robot.base import Robot
-from lab.experiments.journeys import least_time
 from lab.experiments.lockstep import RunTrace
-from lab.navigation.shortest_path import Trip, length
+from lab.experiments.start_and_goal import least_time
+from lab.navigation.shortest_path import NavigationTask, length
 from services.simulator.people import PERSON_RADIUS_M as PERSON_RADIUS
 
 MIN_MOVING_SPEED = 0.01  # m/s
@@ -43,11 +43,11 @@ LOCALISATION = (
 )
 
 
-def measure(trace: RunTrace, trip: Trip, world: World, robot: Robot) -> dict[str, Any]:
+def measure(trace: RunTrace, task: NavigationTask, world: World, robot: Robot) -> dict[str, Any]:
     """Statistics of a drive as a row of the results; None where a value is unknown."""
     path, seconds = trace.path(), _seconds(trace)
-    distance_left = float(np.hypot(*(path[-1, :2] - np.array(trip.goal))))
-    shortest, driven = length(np.array(trip.shortest)), length(path)
+    distance_left = float(np.hypot(*(path[-1, :2] - np.array(task.goal))))
+    shortest, driven = length(np.array(task.shortest)), length(path)
     least = least_time(shortest, robot, GOAL_TOLERANCE_M)
     outcome = _outcome(trace, distance_left)
     return {

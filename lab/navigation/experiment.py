@@ -25,7 +25,7 @@ from lab.navigation import figure as driving_figure
 from lab.navigation.drive import MAX_REACHED_DISTANCE, measure
 from lab.navigation.in_process import NavigationRun
 from lab.navigation.in_process import run as run_in_process
-from lab.navigation.shortest_path import START_GOAL_MARGIN, WALL_GAP, Trip, draw_trip, load_shortest_paths
+from lab.navigation.shortest_path import START_GOAL_MARGIN, WALL_GAP, NavigationTask, draw_task, load_shortest_paths
 from lab.navigation.worlds import GENERATED, seed_of, world_of
 from lab.statistics import bootstrap_interval, median, wilson_interval
 from services.estimator.factory import EstimatorOptions, EstimatorPreset
@@ -91,12 +91,12 @@ class NavigationJob:
         """The robot."""
         return Robot.model_validate({"drive": self.drive})
 
-    def trip(self) -> Trip:
+    def task(self) -> NavigationTask:
         """Start and goal."""
         rng = np.random.default_rng((self.seed, EXPERIMENT_ID, self.index))
-        return draw_trip(self.world, rng, self.robot, self.world_seed)
+        return draw_task(self.world, rng, self.robot, self.world_seed)
 
-    def navigation_run(self, trip: Trip) -> NavigationRun:
+    def navigation_run(self, task: NavigationTask) -> NavigationRun:
         """Parameters of the drive. In a generated world the estimator predicts scans by casting rays in it."""
         world, seed = world_of(self.world, self.world_seed), (self.seed * 100_003 + self.index) % 2**31
         scanner = {**SCANNERS["tim571"].with_beams(self.beams).model_dump(), "range_max": self.range_max}
@@ -104,20 +104,20 @@ class NavigationJob:
             world,
             Scanner.model_validate(scanner),
             self.robot,
-            trip.start,
+            task.start,
             seed,
             slip=self.slip,
             sweep=self.sweep,
             people=self.people,
             people_speed=self.people_speed,
         )
-        start = np.array(trip.start) if self.start == "known" else None
+        start = np.array(task.start) if self.start == "known" else None
         model = "exact" if self.world in GENERATED else "learned"
         estimator = EstimatorOptions(
             world, cast("EstimatorPreset", self.estimator), model, seed=seed, initial_pose=start
         )
         limit = round(self.limit * setup.scanner.rate)
-        return NavigationRun(setup, estimator, trip.goal, self.prior == "odometry", self.epistemic, limit)
+        return NavigationRun(setup, estimator, task.goal, self.prior == "odometry", self.epistemic, limit)
 
 
 def check(job: NavigationJob, worlds: Sequence[str], drives: Sequence[str]) -> None:
@@ -160,11 +160,11 @@ def result_name(job: NavigationJob, worlds: Sequence[str], drives: Sequence[str]
 
 def trial(job: NavigationJob) -> dict[str, Any]:
     """Runs one drive. Returns its statistics."""
-    trip, robot = job.trip(), job.robot
-    trace = run_in_process(job.navigation_run(trip))
+    task, robot = job.task(), job.robot
+    trace = run_in_process(job.navigation_run(task))
     world, _ = load_shortest_paths(job.world, robot.radius, job.world_seed)
-    identity = {"group": job.group, "trial": job.index, "world_seed": job.world_seed, **asdict(trip)}
-    return identity | measure(trace, trip, world, robot)
+    identity = {"group": job.group, "trial": job.index, "world_seed": job.world_seed, **asdict(task)}
+    return identity | measure(trace, task, world, robot)
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:

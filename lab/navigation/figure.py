@@ -1,9 +1,9 @@
-"""The figure of the experiment."""
+"""Figure and table of the experiment."""
 
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from common.geometry.world import World
-from lab.experiments import results
+from lab.experiments.results import markdown, millimetres, number
 from lab.navigation.worlds import world_of
 from lab.statistics import wilson_interval
 from presage.plotting import style as drawing
@@ -53,8 +53,8 @@ def draw(by_group: Mapping[str, Rows], worlds: Mapping[str, str], title: str) ->
     figure = drawing.empty_figure(6.6 * columns, 6.2 * sum(heights) + 0.5 * rows_of_maps + 3.4)
     figure.suptitle(textwrap.fill(title, TITLE_WIDTH * columns), fontsize=11)
     grid = figure.add_gridspec(rows_of_maps + 1, 2 * columns, height_ratios=[*(6.2 * h + 0.5 for h in heights), 2.6])
-    for number, (group, rows) in enumerate(by_group.items()):
-        row, column = divmod(number, columns)
+    for index, (group, rows) in enumerate(by_group.items()):
+        row, column = divmod(index, columns)
         _map(
             drawing.style_axes(figure.add_subplot(grid[row, 2 * column : 2 * column + 2])),
             world_of_group[group],
@@ -97,20 +97,39 @@ def _map(axes: Axes, world: World, group: str, rows: Rows) -> None:
 def _distribution(axes: Axes, by_group: Mapping[str, Rows], quantity: str, label: str) -> None:
     """Plots the share of all trials that reached the goal within a ratio."""
     last = 1.1
-    for number, (group, rows) in enumerate(by_group.items()):
+    for index, (group, rows) in enumerate(by_group.items()):
         ratios = np.sort([row[quantity] for row in rows if row["reached"]])
         share = np.arange(1, len(ratios) + 1) / max(len(rows), 1)
         last = max(last, float(ratios.max(initial=0.0)))
-        style = LINES[number // len(COLOURS) % len(LINES)]
+        style = LINES[index // len(COLOURS) % len(LINES)]
         axes.step(
             [0.0, *ratios, 1e3],
             [0.0, *share, share[-1] if len(share) else 0.0],
             style,
             where="post",
-            color=COLOURS[number % len(COLOURS)],
+            color=COLOURS[index % len(COLOURS)],
             label=group,
         )
     axes.set(xlabel=label, ylabel="share of trials", xlim=(0.95, last * 1.03), ylim=(0, 1.02))
+
+
+COLUMNS: dict[str, Callable[[dict[str, Any]], str]] = {  # of the table, after the world and the drive
+    "reached": lambda row: (
+        f"{row['reached']}/{row['trials']} ({_percent(wilson_interval(row['reached'], row['trials']))})"
+    ),
+    "reported elsewhere": lambda row: str(row["trials_claimed_elsewhere"]),
+    "contacts moving; standing": lambda row: (
+        f"{row['trials_with_contact_moving']}; {row['trials_with_contact_standing']}"
+    ),
+    "path / shortest": lambda row: _median_and_max(row, "path_over_shortest"),
+    "time / least": lambda row: _median_and_max(row, "time_over_bound"),
+    "distance left (mm)": lambda row: f"{millimetres(row['median_left_m'])}; {millimetres(row['max_left_m'])}",
+    "longest untracked (s)": lambda row: _median_and_max(row, "longest_untracked_s", 1),
+    "gap (m)": lambda row: number(row["min_clearance_m"]),
+    "to people (m)": lambda row: number(row["min_clearance_to_people_m"]),
+    "error (mm)": lambda row: f"{millimetres(row['median_error_median_m'])}; {millimetres(row['max_error_max_m'])}",
+    "step (ms)": lambda row: f"{number(row['median_step_mean_ms'], 1)}; {number(row['max_step_max_ms'], 1)}",
+}
 
 
 def table(summary: dict[str, dict[str, Any]]) -> str:
@@ -118,54 +137,29 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
 
     Brackets are 95 % intervals.
     """
-    number, mm = results.number, results.millimetres
     people = any(row["min_clearance_to_people_m"] is not None for row in summary.values())
     uncertain = any((row.get("median_longest_untracked_s") or 0) > 0 for row in summary.values())
     measured_left = all("median_left_m" in row for row in summary.values())  # not in results before November 2026
-    heads = [
-        "world, drive",
-        "reached",
-        "reported elsewhere",
-        "contacts moving; standing",
-        "path / shortest",
-        "time / least",
-        *(["distance left (mm)"] if measured_left else []),
-        *(["longest untracked (s)"] if uncertain else []),
-        "gap (m)",
-        *(["to people (m)"] if people else []),
-        "error (mm)",
-        "step (ms)",
-    ]
-    rows = [
-        [
-            name,
-            f"{row['reached']}/{row['trials']} ({_percent(wilson_interval(row['reached'], row['trials']))})",
-            str(row["trials_claimed_elsewhere"]),
-            f"{row['trials_with_contact_moving']}; {row['trials_with_contact_standing']}",
-            _median_and_max(row, "path_over_shortest"),
-            _median_and_max(row, "time_over_bound"),
-            *([f"{mm(row['median_left_m'])}; {mm(row['max_left_m'])}"] if measured_left else []),
-            *([_median_and_max(row, "longest_untracked_s", 1)] if uncertain else []),
-            number(row["min_clearance_m"]),
-            *([number(row["min_clearance_to_people_m"])] if people else []),
-            f"{mm(row['median_error_median_m'])}; {mm(row['max_error_max_m'])}",
-            f"{number(row['median_step_mean_ms'], 1)}; {number(row['max_step_max_ms'], 1)}",
-        ]
-        for name, row in summary.items()
-    ]
+    left_out = {
+        *([] if measured_left else ["distance left (mm)"]),
+        *([] if uncertain else ["longest untracked (s)"]),
+        *([] if people else ["to people (m)"]),
+    }
+    heads = [head for head in COLUMNS if head not in left_out]
+    rows = [[name, *(COLUMNS[head](row) for head in heads)] for name, row in summary.items()]
     bad = [
         f"- {name}, trial {each['trial']}, {each['outcome']}: {each['why']}"
         for name, row in summary.items()
         for each in row["worst"]
         if each["outcome"] != "reached" or "touched" in each["why"]
     ]
-    return "\n\n".join([results.markdown(heads, rows), *(["\n".join(bad)] if bad else [])])
+    return "\n\n".join([markdown(["world, drive", *heads], rows), *(["\n".join(bad)] if bad else [])])
 
 
 def _median_and_max(row: Mapping[str, Any], quantity: str, digits: int = 3) -> str:
     interval = row.get(f"median_{quantity}_95")
-    within = "" if interval is None else f" ({' to '.join(results.number(each, digits) for each in interval)})"
-    median, most = (results.number(row.get(f"{statistic}_{quantity}"), digits) for statistic in ("median", "max"))
+    within = "" if interval is None else f" ({' to '.join(number(each, digits) for each in interval)})"
+    median, most = (number(row.get(f"{statistic}_{quantity}"), digits) for statistic in ("median", "max"))
     return f"{median}{within}; {most}"
 
 

@@ -20,7 +20,7 @@ from common.errors import UserError
 from common.geometry.se2 import Array
 from common.geometry.world import World
 from common.robot.base import Robot
-from lab.navigation.worlds import RULES, TripRule, world_of
+from lab.navigation.worlds import RULES, StartGoalRule, world_of
 
 ARC_TOLERANCE = 1e-3  # m, error of the polygons that replace arcs
 WALL_GAP = 0.03  # m between the footprint and the walls along the shortest path
@@ -124,7 +124,7 @@ def load_shortest_paths(name: str, radius: float = Robot().radius, seed: int = 0
 
 
 @dataclass(frozen=True)
-class Trip:
+class NavigationTask:
     """Start pose, goal and shortest path of a navigation trial; the robot begins at rest."""
 
     start: tuple[float, float, float]  # m, m, rad
@@ -133,14 +133,14 @@ class Trip:
     redrawn: int = 0  # rejected pairs, too close together or without a path
 
 
-def draw_trip(name: str, rng: np.random.Generator, robot: Robot, seed: int = 0) -> Trip:
+def draw_task(name: str, rng: np.random.Generator, robot: Robot, seed: int = 0) -> NavigationTask:
     """Draws start and goal uniformly from free space with `START_GOAL_MARGIN`, and a uniform start heading.
 
     They follow the world's rule in `RULES`. Coordinates are rounded to millimetres and the heading to 1e-4 rad. Raises
     UserError if no such pair is found.
     """
     world, paths = load_shortest_paths(name, robot.radius, seed)
-    rule = RULES.get(name, TripRule())
+    rule = RULES.get(name, StartGoalRule())
     for redrawn in range(MAX_DRAWS):
         start, goal = np.round(world.sample_free(2, rng, robot.radius + START_GOAL_MARGIN), 3)
         if not rule.allows(world, [start, goal]):
@@ -149,7 +149,9 @@ def draw_trip(name: str, rng: np.random.Generator, robot: Robot, seed: int = 0) 
         if len(path) and length(path) >= rule.min_length:
             heading = round(float(rng.uniform(-np.pi, np.pi)), 4)
             corners = tuple((float(x), float(y)) for x, y in np.round(path, 4))
-            return Trip((float(start[0]), float(start[1]), heading), (float(goal[0]), float(goal[1])), corners, redrawn)
+            return NavigationTask(
+                (float(start[0]), float(start[1]), heading), (float(goal[0]), float(goal[1])), corners, redrawn
+            )
     raise UserError(
         f"world {world.name!r}: no two places {rule.min_length:g} m apart between which the robot could drive"
     )

@@ -1,4 +1,4 @@
-"""Worlds of the navigation experiment, and where its trips begin and end."""
+"""Worlds of the navigation experiment, and where starts and goals may lie."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Rectangle = tuple[float, float, float, float]  # x0, y0, x1, y1 in m
 
 
 @dataclass(frozen=True)
-class TripRule:
+class StartGoalRule:
     """Where starts and goals are drawn."""
 
     rooms: tuple[Rectangle, ...] = ()  # inside one of these; anywhere by default
@@ -31,16 +31,16 @@ class TripRule:
     max_clearance: float = np.inf  # m from a start or a goal to the nearest wall
 
     def allows(self, world: World, places: Sequence[np.ndarray]) -> bool:
-        """Whether trips may begin and end at ``places`` (N, 2) m."""
+        """Whether a start and a goal may be at ``places`` (N, 2) m."""
         inside = [any(x0 <= x <= x1 and y0 <= y <= y1 for x0, y0, x1, y1 in self.rooms) for x, y in places]
         return (not self.rooms or all(inside)) and bool((world.clearance(places) <= self.max_clearance).all())
 
 
 RULES = {
     # In the corridor a scan identifies the place, so a robot with a goal there would localise on the way.
-    "twins": TripRule(rooms=((0.0, 0.0, 5.9, 4.4), (6.1, 0.0, 12.0, 4.4))),
+    "twins": StartGoalRule(rooms=((0.0, 0.0, 5.9, 4.4), (6.1, 0.0, 12.0, 4.4))),
     # A robot can only tell within 2 cm where it is if it sees something.
-    "hall": TripRule(min_length=10.0, max_clearance=2.0),
+    "hall": StartGoalRule(min_length=10.0, max_clearance=2.0),
 }
 
 

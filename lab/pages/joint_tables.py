@@ -42,8 +42,7 @@ def real_logs(folder: Path) -> str:
 
 def simulation(folder: Path) -> str:
     """Tasks of the accuracy benchmark and moved furniture, for presage, the particle filter and a scan matcher."""
-    found = [row for name in ("accuracy", "accuracy-rivals") for row in read(folder / f"{name}.json")["rows"]]
-    rows = {(row["task"], row["estimator"]): row for row in reversed(found)}  # those of `accuracy` have precedence
+    rows = {(row["task"], row["estimator"]): row for row in read(folder / "accuracy.json")["rows"]}
     lines = []
     for label, task in TASKS.items():
         own = [rows.get((task, name)) for name in ("precise", "particle-filter", "correlative")]

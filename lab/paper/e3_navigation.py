@@ -23,20 +23,19 @@ from common.geometry.world import load_world
 from common.robot.base import Robot
 from lab.experiments import results
 from lab.experiments.estimators import PAPER_DESCENT, TEN_STEPS, ExperimentWorld, uses_odometry
-from lab.experiments.journeys import (
+from lab.experiments.lockstep import LockstepRun, RunTrace, session
+from lab.experiments.lockstep import run as run_in_lockstep
+from lab.experiments.start_and_goal import (
     ARRIVAL_DISTANCE,
     CLEARANCE,
     MIN_DISTANCE,
-    Journey,
-    draw_journey,
+    StartAndGoal,
+    draw_start_and_goal,
     least_time,
     path_ratio,
 )
-from lab.experiments.lockstep import LockstepRun, RunTrace, session
-from lab.experiments.lockstep import run as run_in_lockstep
 from lab.experiments.trials import run_trials
 from presage.plotting import style as drawing
-from presage.session.stack import Stack
 from services.estimator.paper.perception import Descent
 
 EXPERIMENT_ID = 3  # part of the random seeds
@@ -44,7 +43,7 @@ ESTIMATORS = (f"paper, {TEN_STEPS}", "precise", "particle-filter")
 
 
 @dataclass(frozen=True)
-class JourneyJob:
+class PaperNavigationJob:
     """One start and goal, the same for every estimator."""
 
     index: int
@@ -69,19 +68,19 @@ def arguments(name: str, descent: Descent) -> tuple[str, ...]:
     return ("--estimator", kind, *(("--prior", "odometry") if uses_odometry(name) else ()), *steps)
 
 
-def trial(job: JourneyJob) -> dict[str, Any]:
-    """Runs one journey with every estimator. Returns the journey and each estimator's results."""
+def trial(job: PaperNavigationJob) -> dict[str, Any]:
+    """Drives from one start to its goal with every estimator. Returns both, and each estimator's results."""
     world = load_world(job.field.world)
-    journey = draw_journey(
+    ends = draw_start_and_goal(
         world, np.random.default_rng((job.seed, EXPERIMENT_ID, job.index)), Robot(), job.apart, free=job.free
     )
-    outcome: dict[str, Any] = asdict(journey) | {"straight_m": journey.straight, "estimators": {}}
-    outcome["least_s"] = least_time(journey.straight, Robot())
+    outcome: dict[str, Any] = asdict(ends) | {"straight_m": ends.straight, "estimators": {}}
+    outcome["least_s"] = least_time(ends.straight, Robot())
     seed = (job.seed * 100_003 + job.index) % 2**31
     with session() as stack:
         for name in job.estimators:
             lockstep_run = LockstepRun(
-                journey,
+                ends,
                 job.field.heading,
                 job.field.world,
                 job.field.beams,
@@ -89,25 +88,21 @@ def trial(job: JourneyJob) -> dict[str, Any]:
                 arguments(name, job.descent),
                 job.limit,
             )
-            outcome["estimators"][name] = _run(lockstep_run, stack)
+            outcome["estimators"][name] = measure(run_in_lockstep(lockstep_run, stack), ends)
     return outcome
 
 
-def _run(lockstep_run: LockstepRun, stack: Stack) -> dict[str, Any]:
-    return measure(run_in_lockstep(lockstep_run, stack), lockstep_run.journey)
-
-
-def measure(trace: RunTrace, journey: Journey) -> dict[str, Any]:
+def measure(trace: RunTrace, ends: StartAndGoal) -> dict[str, Any]:
     """Results of one run. Lists have one entry per iteration, the first from before any motion."""
     path = trace.path()
-    away = np.hypot(*(path[:, :2] - np.array(journey.goal)).T)
+    away = np.hypot(*(path[:, :2] - np.array(ends.goal)).T)
     error = np.hypot(*(trace.believed() - path)[:, :2].T)
     seconds = trace.truths[-1].stamp_ns * 1e-9
     return {
         "reached": bool(away[-1] <= ARRIVAL_DISTANCE),
         "iterations": len(path) - 1,
         "seconds": seconds,
-        "time_over_least": seconds / least_time(journey.straight, Robot()),
+        "time_over_least": seconds / least_time(ends.straight, Robot()),
         "path_over_straight": path_ratio(path),
         "contacts": sum(truth.contact for truth in trace.truths),
         "held_back": sum(truth.stopped for truth in trace.truths),  # by the obstacle stop
@@ -146,7 +141,7 @@ def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
     }
 
 
-def run(job: JourneyJob, trials: int, out: Path, workers: int, console: Console) -> results.Result:
+def run(job: PaperNavigationJob, trials: int, out: Path, workers: int, console: Console) -> results.Result:
     """Runs all trials. Writes e3.json, .csv, .trials.jsonl, .pdf and .png into ``out``."""
     for name in job.estimators:
         arguments(name, job.descent)
@@ -159,7 +154,7 @@ def run(job: JourneyJob, trials: int, out: Path, workers: int, console: Console)
             curves[f"{name} {what} mean m"], curves[f"{name} {what} std m"] = mean, std
             curves["iteration"] = list(range(len(mean)))
     straight = [row["straight_m"] for row in rows]
-    drawn = {name: sum(row[name] for row in rows) for name in ("too_near", "obstructed")}
+    redrawn = {name: sum(row[name] for row in rows) for name in ("too_near", "obstructed")}
     parameters = asdict(job) | {
         "trials": trials,
         "close_m": ARRIVAL_DISTANCE,
@@ -167,17 +162,9 @@ def run(job: JourneyJob, trials: int, out: Path, workers: int, console: Console)
         "robot": Robot().model_dump(),
         "straight_mean_m": float(np.mean(straight)),
         "straight_max_m": float(np.max(straight)),
-        "pairs_redrawn_too_near": drawn["too_near"],
-        "pairs_redrawn_obstructed": drawn["obstructed"],
+        "pairs_redrawn_too_near": redrawn["too_near"],
+        "pairs_redrawn_obstructed": redrawn["obstructed"],
     }
-    note = f"{trials} pairs at random, though this controller goes straight: what stands between holds the robot."
-    if job.free:
-        note = (
-            f"{trials} of {trials + drawn['obstructed']} pairs far enough apart were taken. Of the others the straight "
-            f"line comes nearer than {Robot().radius + CLEARANCE:.2f} m to something, and this controller goes "
-            "straight."
-        )
-    note += f" On average the goal is {np.mean(straight):.1f} m from the start (the paper: about 11 to 13.5 m)."
     result = results.Result(
         "e3",
         "E3: navigation through the real processes",
@@ -186,10 +173,26 @@ def run(job: JourneyJob, trials: int, out: Path, workers: int, console: Console)
         {name: summarise(rows, name) for name in job.estimators},
         curves,
         rows,
-        [note],
+        [_note_on_pairs(trials, redrawn["obstructed"] if job.free else None, float(np.mean(straight)))],
     )
     result.write(out, draw(rows, job))
     return result
+
+
+def _note_on_pairs(trials: int, obstructed: int | None, straight_mean_m: float) -> str:
+    """How starts and goals were chosen.
+
+    ``obstructed`` counts pairs left out because something stood between; None if those were taken too.
+    """
+    if obstructed is None:
+        note = f"{trials} pairs at random, though this controller goes straight: what stands between holds the robot."
+    else:
+        note = (
+            f"{trials} of {trials + obstructed} pairs far enough apart were taken. Of the others the straight "
+            f"line comes nearer than {Robot().radius + CLEARANCE:.2f} m to something, and this controller goes "
+            "straight."
+        )
+    return f"{note} On average the goal is {straight_mean_m:.1f} m from the start (the paper: about 11 to 13.5 m)."
 
 
 def _rows(rows: Sequence[dict[str, Any]], name: str, quantity: str, names: Sequence[str]) -> Array:
@@ -198,7 +201,7 @@ def _rows(rows: Sequence[dict[str, Any]], name: str, quantity: str, names: Seque
     return drawing.pad_with_last([row["estimators"][name][quantity] for row in rows], longest)
 
 
-def draw(rows: Sequence[dict[str, Any]], job: JourneyJob) -> Figure:
+def draw(rows: Sequence[dict[str, Any]], job: PaperNavigationJob) -> Figure:
     """Distance to the goal and error over iterations, as in the paper's figure 3, and the paths below."""
     figure = drawing.empty_figure(13.0, 7.2)
     grid = figure.add_gridspec(2, 2, height_ratios=(1.25, 1))

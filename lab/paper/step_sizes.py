@@ -26,7 +26,7 @@ from common.messages.definitions import Belief, Goal, Pose
 from common.robot.base import Robot
 from lab.experiments import results
 from lab.experiments.estimators import ExperimentWorld
-from lab.experiments.journeys import ARRIVAL_DISTANCE, Journey, draw_journey, least_time
+from lab.experiments.start_and_goal import ARRIVAL_DISTANCE, StartAndGoal, draw_start_and_goal, least_time
 from lab.experiments.trials import run_trials
 from lab.paper import e3_navigation as navigation
 from lab.paper.teleports import StepSizes, travel
@@ -38,7 +38,7 @@ from services.estimator.paper.decoder import PaperModel, use_one_core
 from services.estimator.paper.estimator import PaperEstimator
 from services.estimator.paper.perception import Descent
 from services.estimator.paper.training import usable_ranges
-from services.estimator.shared.interface import Observation
+from services.estimator.shared.interface import Observation, Posterior
 from services.estimator.shared.model_folder import SHIPPED
 
 EXPERIMENT_ID = 5  # part of the random seeds; the journeys are those of E3
@@ -94,9 +94,9 @@ def settings() -> list[Setting]:
 def trial(job: StepSizeJob) -> dict[str, Any]:
     """Runs one journey. Returns its number of iterations, and in the velocity loop its time over the minimum."""
     world = job.field.scene(0).world
-    journey = draw_journey(world, np.random.default_rng((job.seed, navigation.EXPERIMENT_ID, job.index)), Robot())
-    row = {"setting": job.setting.name, "straight_m": journey.straight}
-    return row | (_run_displacement if job.setting.loop == "displacement" else _run_velocity)(job, world, journey)
+    ends = draw_start_and_goal(world, np.random.default_rng((job.seed, navigation.EXPERIMENT_ID, job.index)), Robot())
+    row = {"setting": job.setting.name, "straight_m": ends.straight}
+    return row | (_run_displacement if job.setting.loop == "displacement" else _run_velocity)(job, world, ends)
 
 
 @functools.lru_cache(maxsize=2)
@@ -105,13 +105,13 @@ def _model(field: ExperimentWorld) -> tuple[PaperModel, weights.ModelCard]:
     return weights.load(weights.find(SHIPPED, field.world, "paper", field.beams))
 
 
-def _run_displacement(job: StepSizeJob, world: World, journey: Journey) -> dict[str, Any]:
+def _run_displacement(job: StepSizeJob, world: World, ends: StartAndGoal) -> dict[str, Any]:
     scene = job.field.scene(job.seed, EXPERIMENT_ID, job.index)
 
     def look(pose: Array) -> Array:
         return usable_ranges(scene.observe(scene.clean(pose[None])[0], 0.0).ranges, scene.scanner.range_max)
 
-    outcome = travel(journey, job.setting.steps, _model(job.field)[0], look, world, job.field.heading, job.limit)
+    outcome = travel(ends, job.setting.steps, _model(job.field)[0], look, world, job.field.heading, job.limit)
     return {
         "reached": outcome.reached,
         "iterations": outcome.iterations,
@@ -121,12 +121,12 @@ def _run_displacement(job: StepSizeJob, world: World, journey: Journey) -> dict[
     }
 
 
-def _run_velocity(job: StepSizeJob, world: World, journey: Journey) -> dict[str, Any]:
-    """Runs the journey as in E3, but in one process and with the job's step sizes."""
+def _run_velocity(job: StepSizeJob, world: World, ends: StartAndGoal) -> dict[str, Any]:
+    """Drives as in E3, but in one process and with the job's step sizes."""
     from services.simulator.simulation import Simulation, SimulationSetup  # pybullet, for this alone
 
     scanner, steps = job.field.scene(0).scanner, job.setting.steps
-    pose, goal = (*journey.start, job.field.heading), np.array([*journey.goal, job.field.heading])
+    pose, goal = (*ends.start, job.field.heading), np.array([*ends.goal, job.field.heading])
     model, card = _model(job.field)
     perception = PaperEstimator(model, card, Descent(beta=steps.beta), np.array(pose))
     navigator = Navigator(Robot(), ActionParameters(gamma=steps.gamma), world)
@@ -143,21 +143,12 @@ def _run_velocity(job: StepSizeJob, world: World, journey: Journey) -> dict[str,
             observation = Observation(scan.ranges.astype(float), scan.angles(), scan.range_max, goal=goal)
             posterior = perception.update(observation)
             errors.append(float(np.hypot(*(posterior.pose - here)[:2])))
-            belief = Belief(
-                stamp_ns=scan.stamp_ns,
-                state=posterior.state,
-                pose=Pose.of(posterior.pose),
-                xi=posterior.xi.astype(np.float32),
-                curvature=posterior.curvature,
-                free_energy=posterior.free_energy,
-                accuracy=posterior.accuracy,
-            )
             navigator.on_scan(scan)
-            simulation.command(scan.stamp_ns, navigator.step(belief)[0].twist)
+            simulation.command(scan.stamp_ns, navigator.step(_belief(scan.stamp_ns, posterior))[0].twist)
             simulation.advance()
     finally:
         simulation.close()
-    over = simulation.stamp_ns * 1e-9 / least_time(journey.straight, Robot())
+    over = simulation.stamp_ns * 1e-9 / least_time(ends.straight, Robot())
     return {
         "reached": away <= ARRIVAL_DISTANCE,
         "iterations": simulation.steps,
@@ -166,6 +157,18 @@ def _run_velocity(job: StepSizeJob, world: World, journey: Journey) -> dict[str,
         "error_m": float(np.mean(errors)),
         "distance_m": [away],
     }
+
+
+def _belief(stamp_ns: int, posterior: Posterior) -> Belief:
+    return Belief(
+        stamp_ns=stamp_ns,
+        state=posterior.state,
+        pose=Pose.of(posterior.pose),
+        xi=posterior.xi.astype(np.float32),
+        curvature=posterior.curvature,
+        free_energy=posterior.free_energy,
+        accuracy=posterior.accuracy,
+    )
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -200,18 +203,6 @@ def run(job: StepSizeJob, trials: int, out: Path, workers: int, console: Console
             for name in ("journeys", "reached", "iterations_mean", "time_over_least_median")
         },
     }
-    nearest = min(
-        (each for each in grid if each.loop == "displacement" and summary[each.name]["reached"] == trials),
-        key=lambda each: abs(summary[each.name]["iterations_mean"] - PAPER_ITERATIONS),
-        default=None,
-    )
-    note = "no setting reached every goal"
-    if nearest is not None:
-        mean = summary[nearest.name]["iterations_mean"]
-        note = (
-            f"nearest to the paper's {PAPER_ITERATIONS:g} iterations, where every goal is reached: "
-            f"{nearest.name}: {mean:.1f}"
-        )
     result = results.Result(
         "steps",
         "Step sizes of action and goal",
@@ -220,10 +211,26 @@ def run(job: StepSizeJob, trials: int, out: Path, workers: int, console: Console
         summary,
         curves,
         rows,
-        [note],
+        [_note_on_nearest(grid, summary, trials)],
     )
     result.write(out, draw(grid, summary))
     return result
+
+
+def _note_on_nearest(grid: Sequence[Setting], summary: dict[str, dict[str, Any]], trials: int) -> str:
+    """Which setting reached every goal in the number of iterations that is nearest to the paper's."""
+    nearest = min(
+        (each for each in grid if each.loop == "displacement" and summary[each.name]["reached"] == trials),
+        key=lambda each: abs(summary[each.name]["iterations_mean"] - PAPER_ITERATIONS),
+        default=None,
+    )
+    if nearest is None:
+        return "no setting reached every goal"
+    mean = summary[nearest.name]["iterations_mean"]
+    return (
+        f"nearest to the paper's {PAPER_ITERATIONS:g} iterations, where every goal is reached: "
+        f"{nearest.name}: {mean:.1f}"
+    )
 
 
 def draw(grid: Sequence[Setting], summary: dict[str, dict[str, Any]]) -> Figure:

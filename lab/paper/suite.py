@@ -40,13 +40,13 @@ def run_all(trials: int, seed: int, out: Path, workers: int, console: Console) -
 
     # Two variants: the paper's estimator with enough iterations to converge, and journeys without a free straight line.
     converged = localisation.LocalisationJob(0, seed, 200, ("paper",))
-    any_pair = navigation.JourneyJob(0, seed, limit=450, free=False, estimators=("precise",))
+    any_pair = navigation.PaperNavigationJob(0, seed, limit=450, free=False, estimators=("precise",))
     runs: dict[str, Run] = {
         "e1": lambda: localisation.run(localisation.LocalisationJob(0, seed, 50), limited(100), out, workers, console),
         "converged/e1": lambda: localisation.run(converged, limited(100), folder("converged"), workers, console),
         "e2": lambda: crossing.run(crossing.CrossingJob(0, seed), limited(12), out, workers, console),
         # One worker more, because processes in lockstep also wait for one another.
-        "e3": lambda: navigation.run(navigation.JourneyJob(0, seed), limited(50), out, workers + 1, console),
+        "e3": lambda: navigation.run(navigation.PaperNavigationJob(0, seed), limited(50), out, workers + 1, console),
         "any/e3": lambda: navigation.run(any_pair, limited(10), folder("any"), workers, console),
         "alpha": lambda: step_size.run(localisation.LocalisationJob(0, seed, 50), limited(25), out, workers, console),
         "steps": lambda: stepping.run(stepping.StepSizeJob(0, seed), limited(10), out, workers, console),

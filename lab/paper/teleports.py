@@ -16,7 +16,7 @@ import shapely
 from common.geometry.se2 import Array
 from common.geometry.world import World
 from common.robot.base import Robot
-from lab.experiments.journeys import ARRIVAL_DISTANCE, Journey
+from lab.experiments.start_and_goal import ARRIVAL_DISTANCE, StartAndGoal
 from services.estimator.paper.decoder import PaperModel
 from services.estimator.paper.free_energy import FreeEnergy
 
@@ -42,8 +42,8 @@ class StepSizes:
 
 
 @dataclass(frozen=True)
-class JourneyOutcome:
-    """Result of a journey; entry k of the arrays is from before iteration k + 1."""
+class TeleportOutcome:
+    """Result of driving by teleports; entry k of the arrays is from before iteration k + 1."""
 
     distance: Array  # (K,) m, robot to goal
     error: Array  # (K,) m, belief to robot
@@ -61,21 +61,21 @@ class JourneyOutcome:
 
 
 def travel(
-    journey: Journey,
+    ends: StartAndGoal,
     steps: StepSizes,
     model: PaperModel,
     look: Callable[[Array], Array],
     world: World,
     yaw: float,
     limit: int,
-) -> JourneyOutcome:
+) -> TeleportOutcome:
     """Runs algorithm 1 with the belief starting at the true start, for at most ``limit`` iterations.
 
     ``look`` returns usable ranges (B,), m, with fresh noise at a pose (3,).
     """
     room = shapely.buffer(world.free_space, -Robot().radius)
     shapely.prepare(room)
-    goal, robot = np.array(journey.goal), np.array(journey.start)
+    goal, robot = np.array(ends.goal), np.array(ends.start)
     belief, action, metric = robot.copy(), np.zeros(2), model.norm.metric if steps.normalised else np.ones(2)
     x0, y0, x1, y1 = world.bounds
     g_goal = model.predict(np.array([*goal, yaw]))[0]
@@ -90,7 +90,7 @@ def travel(
             action, stopped = np.zeros(2), stopped + 1
         distances.append(float(np.hypot(*(robot - goal))))
         errors.append(float(np.hypot(*(robot - belief))))
-    return JourneyOutcome(np.array(distances), np.array(errors), stopped)
+    return TeleportOutcome(np.array(distances), np.array(errors), stopped)
 
 
 def _perceive(o: Array, belief: Array, g_goal: Array, model: PaperModel, steps: StepSizes, yaw: float) -> Array:

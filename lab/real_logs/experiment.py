@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from common.errors import UserError
-from common.geometry.world import World, load_world
+from common.geometry.world import load_world
 from common.versions import commit
 from lab.experiments import results
 from lab.experiments.trials import run_trials
@@ -79,24 +79,12 @@ class RealLogJob:
 
 def run(job: RealLogJob, out: Path, workers: int, console: Console) -> results.Result:
     """Trains, tunes and localises. Writes real-NAME.json, .csv, .trials.jsonl, .pdf and .png into ``out``."""
-    world = load_world(job.map)
     template = StretchJob(
         str(job.log), job.map, job.mount, "precise", ODOMETRY, 0, seed=job.seed, exchanged=job.exchange
     )
-    drive = template.drive
-    half = template.learned
-    x, y, yaw = drive.mount
-    console.print(
-        f"{job.log.name}: {len(drive.ranges)} posed scans, the laser at {x:g} m, {y:g} m, {np.rad2deg(yaw):g} deg in "
-        f"base_link{'' if job.mount else ' (change with --mount)'}; localising the "
-        f"{'first' if job.exchange else 'second'} half"
-    )
-    _check_map(world, drive.part(np.arange(half)), job.map)
-    if len(drive.ranges) < 4 * MAX_SEARCH_SCANS:
-        raise UserError(
-            f"{job.log}: {len(drive.ranges)} posed scans; at least {4 * MAX_SEARCH_SCANS} are needed, that is scans "
-            "with a reference pose"
-        )
+    drive, half = template.drive, template.learned
+    _print_drive(job, drive, console)
+    _check_drive(job, drive, half)
     model, card, tuned = _train_and_tune(job, template, half, out, console)
     template = replace(template, first=half, model=str(model))
     jobs = [
@@ -133,13 +121,27 @@ def run(job: RealLogJob, out: Path, workers: int, console: Console) -> results.R
     return result
 
 
-def _check_map(world: World, learned: ReferenceDrive, name: str) -> None:
-    """Raises UserError if most of the training half's poses are not in the map's free space."""
-    free = float((world.clearance(learned.poses[:, :2]) > 0).mean())
+def _print_drive(job: RealLogJob, drive: ReferenceDrive, console: Console) -> None:
+    x, y, yaw = drive.mount
+    console.print(
+        f"{job.log.name}: {len(drive.ranges)} posed scans, the laser at {x:g} m, {y:g} m, {np.rad2deg(yaw):g} deg in "
+        f"base_link{'' if job.mount else ' (change with --mount)'}; localising the "
+        f"{'first' if job.exchange else 'second'} half"
+    )
+
+
+def _check_drive(job: RealLogJob, drive: ReferenceDrive, half: int) -> None:
+    """Raises UserError if the training half's poses are mostly outside the map's free space, or scans are too few."""
+    free = float((load_world(job.map).clearance(drive.poses[:half, :2]) > 0).mean())
     if free < MIN_FREE_SHARE:
         raise UserError(
-            f"only {free:.0%} of the reference poses of the training half are in free space of {name}: "
+            f"only {free:.0%} of the reference poses of the training half are in free space of {job.map}: "
             "is it a map of this place, in the frame of these poses?"
+        )
+    if len(drive.ranges) < 4 * MAX_SEARCH_SCANS:
+        raise UserError(
+            f"{job.log}: {len(drive.ranges)} posed scans; at least {4 * MAX_SEARCH_SCANS} are needed, that is scans "
+            "with a reference pose"
         )
 
 

@@ -61,6 +61,7 @@ MAX_STRETCHES, MAX_STRETCH_SCANS = 3, 150  # of the second quarter, for tracking
 SEARCH_STARTS, SEARCH_SCANS = 4, 15  # starts to find, and scans allowed for global localisation
 CELL_SIZE = 0.05  # m, of the first quarter's map if the drive's own map is not a grid
 ParameterValues = tuple[tuple[str, float], ...]
+Score = tuple[float, float]  # the first number decides, the second among equals; larger is better
 
 
 @dataclass(frozen=True)
@@ -87,53 +88,75 @@ def tune(
     ``job`` gives the log, the map and the mount; ``half`` is the number of scans in the first half, ``start`` the
     settings to start from.
     """
-    lines: list[str] = []
-    total = 2 * sum(map(len, TRACKING_CANDIDATES.values())) + sum(map(len, SEARCH_CANDIDATES.values())) + 3
     quarter = half // 2
-    job = replace(job, map=str(_map_of_quarter(job, quarter, folder)))
-    length = min(MAX_STRETCH_SCANS, half - quarter)
-    firsts = sorted(set(_evenly_spaced(job, quarter, half - length, MAX_STRETCHES)))
+    stretches = TuningStretches(replace(job, map=str(_map_of_quarter(job, quarter, folder))), quarter, half)
+    search = CoordinateSearch(report)
+    laser = search.best(LASER, start, TRACKING_CANDIDATES, partial(stretches.tracking_score, LASER))
+    odometry = start
+    if job.drive.odom is not None:
+        odometry = search.best(ODOMETRY, start, TRACKING_CANDIDATES, partial(stretches.tracking_score, ODOMETRY))
+    # A kidnapped robot must give up its given pose, and nav2's default number of particles is too small for a search.
+    start_finding = _with(_with(odometry, "keep_initial_pose", 0.0), "amcl_defaults", 0.0)
+    finding = search.best("finding", start_finding, SEARCH_CANDIDATES, stretches.finding_score)
+    return TunedSettings(odometry, laser, finding, search.tried)
 
-    starts = _evenly_spaced(job, quarter, half - MAX_SEARCH_SCANS, SEARCH_STARTS)
 
-    def tracking(task: str, settings: ParameterValues) -> tuple[float, float]:
-        return _tracking_score(
-            [trial(replace(job, task=task, first=first, count=length, particles=settings)) for first in firsts]
-        )
+class TuningStretches:
+    """Parts of the second quarter on which settings are tried."""
 
-    def finding(settings: ParameterValues) -> tuple[float, float]:
-        rows = [trial(replace(job, task=GLOBAL, first=k, count=SEARCH_SCANS, particles=settings)) for k in starts]
-        kidnappings = zip(starts, starts[len(starts) // 2 :] + starts[: len(starts) // 2], strict=True)
-        rows += [trial(replace(job, task=KIDNAPPED, first=k, to=to, particles=settings)) for k, to in kidnappings]
+    def __init__(self, job: StretchJob, quarter: int, half: int) -> None:
+        """The second quarter begins at scan ``quarter`` and ends before scan ``half``."""
+        self.job, self.length = job, min(MAX_STRETCH_SCANS, half - quarter)
+        self.firsts = sorted(set(_evenly_spaced(job, quarter, half - self.length, MAX_STRETCHES)))
+        self.starts = _evenly_spaced(job, quarter, half - MAX_SEARCH_SCANS, SEARCH_STARTS)
+
+    def tracking_score(self, task: str, settings: ParameterValues) -> Score:
+        """Score of settings for tracking with or without odometry."""
+        job = replace(self.job, task=task, count=self.length, particles=settings)
+        return _tracking_score([trial(replace(job, first=first)) for first in self.firsts])
+
+    def finding_score(self, settings: ParameterValues) -> Score:
+        """Score of settings for global localisation and kidnapping."""
+        job, half = replace(self.job, particles=settings), len(self.starts) // 2
+        rows = [trial(replace(job, task=GLOBAL, first=first, count=SEARCH_SCANS)) for first in self.starts]
+        kidnappings = zip(self.starts, self.starts[half:] + self.starts[:half], strict=True)
+        rows += [trial(replace(job, task=KIDNAPPED, first=first, to=to)) for first, to in kidnappings]
         return _search_score(rows)
 
-    def coordinate_search(
+
+class CoordinateSearch:
+    """Changes one setting after the other and keeps what improves the score."""
+
+    def __init__(self, report: Callable[[str, float], None]) -> None:
+        """``report`` gets what is tried, and the share that is done."""
+        self.tried: list[str] = []  # as in `TunedSettings`
+        self._report = report
+        # Each of the three searches also tries its initial settings.
+        self._total = 2 * sum(map(len, TRACKING_CANDIDATES.values())) + sum(map(len, SEARCH_CANDIDATES.values())) + 3
+
+    def best(
+        self,
         title: str,
         settings: ParameterValues,
-        tried: dict[str, tuple[float, ...]],
-        score: Callable[[ParameterValues], tuple[float, float]],
+        candidates: dict[str, tuple[float, ...]],
+        score: Callable[[ParameterValues], Score],
     ) -> ParameterValues:
+        """The settings with the best score, starting from ``settings``; of each setting tries the candidate values."""
         best, best_score = settings, score(settings)
-        lines.append(f"{title}, initial settings: {best_score[0]:.0%}, {-best_score[1]:.3g}")
-        for name, values in tried.items():
+        self._note(f"{title}, initial settings", best_score)
+        for name, values in candidates.items():
             base = best
             for value in values:
                 changed = _with(base, name, value)
                 changed_score = score(changed)
-                lines.append(f"{title}, {name} {value:g}: {changed_score[0]:.0%}, {-changed_score[1]:.3g}")
+                self._note(f"{title}, {name} {value:g}", changed_score)
                 if changed_score > best_score:
                     best, best_score = changed, changed_score
-                report(f"particle filter, {title}: {name}", len(lines) / total)
+                self._report(f"particle filter, {title}: {name}", len(self.tried) / self._total)
         return best
 
-    odometry, laser = start, coordinate_search(LASER, start, TRACKING_CANDIDATES, partial(tracking, LASER))
-    if job.drive.odom is not None:
-        odometry = coordinate_search(ODOMETRY, start, TRACKING_CANDIDATES, partial(tracking, ODOMETRY))
-    # A kidnapped robot must give up its given pose, and nav2's default number of particles is too small for a search.
-    start_finding = _with(_with(odometry, "keep_initial_pose", 0.0), "amcl_defaults", 0.0)
-    return TunedSettings(
-        odometry, laser, coordinate_search("finding", start_finding, SEARCH_CANDIDATES, finding), lines
-    )
+    def _note(self, what: str, score: Score) -> None:
+        self.tried.append(f"{what}: {score[0]:.0%}, {-score[1]:.3g}")
 
 
 def _map_of_quarter(job: StretchJob, quarter: int, folder: Path) -> Path:
@@ -153,21 +176,22 @@ def _evenly_spaced(job: StretchJob, first: int, last: int, count: int) -> list[i
 
 
 def _with(settings: ParameterValues, name: str, value: float) -> ParameterValues:
+    """The settings with one changed, as in `TRACKING_CANDIDATES`; z_hit follows z_rand."""
     values = dict(settings)
     if name == "alpha":
         return tuple({**values, **{f"alpha{k}": values[f"alpha{k}"] * value for k in range(1, 6)}}.items())
     return tuple({**values, name: value, **({"z_hit": 1 - value} if name == "z_rand" else {})}.items())
 
 
-def _tracking_score(rows: list[dict[str, Any]]) -> tuple[float, float]:
-    """Share of scans tracked, and the negative median error (m) of those; larger is better."""
+def _tracking_score(rows: list[dict[str, Any]]) -> Score:
+    """Share of scans tracked, and the negative median error (m) of those."""
     errors = np.array([value for row in rows for value in row["error_m"]])
     tracked = errors < TRACKED_DISTANCE
     return round(float(tracked.mean()), 2), -float(np.median(errors[tracked])) if tracked.any() else -np.inf
 
 
-def _search_score(rows: list[dict[str, Any]]) -> tuple[float, float]:
-    """Share of starts found, and the negative mean number of scans until then; larger is better."""
+def _search_score(rows: list[dict[str, Any]]) -> Score:
+    """Share of starts found, and the negative mean number of scans until then."""
     scans = []
     for row in rows:
         skip = SCANS_BEFORE_KIDNAPPING if row["task"] == KIDNAPPED else 0

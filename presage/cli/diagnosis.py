@@ -8,7 +8,7 @@ import typer
 
 from common.bus.bus import Link
 from presage.cli.session_options import chosen_link
-from presage.session.running import OBSERVER, find_session
+from presage.session.running_sessions import OBSERVER, find_session
 from presage.terminal.options import Json, WorldName, console
 
 app = typer.Typer()

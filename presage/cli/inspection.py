@@ -50,7 +50,7 @@ def plot(
     Examples: `presage plot recordings/run.mcap --out run.png`; `presage plot run.mcap.active --json run.json`.
     """
     from presage.recordings.selection import stem_of
-    from presage.session.demo import plot_command
+    from presage.recordings.session_figure import plot_command
 
     plot_command(file, out or file.with_name(stem_of(file) + ".png"), json_file, console)
 

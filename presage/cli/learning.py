@@ -71,7 +71,7 @@ def train(
     from presage.learning.options import TrainSettings
     from presage.learning.train_drive import TrainDriveOptions, train_from_drive
     from presage.logs.options import LogSettings
-    from presage.session.running import link_of
+    from presage.session.running_sessions import link_of
     from services.estimator.precise.learning.field_learning import Recipe
     from services.estimator.shared.model_folder import training_folder
     from services.simulator.settings import SimulatorSettings

@@ -97,7 +97,7 @@ def localize(
         "global" if mode == "single" else mode,
         log.frame,
         log.reading(),
-        fresh=mode == "single",
+        independent_scans=mode == "single",
         odometry=log.odometry,
         out=out,
         start=start,

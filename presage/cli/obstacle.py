@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from common.errors import UserError, first_fault
 from presage.cli.session_options import chosen_link
-from presage.session.running import OBSERVER
+from presage.session.running_sessions import OBSERVER
 from presage.terminal.options import ALLOW_NEGATIVE_NUMBERS, console
 
 if TYPE_CHECKING:

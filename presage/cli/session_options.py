@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from common.bus.bus import Link
-from presage.session.running import OPERATOR, link_of
+from presage.session.running_sessions import OPERATOR, link_of
 
 RobotName = Annotated[
     str, typer.Option(envvar="PRESAGE_ROBOT", help="Robot name. Defaults to the only robot of the session.")

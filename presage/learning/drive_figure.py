@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
+from presage.plotting.style import empty_figure
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.learning.calibration import Calibration
 from services.estimator.precise.learning.weights import FieldCard
@@ -16,8 +15,7 @@ from services.estimator.precise.learning.weights import FieldCard
 
 def draw_learned(model: FieldModel, card: FieldCard, png: Path) -> None:
     """Draws the learned distance field and the calibration of its model into ``png``."""
-    figure = Figure(figsize=(12, 4.8), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = empty_figure(12, 4.8)
     left, right = figure.subplots(1, 2, width_ratios=(1.7, 1))
     _draw_field(left, model, card.world.name)
     if card.calibration is not None:

@@ -11,7 +11,7 @@ from rich.progress import Progress
 
 from common.errors import UserError
 from common.geometry.occupancy_grid import FREE, OCCUPIED
-from common.geometry.rasterize import rasterise
+from common.geometry.rasterisation import rasterise
 from common.geometry.ros_map_writer import write_grid
 from common.geometry.se2 import Array
 from common.geometry.tum import write_tum
@@ -27,7 +27,7 @@ from presage.terminal.progress import working
 from services.estimator.precise.learning import drive_learning, weights
 from services.mapper.slam.drive import Laser, RawDrive
 from services.mapper.slam.grid import grid_of_scans
-from services.mapper.slam.trajectory import build_trajectory, distribute_corrections
+from services.mapper.slam.trajectory import DriveTrajectory, build_trajectory, distribute_corrections
 
 MIN_SCANS = 2
 
@@ -130,6 +130,31 @@ def _build_poses(
     progress: Console,
 ) -> Array:
     """Poses (N, 3) computed from the scans, in the frame of the map ``rough`` if given, otherwise of the first scan."""
+    built = _build_trajectory(scans, stamps, options, console, progress)
+    posed = drive_of(replace(scans, truth=built.poses), options.log)
+    used = usable_scans(stamps, built.poses)
+    with Progress(*Progress.get_default_columns(), console=progress, transient=True) as bar:
+        task = bar.add_task("refining the poses", total=1.0)
+        poses: Array = built.poses.copy()
+        poses[used] = refine_poses(posed, lambda done: bar.update(task, completed=done))
+    if rough is None:
+        return poses
+    posed = replace(posed, poses=poses[used])
+    keys = np.intersect1d(built.keys, used)
+    with working(f"finding the drive in {rough.name}", progress):
+        placement = place_drive(rough, posed.part(np.searchsorted(used, keys)), former)
+    console.print(
+        f"{placement.found:.0%} of the key scans found in {rough.name}, with a median deviation of "
+        f"{placement.deviation * 1e3:.0f} mm",
+        soft_wrap=True,
+    )
+    return distribute_corrections(poses, keys, placement.poses, np.zeros(len(keys), int))
+
+
+def _build_trajectory(
+    scans: Scans, stamps: Array, options: MapOptions, console: Console, progress: Console
+) -> DriveTrajectory:
+    """Matches the scans with one another, and prints the result."""
     if len(scans) < MIN_SCANS:
         raise UserError(f"{options.log}: {len(scans)} scans; a map needs at least {MIN_SCANS}")
     complete = scans.odom is not None and bool(np.isfinite(scans.odom).all())
@@ -154,21 +179,4 @@ def _build_poses(
             "elsewhere in the map; the robot was kidnapped, or its view was blocked",
             soft_wrap=True,
         )
-    posed = drive_of(replace(scans, truth=built.poses), options.log)
-    used = usable_scans(stamps, built.poses)
-    with Progress(*Progress.get_default_columns(), console=progress, transient=True) as bar:
-        task = bar.add_task("refining the poses", total=1.0)
-        poses: Array = built.poses.copy()
-        poses[used] = refine_poses(posed, lambda done: bar.update(task, completed=done))
-    if rough is None:
-        return poses
-    posed = replace(posed, poses=poses[used])
-    keys = np.intersect1d(built.keys, used)
-    with working(f"finding the drive in {rough.name}", progress):
-        placement = place_drive(rough, posed.part(np.searchsorted(used, keys)), former)
-    console.print(
-        f"{placement.found:.0%} of the key scans found in {rough.name}, with a median deviation of "
-        f"{placement.deviation * 1e3:.0f} mm",
-        soft_wrap=True,
-    )
-    return distribute_corrections(poses, keys, placement.poses, np.zeros(len(keys), int))
+    return built

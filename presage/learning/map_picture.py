@@ -5,19 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from common.geometry.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from common.geometry.se2 import Array
+from presage.plotting.style import empty_figure
 
 
 def draw_map(png: Path, grid: OccupancyGrid, poses: Array) -> None:
     """Draws a grid with a yaw of 0, and the places of poses (N, 3)."""
     values, rows, columns = grid.values, grid.height, grid.width
     size = 12 / max(rows, columns)
-    figure = Figure(figsize=(max(4, columns * size), max(4, rows * size)), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = empty_figure(max(4, columns * size), max(4, rows * size))
     axes = figure.subplots()
     grey = np.select([values == FREE, values == OCCUPIED], [1.0, 0.0], 0.8)
     (x0, y0), (x1, y1) = grid.corners()[0], grid.corners()[2]

@@ -8,8 +8,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -19,6 +17,7 @@ from common.robot.base import Robot
 from common.robot.scanner import Scanner
 from common.versions import commit, versions
 from presage.learning.simulated_scans import collect, scanner_on_bus
+from presage.plotting.style import empty_figure
 from services.estimator.paper import training, weights
 from services.estimator.paper.checkpoint import Checkpoint
 from services.estimator.paper.decoder import DecoderShape, Normalisation, PaperModel
@@ -165,8 +164,7 @@ def _save(
 
 
 def _draw_curve(card: weights.ModelCard, png: Path) -> None:
-    figure = Figure(figsize=(6, 4), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = empty_figure(6, 4)
     axes = figure.add_subplot()
     epochs = np.arange(1, len(card.curve_test_l1) + 1)
     axes.plot(epochs, card.curve_train_l1, color="#0072B2", label=f"{card.samples} training samples")

@@ -8,8 +8,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
@@ -20,6 +18,7 @@ from common.robot.base import Robot
 from common.robot.scanner import SCANNERS, Scanner
 from common.versions import commit, versions
 from presage.learning.simulated_scans import collect, scanner_on_bus
+from presage.plotting.style import empty_figure
 from services.estimator.factory import MIN_SIGMA_M
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.learning import weights
@@ -164,8 +163,7 @@ def _card(
 
 
 def _draw(model: FieldModel, card: weights.FieldCard, png: Path) -> None:
-    figure = Figure(figsize=(9, 4.6), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = empty_figure(9, 4.6)
     axes = figure.add_subplot()
     field = model.field
     ny, nx = field.phi.shape

@@ -20,7 +20,7 @@ from common.geometry.se2 import Array
 from common.robot.ranges import normalise_driver_ranges
 from presage.logs.carmen_lines import LINE_TYPE, LaserLine, is_laser, laser_line, pose_line
 from presage.logs.log import Log, LoggedScan, Reading
-from presage.logs.poses import PoseTrack
+from presage.logs.pose_track import PoseTrack
 from presage.logs.resampling import resample
 
 MAX_LINE_CHARACTERS = 1 << 22  # far more than the lines of real logs; limits the memory for other files
@@ -62,10 +62,9 @@ class _FirstPass:
     lasers: Counter[str] = field(default_factory=Counter)  # lines by name
     firsts: dict[str, list[LaserLine]] = field(default_factory=dict)  # the first lines of each laser
     mounts: dict[str, tuple[Array, Array]] = field(default_factory=dict)  # minimum and maximum of laser in base_link
-    odom: tuple[PoseTrack, PoseTrack] = field(
-        default_factory=lambda: (PoseTrack(), PoseTrack())
-    )  # by ipc stamp, by logger stamp
-    true: tuple[PoseTrack, PoseTrack] = field(default_factory=lambda: (PoseTrack(), PoseTrack()))  # likewise
+    # Poses by ipc stamp, and by logger stamp.
+    odom: tuple[PoseTrack, PoseTrack] = field(default_factory=lambda: (PoseTrack(), PoseTrack()))
+    true: tuple[PoseTrack, PoseTrack] = field(default_factory=lambda: (PoseTrack(), PoseTrack()))
 
 
 def open_carmen(path: Path, reading: Reading) -> Log:

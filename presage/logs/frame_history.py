@@ -10,7 +10,7 @@ from common.errors import UserError
 from common.geometry import se2
 from common.geometry.se2 import Array
 from common.messages.ros_messages import IDENTITY, Mount, Transform, mount_of
-from presage.logs.poses import PoseTrack
+from presage.logs.pose_track import PoseTrack
 
 FIXED_TOLERANCE = 0.01  # m and rad; a frame that changes more moves against its parent
 

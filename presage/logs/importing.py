@@ -24,10 +24,10 @@ from common.messages.definitions import Odom, Pose, Scan, Stamped, Truth, Twist
 from common.messages.requests import WorldReply
 from common.messages.topics import ODOM, SCAN, TRUTH, Topic
 from common.robot.scanner import Scanner
-from common.versions import commit, versions
+from common.versions import versions
 from presage.logs.log import Log, LoggedScan, Reading
 from presage.logs.opening import IS_A_RECORDING, kind_of, open_log
-from presage.terminal.output import check_file, write_json
+from presage.terminal.output import check_file, provenance, write_json
 from presage.terminal.progress import progress, working
 from services.estimator.factory import DEFAULT_SIGMA_M
 from services.recorder.files.message_counts import MessageCounts, as_metadata
@@ -72,7 +72,7 @@ def import_command(options: ImportOptions, json_file: Path | None, console: Cons
         written = write_recording(options, log, world, logged_scans)
     facts = written.facts(options, log)
     console.print(*_lines(options, log, facts), sep="\n", highlight=False, soft_wrap=True)
-    write_json(json_file, {**facts, "commit": commit(), "versions": versions(), "arguments": sys.argv[1:]})
+    write_json(json_file, {**facts, **provenance()})
 
 
 def _open(options: ImportOptions) -> Log:

@@ -20,9 +20,8 @@ class LogSettings(BaseModel):
 
     mount: Annotated[str, Field(pattern=POSE_TEXT)] = ""  # x,y[,yaw_deg] of the laser in base_link, m and deg
     upside_down: bool | None = None  # the scanner is mounted with a roll of 180 deg
-    frame: Literal["base_link", "laser"] = (
-        "base_link"  # whose poses are estimated or recorded, and which the poses in an .npz file are of
-    )
+    # Whose poses are estimated or recorded, and which the poses in an .npz file are of.
+    frame: Literal["base_link", "laser"] = "base_link"
     scan_topic: str = ""  # if there are several; in a CARMEN log the type of line, such as RLASER
     odom_topic: str = ""  # if there are several; in a CARMEN log ODOM reads the ODOM lines
     odometry: bool = True  # whether `presage localize` uses the odometry

@@ -14,7 +14,7 @@ from common.geometry.se2 import Array
 from common.messages.ros_messages import read_pose, stamp_of
 from presage.logs.frame_history import FrameHistory
 from presage.logs.log import Reading
-from presage.logs.poses import PoseTrack
+from presage.logs.pose_track import PoseTrack
 
 Lookup = Callable[[int], Array | None]  # pose (3,) at a stamp in ns, or None
 

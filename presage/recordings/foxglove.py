@@ -23,7 +23,7 @@ from common.errors import UserError
 from common.messages.definitions import Belief, Truth
 from common.messages.topics import BELIEF, TRUTH
 from common.versions import versions
-from presage.recordings import plain_numbers as numbers
+from presage.recordings import foxglove_numbers as numbers
 from presage.recordings.foxglove_session import FoxgloveMessage, SessionConverter, pose_source_of, static_messages
 from presage.recordings.selection import entries, keys_of, refuse_to_overwrite, robot_of, with_progress
 from services.recorder.reader import Recording

@@ -47,8 +47,8 @@ from common.messages.definitions import (
 )
 from common.messages.topics import Topic
 from common.robot.base import Robot
+from presage.recordings import foxglove_numbers as numbers
 from presage.recordings import foxglove_shapes as shapes
-from presage.recordings import plain_numbers as numbers
 from services.recorder.reader import RawMessage
 
 MAX_REMEMBERED_STAMPS = 4096  # far more than the delay between a scan and its belief

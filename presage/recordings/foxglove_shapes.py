@@ -30,8 +30,7 @@ from foxglove_schemas_protobuf.Vector2_pb2 import Vector2
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from common.geometry import occupancy_grid
-from common.geometry import rasterize as raster
+from common.geometry import occupancy_grid, rasterisation
 from common.geometry.se2 import Array
 from common.geometry.world import World
 from common.messages.definitions import Belief, BeliefHypothesis, Map, Plan, Prediction, Preference, Scan
@@ -259,8 +258,8 @@ def _slabs(ring: Array, rgb: Sequence[float], *, outside: bool) -> list[CubePrim
 
 def grid(world: World, ns: int) -> Grid:
     """The map, with RGBA and occupancy (0 free, 100 occupied, 255 unknown) as one byte each."""
-    (x0, y0), cell, x, y = raster.cell_centres(world)
-    free, wall = raster.classify_points(world, x, y, cell)
+    (x0, y0), cell, x, y = rasterisation.cell_centres(world)
+    free, wall = rasterisation.classify_points(world, x, y, cell)
     return _coloured_grid(free, wall, (x0, y0, 0.0), cell, ns)
 
 

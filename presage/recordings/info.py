@@ -104,8 +104,10 @@ class _PayloadCheck:
 def collect_facts(recording: Recording, check: bool | None = None) -> RecordingFacts:
     """Collects facts about a recording; ``check`` reads all of it, and defaults to True for small files."""
     size = recording.path.stat().st_size
+    if check is None:
+        check = size <= MAX_CHECKED_BYTES
     checked = None
-    if check if check is not None else size <= MAX_CHECKED_BYTES:
+    if check:
         checked = _PayloadCheck()
         checked.read(recording)
         recording.verify()

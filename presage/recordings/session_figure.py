@@ -1,7 +1,8 @@
-"""Draws a recorded session."""
+"""`presage plot`: draws a recorded session."""
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from matplotlib.patches import Circle as Disc
 from matplotlib.patches import Polygon as Patch
 from matplotlib.ticker import FuncFormatter
 from matplotlib.transforms import ScaledTranslation
+from rich.console import Console
 
 from common.errors import UserError
 from common.geometry.se2 import Array, compose
@@ -19,9 +21,11 @@ from common.geometry.world import World
 from common.messages.definitions import Goal, Scan
 from common.robot.ranges import is_surface
 from common.runtime import safety
+from common.versions import commit
 from presage.plotting.maps import draw_walls
-from presage.recordings.gathering import RecordedSession, load_session
-from presage.recordings.session_summary import summary_of
+from presage.recordings.recorded_session import RecordedSession, load_session
+from presage.recordings.session_summary import print_summary, summarise, summary_of
+from presage.terminal.output import check_file, write_json
 
 # Palette of Okabe and Ito, suitable for colour-blind readers.
 TRUTH, BELIEF, MEASURED, GOAL = "#000000", "#D55E00", "#0072B2", "#009E73"
@@ -41,6 +45,16 @@ def draw_session(path: Path, png: Path, *, title: str | None = None) -> None:
         figure.savefig(png, dpi=150)
     except OSError as error:
         raise UserError(f"{png}: cannot be written ({error.strerror}); choose another place for the figure") from None
+
+
+def plot_command(recording: Path, figure: Path, json_file: Path | None, console: Console) -> None:
+    """Prints the summary of a recording and draws its figure."""
+    check_file(figure, "--out")
+    check_file(json_file, "--json")
+    summary = summarise(recording)
+    draw_session(recording, figure)
+    print_summary(summary, recording, figure, console)
+    write_json(json_file, {**summary.as_dict(), "commit": commit(), "arguments": sys.argv[1:]})
 
 
 def figure_of(session: RecordedSession, title: str) -> Figure:

@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
+from rich.table import Table
 
 from common.geometry.se2 import Array
 from common.messages.definitions import Goal
-from presage.recordings.gathering import RecordedSession, load_session
+from presage.recordings.recorded_session import RecordedSession, load_session
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,16 @@ class SessionSummary:
         return rows if self.complete else [*rows, ("incomplete", "the recording's end is missing or damaged")]
 
 
+def print_summary(summary: SessionSummary, recording: Path, figure: Path, console: Console) -> None:
+    """Prints the summary and the names of the files."""
+    table = Table(show_header=False, box=None, padding=(0, 2))
+    for name, value in summary.lines():
+        table.add_row(name, value)
+    table.add_row("recording", str(recording))
+    table.add_row("figure", str(figure))
+    console.print(table)
+
+
 def summarise(path: Path) -> SessionSummary:
     """Summarises the recording at ``path``."""
     return summary_of(load_session(path))
@@ -88,21 +100,16 @@ def summary_of(session: RecordedSession) -> SessionSummary:
     goal_ns = session.goal_times_ns[-1] if goal is not None else 0
     until = reached if reached is not None else np.iinfo(np.int64).max
     navigating = errors[(stamps >= goal_ns) & (stamps <= until)] if goal is not None else errors[:0]
-    dropped = Counter[str]()
-    for service, health in session.healths.items():
-        if service == "viewer":  # the viewer may skip messages without harm
-            continue
-        dropped.update({row.key: row.dropped for row in health.topics if row.dropped})
-    goal_row = min(int(np.argmax(np.append(session.truth.stamps_ns >= goal_ns, True))), len(path) - 1)
-    start = path[goal_row] if len(path) else None
+    from_goal_on = np.concatenate([path[session.truth.stamps_ns >= goal_ns], path[-1:]])
+    dropped = _dropped_by_key(session)
     return SessionSummary(
         world=session.world.name if session.world else None,
         robot=session.robot,
         complete=not session.warning,
         scans=len(scans),
         messages=sum(session.counts.values()),
-        dropped=dropped.total() if session.healths else None,
-        dropped_by_key=dict(dropped),
+        dropped=sum(dropped.values()) if session.healths else None,
+        dropped_by_key=dropped,
         undecodable=session.undecodable,
         duration_s=session.duration_s,
         duration_stamped_s=float(scans.max() - scans.min()) * 1e-9 if len(scans) else None,
@@ -118,9 +125,18 @@ def summary_of(session: RecordedSession) -> SessionSummary:
         position_error_navigating_median_m=statistic_of_finite(np.median, navigating),
         position_error_navigating_max_m=statistic_of_finite(np.max, navigating),
         path_m=float(np.hypot(*np.diff(path[:, :2], axis=0).T).sum()) if len(path) else None,
-        straight_line_m=None if start is None else _distance(start[None], goal),
+        straight_line_m=_distance(from_goal_on[:1], goal),
         contacts=session.contacts if len(session.truth) else None,
     )
+
+
+def _dropped_by_key(session: RecordedSession) -> dict[str, int]:
+    """Number of messages that services dropped, without those of the viewer, which may skip messages without harm."""
+    dropped = Counter[str]()
+    for service, health in session.healths.items():
+        if service != "viewer":
+            dropped.update({row.key: row.dropped for row in health.topics if row.dropped})
+    return dict(dropped)
 
 
 def _metres(value: float | None) -> str:

@@ -11,9 +11,9 @@ from common.errors import UserError
 from common.messages.definitions import Belief, CmdVel, Scan, Stamped
 from common.messages.topics import BELIEF, CMD_VEL, DRIVE, FIELD, GOAL, ODOM, SCAN, STATUS, Topic
 from common.messages.wire import DecodeError
-from presage.replay.comparison import ReplayOutcome
 from presage.replay.goal_times import GoalTimes
 from presage.replay.in_process import InProcessServices
+from presage.replay.replay_outcome import ReplayOutcome
 from presage.terminal.progress import progress
 from services.recorder.reader import RawMessage, Recording
 

@@ -20,14 +20,13 @@ from common.geometry import se2
 from common.geometry.pose_text import start_of_text
 from common.geometry.se2 import Array
 from common.geometry.world import load_world
-from common.versions import commit, versions
 from presage.estimator import Estimator
 from presage.interrupts import ignoring_interrupts
 from presage.laser_scan import LaserScan
 from presage.logs.log import Reading
 from presage.logs.opening import kind_of
 from presage.logs.scan_files import Prior, Scans, read_scans
-from presage.terminal.output import check_file
+from presage.terminal.output import check_file, provenance
 from presage.terminal.progress import progress, working
 from services.estimator.factory import EstimatorOptions, EstimatorPreset, check_start
 from services.estimator.shared.interface import Posterior
@@ -61,7 +60,7 @@ class LocalizeOptions:
     file: Path
     estimator_options: EstimatorOptions
     mode: Literal["global", "track"] = "global"
-    fresh: bool = False
+    independent_scans: bool = False  # every scan starts from an unknown pose, as if it were the first
     prior: Prior = "odometry"
     frame: Literal["base_link", "laser"] = "base_link"
     reading: Reading = Reading()  # noqa: RUF009 - frozen
@@ -79,7 +78,7 @@ class LocalizeOptions:
         frame: str,
         reading: Reading,
         *,
-        fresh: bool,
+        independent_scans: bool,
         odometry: bool,
         out: Path | None,
         start: float | None = None,
@@ -94,7 +93,7 @@ class LocalizeOptions:
         if out is not None and out.suffix not in (".csv", ".json"):
             raise UserError(f"{out}: the name of the result must end with .csv or .json")
         prior: Prior = "odometry" if odometry else "motion"
-        return cls(file, estimator_options, mode, fresh, prior, frame, reading, out, start, end, every)  # type: ignore[arg-type]
+        return cls(file, estimator_options, mode, independent_scans, prior, frame, reading, out, start, end, every)  # type: ignore[arg-type]
 
 
 def build_estimator_options(
@@ -133,16 +132,17 @@ class TimedBelief:
 
 
 def run_estimator(
-    estimator: Estimator, scans: Iterable[LaserScan], *, fresh: bool = False, start: Array | None = None
+    estimator: Estimator, scans: Iterable[LaserScan], *, independent_scans: bool = False, start: Array | None = None
 ) -> Iterator[TimedBelief]:
     """Yields the belief after each scan, from ``start`` (3,) or (2,), or from an unknown pose.
 
-    With ``fresh``, each scan is alone.
+    With ``independent_scans``, every later scan starts from it again.
     """
     for k, scan in enumerate(scans):
         if k == 0:
             estimator.check(scan)
-        if start is not None if k == 0 else fresh:
+        must_restart = independent_scans if k > 0 else start is not None
+        if must_restart:
             estimator.restart(start)
         began = time.perf_counter()
         posterior = estimator.update(scan)
@@ -187,10 +187,10 @@ def localize(options: LocalizeOptions, console: Console) -> list[dict[str, Any]]
     estimator.check(scans[0])
     rows: list[dict[str, Any]] = []
     try:
-        found = run_estimator(estimator, scans, fresh=options.fresh, start=start)
+        found = run_estimator(estimator, scans, independent_scans=options.independent_scans, start=start)
         with _output(options, count) as write, closing(_with_progress(options, found, count, console)) as localised:
-            for k, one in enumerate(localised):
-                row = _row(scans, k, one, laser=laser)
+            for k, timed in enumerate(localised):
+                row = _row(scans, k, timed, laser=laser)
                 write(row)
                 rows.append(row)
     except KeyboardInterrupt:
@@ -244,8 +244,8 @@ def _start(options: LocalizeOptions, scans: Scans) -> Array | None:
     )
 
 
-def _row(scans: Scans, k: int, localised: TimedBelief, *, laser: bool) -> dict[str, Any]:
-    posterior = localised.posterior
+def _row(scans: Scans, k: int, timed: TimedBelief, *, laser: bool) -> dict[str, Any]:
+    posterior = timed.posterior
     pose, covariance = posterior.pose, posterior.covariance
     mount = scans.geometry.mount
     if laser and mount.any():  # the estimator localises base_link
@@ -255,7 +255,7 @@ def _row(scans: Scans, k: int, localised: TimedBelief, *, laser: bool) -> dict[s
     values = [None if covariance is None else float(covariance[i, j]) for i, j in UPPER_TRIANGLE]
     stamp = None if scans.stamps is None else float(scans.stamps[k])
     belief = [posterior.free_energy, posterior.state, posterior.probability]
-    numbers = [stamp, *map(float, pose), *values, *belief, round(localised.update_ms, 3)]
+    numbers = [stamp, *map(float, pose), *values, *belief, round(timed.update_ms, 3)]
     return dict(zip(COLUMNS, numbers, strict=True))
 
 
@@ -293,15 +293,12 @@ def _write_json(options: LocalizeOptions, out: Path, rows: list[dict[str, Any]],
         "model": options.estimator_options.model,
         "frame": options.frame,
         "mode": options.mode,
-        "fresh": options.fresh,
+        "fresh": options.independent_scans,
         "start": options.start,
         "end": options.end,
         "every": options.every,
         "complete": complete,
-        "seed": options.estimator_options.seed,
-        "commit": commit(),
-        "versions": versions(),
-        "arguments": sys.argv[1:],
+        **provenance(options.estimator_options.seed),
     }
     out.write_text(json.dumps({**meta, "rows": rows}, indent=1) + "\n", encoding="utf-8")
 

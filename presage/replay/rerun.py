@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import closing
@@ -29,13 +28,13 @@ from common.log import set_up_logging
 from common.messages.definitions import Belief, Prediction, Scan, Stamped
 from common.messages.topics import BELIEF, PREDICTION, SCAN, Topic, topic_of
 from common.messages.wire import DecodeError
-from common.versions import commit, versions
+from common.versions import versions
 from presage.logs.scan_files import Scans, read_scans
 from presage.recordings.selection import robot_of
+from presage.replay.estimator_comparison import BeliefSeries, compare, comparison_table, draw_comparison
 from presage.replay.localize import TimedBelief, prepare_estimator, run_estimator
-from presage.replay.recorded_session import estimator_settings, recorded_settings, settings_with
-from presage.replay.report import BeliefSeries, compare, comparison_table, draw_comparison
-from presage.terminal.output import check_file, write_json
+from presage.replay.recorded_settings import estimator_settings, recorded_settings, settings_with
+from presage.terminal.output import check_file, provenance, write_json
 from presage.terminal.progress import progress
 from services.estimator.service import belief_message, estimator_options, prediction_message
 from services.estimator.settings import EstimatorSettings
@@ -89,8 +88,7 @@ def rerun_command(options: RerunOptions, json_file: Path | None, console: Consol
     for path in (out, *draw_comparison(comparison, out)):
         console.print(f"wrote {path}", highlight=False, soft_wrap=True)
     about = {"file": str(options.file), "out": str(out), "robot": robot, "settings": settings.effective()}
-    meta = {"commit": commit(), "versions": versions(), "arguments": sys.argv[1:]}
-    write_json(json_file, {**about, **comparison.as_dict(), **meta})
+    write_json(json_file, {**about, **comparison.as_dict(), **provenance()})
 
 
 def settings_of(recording: Recording, chosen: dict[str, Any], folder: Path, console: Console) -> EstimatorSettings:
@@ -175,10 +173,10 @@ def _copy(
         message = _decode(topic, raw) if raw.key in (SCAN.key(robot), BELIEF.key(robot)) else None
         if isinstance(message, Scan) and len(new.stamps) < len(stamps) and message.stamp_ns == stamps[len(new.stamps)]:
             scan_published_ns, scan_logged_ns = raw.published_ns, raw.logged_ns
-            one = next(localised)
-            belief = belief_message(message, one.posterior, estimator, world)
-            new.add(belief, one.update_ms)
-            pending += [(PREDICTION, prediction_message(message, one.posterior)), (BELIEF, belief)]
+            timed = next(localised)
+            belief = belief_message(message, timed.posterior, estimator, world)
+            new.add(belief, timed.update_ms)
+            pending += [(PREDICTION, prediction_message(message, timed.posterior)), (BELIEF, belief)]
         elif isinstance(message, Belief):
             old.add(message, (raw.published_ns - scan_published_ns) * 1e-6)
             if new.stamps and message.stamp_ns == new.stamps[-1]:

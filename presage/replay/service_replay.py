@@ -23,10 +23,9 @@ from common.messages.topics import BELIEF, CMD_VEL, SCAN
 from common.runtime.service import Service
 from common.versions import commit
 from presage.recordings.selection import robot_of
-from presage.replay.comparison import COMPARED_FIELDS, TOLERANCE_M, TOLERANCE_RAD, ReplayOutcome
 from presage.replay.feed import ScanFeed
 from presage.replay.in_process import InProcessServices
-from presage.replay.recorded_session import (
+from presage.replay.recorded_settings import (
     SETTINGS,
     RecordedSettings,
     check_recorded_mount,
@@ -36,6 +35,7 @@ from presage.replay.recorded_session import (
     settings_with,
     world_file,
 )
+from presage.replay.replay_outcome import COMPARED_FIELDS, TOLERANCE_M, TOLERANCE_RAD, ReplayOutcome
 from presage.terminal.output import check_file, write_json
 from services.controller.service import ControllerService
 from services.controller.settings import ControllerSettings

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
 from common.bus.bus import Bus, open_bus
 from common.errors import UserError
@@ -22,10 +21,10 @@ from common.robot.base import Robot
 from common.versions import commit
 from presage.live.latest_messages import LatestMessages
 from presage.recordings.session_figure import draw_session
-from presage.recordings.session_summary import SessionSummary, summarise
+from presage.recordings.session_summary import print_summary, summarise
 from presage.session.page import show_page_link
-from presage.session.preflight import plan_session
-from presage.session.running import announced, credentials_for
+from presage.session.running_sessions import announced, credentials_for
+from presage.session.session_plan import plan_session
 from presage.session.stack import Stack
 from presage.terminal.options import arguments
 from presage.terminal.output import check_file, make_folder, write_json
@@ -207,16 +206,6 @@ def _navigate(bus: Bus, messages: LatestMessages, stack: Stack, place: tuple[flo
     )
 
 
-def show(summary: SessionSummary, recording: Path, figure: Path, console: Console) -> None:
-    """Prints the summary and the names of the files."""
-    table = Table(show_header=False, box=None, padding=(0, 2))
-    for name, value in summary.lines():
-        table.add_row(name, value)
-    table.add_row("recording", str(recording))
-    table.add_row("figure", str(figure))
-    console.print(table)
-
-
 def demo_command(demo: DemoOptions, json_file: Path | None) -> int:
     """Runs the demo, prints its summary and draws its figure; returns status 1 if the goal was not reached."""
     console = Console(width=None if sys.stdout.isatty() else 150)
@@ -227,17 +216,7 @@ def demo_command(demo: DemoOptions, json_file: Path | None) -> int:
     with console.status("drawing"):
         summary = summarise(recording)
         draw_session(recording, figure)
-    show(summary, recording, figure, console)
+    print_summary(summary, recording, figure, console)
     write_json(json_file, {**summary.as_dict(), "seed": demo.seed, "commit": commit(), "arguments": sys.argv[1:]})
     console.print("[bold green]goal reached[/]" if reached else "[bold red]goal not reached[/]")
     return 0 if reached else 1
-
-
-def plot_command(recording: Path, figure: Path, json_file: Path | None, console: Console) -> None:
-    """Prints the summary of a recording and draws its figure."""
-    check_file(figure, "--out")
-    check_file(json_file, "--json")
-    summary = summarise(recording)
-    draw_session(recording, figure)
-    show(summary, recording, figure, console)
-    write_json(json_file, {**summary.as_dict(), "commit": commit(), "arguments": sys.argv[1:]})

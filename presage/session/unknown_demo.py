@@ -29,8 +29,8 @@ from common.versions import commit
 from presage.live.latest_messages import LatestMessages
 from presage.session.demo import DemoOptions, check_recorded, new_recording
 from presage.session.page import show_page_link
-from presage.session.preflight import plan_session
-from presage.session.running import announced, credentials_for
+from presage.session.running_sessions import announced, credentials_for
+from presage.session.session_plan import plan_session
 from presage.session.stack import Stack
 from presage.terminal.options import arguments
 from presage.terminal.output import check_file, make_folder, write_json

@@ -11,8 +11,8 @@ from rich.console import Console
 from common.bus.bus import open_bus
 from common.errors import UserError
 from presage.session.page import show_page_link
-from presage.session.preflight import SessionPlan, plan_session
-from presage.session.running import announced, credentials_for
+from presage.session.running_sessions import announced, credentials_for
+from presage.session.session_plan import SessionPlan, plan_session
 from presage.session.stack import Stack
 from presage.terminal.options import arguments
 
@@ -51,20 +51,12 @@ def run_up(options: UpOptions, console: Console) -> None:
     )
     robot, pace = plan.estimator_settings.robot, plan.simulator_settings.pace
     robots = [robot] if options.robots == 1 else [f"{robot}-{k}" for k in range(1, options.robots + 1)]
-    if options.robots > 1 and options.record is not None:
-        raise UserError(
-            f"--record records one robot only: leave it out, and run `presage --robot {robots[0]} record` beside it"
-        )
-    if not simulated and (options.robots > 1 or pace != "realtime"):
-        raise UserError("--no-simulator allows one robot in real time only: leave out --robots, and the setting pace")
-    if options.mapping and options.robots > 1:
-        raise UserError("--mapping maps with one robot: leave out --robots")
+    _check_combination(options, robots[0], simulated=simulated, pace=pace)
     with Stack(robots[0], options.port or None, security=credentials_for(robots[0])) as stack:
         stack.start_router()
-        viewer = [*plan.config, *arguments(recordings=options.record)]
         page = "viewer" not in options.without
         if page:
-            stack.start("viewer", *viewer)
+            stack.start("viewer", *plan.config, *arguments(recordings=options.record))
         _start_services(stack, options, plan, robots, page=page)
         with open_bus(stack.link()) as bus:
             stack.wait_alive(bus)
@@ -79,6 +71,18 @@ def run_up(options: UpOptions, console: Console) -> None:
             else:
                 _show_hints(stack, plan.estimator_settings.world, robots, console)
             _watch(stack, console)
+
+
+def _check_combination(options: UpOptions, first_robot: str, *, simulated: bool, pace: str) -> None:
+    """Raises UserError for options that exclude one another."""
+    if options.robots > 1 and options.record is not None:
+        raise UserError(
+            f"--record records one robot only: leave it out, and run `presage --robot {first_robot} record` beside it"
+        )
+    if not simulated and (options.robots > 1 or pace != "realtime"):
+        raise UserError("--no-simulator allows one robot in real time only: leave out --robots, and the setting pace")
+    if options.mapping and options.robots > 1:
+        raise UserError("--mapping maps with one robot: leave out --robots")
 
 
 def _start_services(stack: Stack, options: UpOptions, plan: SessionPlan, robots: list[str], *, page: bool) -> None:

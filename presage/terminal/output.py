@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
 from common.errors import UserError
+from common.versions import commit, versions
 
 
 def check_file(file: Path | None, option: str) -> None:
@@ -40,6 +42,12 @@ def write_json(file: Path | None, data: dict[str, Any]) -> None:
     """Writes ``data`` as indented JSON; does nothing if ``file`` is None."""
     if file is not None:
         file.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+
+
+def provenance(seed: int | None = None) -> dict[str, Any]:
+    """The information needed to reproduce a result: seed if there is one, commit, versions, command-line arguments."""
+    found = {"commit": commit(), "versions": versions(), "arguments": sys.argv[1:]}
+    return found if seed is None else {"seed": seed, **found}
 
 
 def printable(text: str) -> str:

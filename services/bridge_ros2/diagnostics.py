@@ -9,7 +9,7 @@ from services.bridge_ros2.ros_types import LASER_SCAN, ODOMETRY, TWIST_STAMPED
 from services.bridge_ros2.settings import MAP_TOPIC
 
 if TYPE_CHECKING:
-    from services.bridge_ros2.graph import Graph
+    from services.bridge_ros2.graph import RosGraph
     from services.bridge_ros2.settings import BridgeRos2Settings
 
 SCAN_TIMEOUT_S = 3.0  # after this time without a scan, the health note explains why
@@ -17,7 +17,7 @@ SCAN_TIMEOUT_S = 3.0  # after this time without a scan, the health note explains
 
 def diagnose(
     options: BridgeRos2Settings,
-    graph: Graph,
+    graph: RosGraph,
     problem: str,
     *,
     linked: bool,
@@ -46,7 +46,7 @@ def diagnose(
     return _diagnose_other(options, graph, with_odometry=with_odometry) if received else f"no scan on {topic} yet"
 
 
-def _diagnose_other(options: BridgeRos2Settings, graph: Graph, *, with_odometry: bool) -> str:
+def _diagnose_other(options: BridgeRos2Settings, graph: RosGraph, *, with_odometry: bool) -> str:
     """Explains what else is wrong while scans arrive, or returns an empty string."""
     if problem := _wrong_odometry_topic(options, graph):
         return problem
@@ -66,7 +66,7 @@ def _diagnose_other(options: BridgeRos2Settings, graph: Graph, *, with_odometry:
     return ""
 
 
-def _wrong_odometry_topic(options: BridgeRos2Settings, graph: Graph) -> str:
+def _wrong_odometry_topic(options: BridgeRos2Settings, graph: RosGraph) -> str:
     """Explains that the odometry topic set by the user does not exist while others of its type do.
 
     Returns an empty string if the topic was not set explicitly, because then odometry from tf is fine.
@@ -80,7 +80,7 @@ def _wrong_odometry_topic(options: BridgeRos2Settings, graph: Graph) -> str:
     return f"no odometry on {topic}; set --odom-topic: {ODOMETRY} is published on {join_names(existing)}"
 
 
-def _explain_missing_endpoints(options: BridgeRos2Settings, graph: Graph) -> str:
+def _explain_missing_endpoints(options: BridgeRos2Settings, graph: RosGraph) -> str:
     """Explains why there are no endpoints of the configured flavour and domain."""
     other_endpoints = graph.other_endpoints()
     domains = sorted(

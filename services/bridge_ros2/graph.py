@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from services.bridge_ros2.keys import Endpoint, RosKeys, read_token
+from services.bridge_ros2.keys import RosEndpoint, RosKeys, read_token
 from services.bridge_ros2.ros_types import NO_HASH, TWIST, TWIST_STAMPED, type_hash
 
 MAX_NAMES_SHOWN = 4  # in one line
 
 
-class Graph:
+class RosGraph:
     """Publishers and subscriptions on the ROS side, from their liveliness tokens.
 
     A zenoh thread calls `change`; the service's loop calls the other methods.
     """
 
-    def __init__(self, names: RosKeys | None = None) -> None:
-        """``names`` are the bridge's own keys on zenoh."""
-        self._names = names or RosKeys()
-        self._tokens: dict[str, Endpoint] = {}
+    def __init__(self, keys: RosKeys | None = None) -> None:
+        """``keys`` are the bridge's own keys on zenoh."""
+        self._keys = keys or RosKeys()
+        self._tokens: dict[str, RosEndpoint] = {}
 
     def change(self, token: str, *, alive: bool) -> None:
         """Records that a token appeared or disappeared."""
@@ -26,15 +26,15 @@ class Graph:
         else:
             self._tokens.pop(token, None)
 
-    def endpoints(self) -> list[Endpoint]:
+    def endpoints(self) -> list[RosEndpoint]:
         """Endpoints of the bridge's flavour and domain, ordered by name."""
-        return [each for each in self._all() if self._names.matches(each)]
+        return [each for each in self._all() if self._keys.matches(each)]
 
-    def other_endpoints(self) -> list[Endpoint]:
+    def other_endpoints(self) -> list[RosEndpoint]:
         """Endpoints of another flavour or domain, ordered by name."""
-        return [each for each in self._all() if not self._names.matches(each)]
+        return [each for each in self._all() if not self._keys.matches(each)]
 
-    def _all(self) -> list[Endpoint]:
+    def _all(self) -> list[RosEndpoint]:
         return sorted(self._tokens.copy().values(), key=lambda each: (each.topic, each.kind, each.node))
 
     def distro_mismatch(self, topic: str) -> str:
@@ -42,15 +42,15 @@ class Graph:
 
         The publishers of ``topic`` decide; without any, all endpoints do.
         """
-        if self._names.flavor == "ros2dds":
+        if self._keys.flavor == "ros2dds":
             return ""
         endpoints = self.endpoints()
         endpoints = [each for each in endpoints if each.publishes and each.topic == topic] or endpoints
         hashes = {each.hash != NO_HASH for each in endpoints}
-        if hashes != {not self._names.hashes}:  # no endpoints, matching ones, or a mixture
+        if hashes != {not self._keys.hashes}:  # no endpoints, matching ones, or a mixture
             return ""
         nodes, consequence = _nodes(endpoints), "or the robot will not receive what the bridge sends"
-        if self._names.hashes:
+        if self._keys.hashes:
             return f"the message types of {nodes} have no hashes, as in Humble; set --distro humble, {consequence}"
         return f"the message types of {nodes} have hashes, as since Iron; set --distro jazzy, {consequence}"
 
@@ -102,7 +102,7 @@ class Graph:
         return found.pop() if len(found) == 1 else ""
 
 
-def _nodes(endpoints: list[Endpoint]) -> str:
+def _nodes(endpoints: list[RosEndpoint]) -> str:
     return join_names(sorted({each.node for each in endpoints} - {""})) or "a node"
 
 

@@ -21,14 +21,16 @@ from services.bridge_ros2.ros_types import NO_HASH, dds_name, ros_name, type_has
 
 Flavor = Literal["rmw_zenoh", "ros2dds"]
 Kind = Literal["NN", "MP", "MS"]  # node, publisher, subscription
-NAME = r"(~?/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*"
+TOPIC_NAME = r"(~?/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*"
 DEFAULT_DEPTH = 42  # rmw_zenoh's default history depth (qos.cpp)
 # Tokens of every flavour and domain, to explain which nodes exist if no messages arrive: first those of
 # zenoh-bridge-ros2dds, then those of rmw_zenoh and of zenoh-bridge-ros2dds before 1.0.
-TOKENS = ("@/*/@ros2_lv/**", "@ros2_lv/**")
+TOKEN_KEYS = ("@/*/@ros2_lv/**", "@ros2_lv/**")
 ATTACHMENT = struct.Struct("<qqB16s")  # sequence number, wall time in ns, length of the gid, gid
 # The attachment of the first versions for Jazzy, with named fields.
-LEGACY = re.compile(rb"\x0fsequence_number(.{8})\x10source_timestamp(.{8})\x0asource_gid\x10(.{16})", re.DOTALL)
+LEGACY_ATTACHMENT = re.compile(
+    rb"\x0fsequence_number(.{8})\x10source_timestamp(.{8})\x0asource_gid\x10(.{16})", re.DOTALL
+)
 
 
 @dataclass(frozen=True)
@@ -45,11 +47,11 @@ class Qos:
         return f"{reliability}:{durability}:,{'' if self.depth == DEFAULT_DEPTH else self.depth}:,:,:,,"
 
 
-SENSOR = Qos(reliable=False, depth=5)
-LATEST = Qos(depth=1)
-TF = Qos(depth=100)
-TF_STATIC = Qos(transient_local=True, depth=100)
-LATCHED = Qos(transient_local=True, depth=1)
+SENSOR_QOS = Qos(reliable=False, depth=5)
+LATEST_QOS = Qos(depth=1)
+TF_QOS = Qos(depth=100)
+TF_STATIC_QOS = Qos(transient_local=True, depth=100)
+LATCHED_QOS = Qos(transient_local=True, depth=1)
 
 
 def full_name(topic: str, namespace: str) -> str:
@@ -92,7 +94,7 @@ class RosKeys:
         if self.flavor == "rmw_zenoh" and received not in (type_hash(kind), NO_HASH):
             raise ValueError(f"its {kind} has the type hash {received}, not {type_hash(kind)}: another definition")
 
-    def matches(self, endpoint: Endpoint) -> bool:
+    def matches(self, endpoint: RosEndpoint) -> bool:
         """Whether an endpoint has this flavour and domain, so that it can exchange messages with the bridge."""
         return endpoint.flavor == self.flavor and endpoint.domain in (None, self.domain)
 
@@ -108,10 +110,10 @@ def mangle(name: str) -> str:
 
 
 @dataclass(frozen=True)
-class Node:
+class BridgeNode:
     """The bridge as a node of rmw_zenoh."""
 
-    names: RosKeys
+    keys: RosKeys
     zid: str  # the zenoh session's id
     namespace: str
     name: str
@@ -122,12 +124,12 @@ class Node:
 
     def endpoint_token(self, kind: Kind, number: int, topic: str, message: str, qos: Qos) -> str:
         """Token of a publisher or subscription. ``number`` must be unique in the node."""
-        rest = (mangle(topic), dds_name(message), self.names.hash_of(message), qos.text())
+        rest = (mangle(topic), dds_name(message), self.keys.hash_of(message), qos.text())
         return "/".join([self._token(kind, number), *rest])
 
     def _token(self, kind: Kind, number: int) -> str:
         enclave, namespace = "%", mangle(clean_namespace(self.namespace))
-        return f"@ros2_lv/{self.names.domain}/{self.zid}/0/{number}/{kind}/{enclave}/{namespace}/{self.name}"
+        return f"@ros2_lv/{self.keys.domain}/{self.zid}/0/{number}/{kind}/{enclave}/{namespace}/{self.name}"
 
 
 def publisher_gid(token: str) -> bytes:
@@ -148,7 +150,7 @@ def read_attachment(data: bytes) -> tuple[int, int, bytes] | None:
 
     Also reads the format of the first versions for Jazzy, with named fields.
     """
-    if match := LEGACY.fullmatch(data):
+    if match := LEGACY_ATTACHMENT.fullmatch(data):
         return (*struct.unpack("<qq", match[1] + match[2]), match[3])
     if len(data) != ATTACHMENT.size or data[16] != 16:
         return None
@@ -157,7 +159,7 @@ def read_attachment(data: bytes) -> tuple[int, int, bytes] | None:
 
 
 @dataclass(frozen=True)
-class Endpoint:
+class RosEndpoint:
     """A publisher or subscription of another node."""
 
     publishes: bool
@@ -169,17 +171,17 @@ class Endpoint:
     domain: int | None = None  # unknown for zenoh-bridge-ros2dds
 
 
-def read_token(key: str) -> Endpoint | None:
+def read_token(key: str) -> RosEndpoint | None:
     """Parses the token of a publisher or subscription, of either flavour. Returns None for any other key."""
     parts = key.split("/")
     if parts[0] == "@ros2_lv" and len(parts) >= 13 and parts[5] in ("MP", "MS"):
         namespace, name, topic, kind, digest = (part.replace("%", "/") for part in parts[7:12])
         domain = int(parts[1]) if re.fullmatch(r"[0-9]{1,3}", parts[1]) else None
         node = f"{namespace.rstrip('/')}/{name}"
-        return Endpoint(parts[5] == "MP", topic, ros_name(kind), digest, node, domain=domain)
+        return RosEndpoint(parts[5] == "MP", topic, ros_name(kind), digest, node, domain=domain)
     where = parts.index("@ros2_lv") if "@ros2_lv" in parts else -1
     rest = parts[where + (1 if where == 2 else 2) :] if where in (0, 2) else []
     if len(rest) >= 3 and rest[0] in ("MP", "MS"):
         topic, kind = (part.replace("§", "/") for part in rest[1:3])
-        return Endpoint(rest[0] == "MP", "/" + topic.strip("/"), kind, flavor="ros2dds")
+        return RosEndpoint(rest[0] == "MP", "/" + topic.strip("/"), kind, flavor="ros2dds")
     return None

@@ -18,11 +18,11 @@ import zenoh.ext
 from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
 from common.messages.topics import Topic
-from services.bridge_ros2.keys import TOKENS, Node, Qos, RosKeys, attachment, publisher_gid, read_attachment
+from services.bridge_ros2.keys import TOKEN_KEYS, BridgeNode, Qos, RosKeys, attachment, publisher_gid, read_attachment
 from services.bridge_ros2.ros_types import encode
 
 if TYPE_CHECKING:
-    from services.bridge_ros2.graph import Graph
+    from services.bridge_ros2.graph import RosGraph
 
 HEARTBEAT_PERIOD_S = 0.5  # of latched topics, as in rmw_zenoh
 LEASE_MS = 3000  # a silent peer counts as gone after this
@@ -82,16 +82,16 @@ class RosPublisher:
 class RosSession:
     """The bridge's node in the ROS graph. zenoh's threads fill the graph and the inbox."""
 
-    def __init__(self, session: zenoh.Session, names: RosKeys, namespace: str, name: str, graph: Graph) -> None:
+    def __init__(self, session: zenoh.Session, keys: RosKeys, namespace: str, name: str, graph: RosGraph) -> None:
         """Declares the node, and subscribes to the tokens of other nodes."""
-        self._session, self._names, self._graph = session, names, graph
+        self._session, self._keys, self._graph = session, keys, graph
         self._declared: list[Any] = []
         self._numbers = itertools.count(1)
-        self._node: Node | None = None
-        if names.flavor == "rmw_zenoh":
-            self._node = Node(names, str(session.zid()), namespace, name)
+        self._node: BridgeNode | None = None
+        if keys.flavor == "rmw_zenoh":
+            self._node = BridgeNode(keys, str(session.zid()), namespace, name)
             self._declare_token(self._node.token())
-        for key in TOKENS:
+        for key in TOKEN_KEYS:
             self._declared.append(session.liveliness().declare_subscriber(key, self._on_token, history=True))
 
     def _on_token(self, sample: zenoh.Sample) -> None:
@@ -115,7 +115,7 @@ class RosSession:
             entry = Sample(inbox_topic, str(sample.key_expr), sample.payload.to_bytes(), published_ns, time.time_ns())
             inbox.put(entry, newest_only=inbox_topic.queue == "newest")
 
-        key = self._names.subscribe(topic, kind)
+        key = self._keys.subscribe(topic, kind)
         options: dict[str, Any] = {}
         if qos.transient_local:
             options = {
@@ -139,7 +139,7 @@ class RosSession:
             if (sample := reply.ok) is not None:
                 inbox.put(Sample(inbox_topic, topic.strip("/"), sample.payload.to_bytes(), 0, time.time_ns()))
 
-        for key in self._names.caches(topic):
+        for key in self._keys.caches(topic):
             self._session.get(
                 key,
                 zenoh.handlers.Callback(on_reply),
@@ -161,7 +161,7 @@ class RosSession:
                 ),
             }
         publisher = zenoh.ext.declare_advanced_publisher(
-            self._session, self._names.publish(topic, kind), congestion_control=zenoh.CongestionControl.DROP, **options
+            self._session, self._keys.publish(topic, kind), congestion_control=zenoh.CongestionControl.DROP, **options
         )
         self._declared.append(publisher)
         gid = b""

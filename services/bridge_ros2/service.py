@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 from common.bus.inbox import Sample
-from common.geometry.rasterize import rasterise
+from common.geometry.rasterisation import rasterise
 from common.geometry.se2 import Array
 from common.geometry.world import load_world
 from common.messages.definitions import Belief, CmdVel, Goal, Stamped
@@ -19,8 +19,8 @@ from services.bridge_ros2 import to_ros
 from services.bridge_ros2.command_gate import CommandGate
 from services.bridge_ros2.diagnostics import SCAN_TIMEOUT_S, diagnose
 from services.bridge_ros2.from_ros import dead_reckoning_of, odom_of, pose_of, scan_of
-from services.bridge_ros2.graph import Graph
-from services.bridge_ros2.keys import LATCHED, LATEST, SENSOR, TF, TF_STATIC, Qos
+from services.bridge_ros2.graph import RosGraph
+from services.bridge_ros2.keys import LATCHED_QOS, LATEST_QOS, SENSOR_QOS, TF_QOS, TF_STATIC_QOS, Qos
 from services.bridge_ros2.odometry import MountAndOdometry, NoMountError
 from services.bridge_ros2.ros_session import RosPublisher, RosSession, open_ros_session
 from services.bridge_ros2.ros_types import (
@@ -65,7 +65,7 @@ class BridgeRos2Service(Service):
     def __init__(self, settings: BridgeRos2Settings) -> None:
         super().__init__(settings)
         self.options = settings
-        self.graph = Graph(settings.names())
+        self.graph = RosGraph(settings.ros_keys())
         self.motion = MountAndOdometry(settings.base_frame, settings.odom_frame, settings.build_mount())
         self.gate = CommandGate(settings.build_robot(), obstacle_stop=settings.obstacle_stop)
         self.self_filter = settings.build_self_filter()
@@ -108,25 +108,25 @@ class BridgeRos2Service(Service):
                 self.log.warning(self.note)
             self._warned_waiting = True
             return
-        ros = self._ros = RosSession(session, options.names(), options.namespace, NODE, self.graph)
+        ros = self._ros = RosSession(session, options.ros_keys(), options.namespace, NODE, self.graph)
         self._began = time.monotonic()
         subscribed: list[tuple[str, str, Qos, Callable[[Any], None]]] = [
-            (TF_TOPIC + "_static", TF_MESSAGE, TF_STATIC, self._on_tf),
-            (TF_TOPIC, TF_MESSAGE, TF, self._on_tf),
+            (TF_TOPIC + "_static", TF_MESSAGE, TF_STATIC_QOS, self._on_tf),
+            (TF_TOPIC, TF_MESSAGE, TF_QOS, self._on_tf),
             (options.odom_topic, ODOMETRY, Qos(), self._on_odometry),
-            (options.scan_topic, LASER_SCAN, SENSOR, self._on_scan),
+            (options.scan_topic, LASER_SCAN, SENSOR_QOS, self._on_scan),
             (INITIAL_POSE_TOPIC, POSE_WITH_COVARIANCE, Qos(), self._on_initial_pose),
         ]
         published = [
-            (POSE_TOPIC, POSE_WITH_COVARIANCE, LATCHED),
-            (HYPOTHESES_TOPIC, POSE_ARRAY, SENSOR),
-            (TF_TOPIC if options.tf != "none" else "", TF_MESSAGE, TF),
+            (POSE_TOPIC, POSE_WITH_COVARIANCE, LATCHED_QOS),
+            (HYPOTHESES_TOPIC, POSE_ARRAY, SENSOR_QOS),
+            (TF_TOPIC if options.tf != "none" else "", TF_MESSAGE, TF_QOS),
         ]
         if self._map is not None:
-            published.append((MAP_TOPIC, OCCUPANCY_GRID, LATCHED))
+            published.append((MAP_TOPIC, OCCUPANCY_GRID, LATCHED_QOS))
         if options.commands:
             subscribed.append((GOAL_TOPIC, POSE_STAMPED, Qos(), self._on_goal))
-            published.append((options.cmd_topic, TWIST_STAMPED if options.stamped else TWIST, LATEST))
+            published.append((options.cmd_topic, TWIST_STAMPED if options.stamped else TWIST, LATEST_QOS))
         self._publishers = {
             name: ros.publisher(options.topic(name), kind, qos) for name, kind, qos in published if name
         }
@@ -204,7 +204,7 @@ class BridgeRos2Service(Service):
             return
         kind, handler = self._handlers[sample.topic.name]
         try:
-            self.options.names().check_type_hash(sample.key, kind)
+            self.options.ros_keys().check_type_hash(sample.key, kind)
             handler(decode(kind, sample.payload))
         except NoMountError as error:  # tf may still arrive; the health note reports it only after a while
             self._problem = str(error)

@@ -11,9 +11,9 @@ from common.errors import UserError
 from common.geometry.pose_text import POSE_TEXT, pose_of_text
 from common.messages.ros_messages import Mount
 from common.runtime.robot_settings import SelfFilterSettings
-from services.bridge_ros2.keys import NAME, RosKeys, full_name
+from services.bridge_ros2.keys import TOPIC_NAME, RosKeys, full_name
 
-TOPIC = rf"^$|^{NAME}$"
+TOPIC = rf"^$|^{TOPIC_NAME}$"
 ENDPOINT = r"[a-z]+/[^\s,]+:(6553[0-5]|655[0-2]\d|65[0-4]\d\d|6[0-4]\d{3}|[1-5]\d{4}|[1-9]\d{0,3})"
 ENDPOINTS = rf"^{ENDPOINT}(,{ENDPOINT})*$"
 FRAME = r"^[A-Za-z0-9_./-]{1,64}$"
@@ -86,17 +86,17 @@ class BridgeRos2Settings(SelfFilterSettings):
     ] = "jazzy"
     domain: Annotated[int, Field(ge=0, le=232, description="ROS_DOMAIN_ID")] = 0
     namespace: Annotated[
-        str, Field(pattern=rf"^$|^{NAME}/?$", description="namespace of relative topic names, such as robot1")
+        str, Field(pattern=rf"^$|^{TOPIC_NAME}/?$", description="namespace of relative topic names, such as robot1")
     ] = ""
 
-    scan_topic: Annotated[str, Field(pattern=rf"^{NAME}$", description="topic with scans (sensor_msgs/LaserScan)")] = (
-        "scan"
-    )
+    scan_topic: Annotated[
+        str, Field(pattern=rf"^{TOPIC_NAME}$", description="topic with scans (sensor_msgs/LaserScan)")
+    ] = "scan"
     odom_topic: Annotated[
         str,
         Field(pattern=TOPIC, description="topic with odometry (nav_msgs/Odometry); empty to use odometry from tf"),
     ] = "odom"
-    cmd_topic: Annotated[str, Field(pattern=rf"^{NAME}$", description="topic for velocity commands")] = "cmd_vel"
+    cmd_topic: Annotated[str, Field(pattern=rf"^{TOPIC_NAME}$", description="topic for velocity commands")] = "cmd_vel"
     stamped: Annotated[bool, Field(description="send commands as TwistStamped instead of Twist")] = False
     commands: Annotated[
         bool,
@@ -134,7 +134,7 @@ class BridgeRos2Settings(SelfFilterSettings):
 
     obstacle_stop: Annotated[bool, Field(description="slow down and stop before obstacles in the scan")] = True
 
-    def names(self) -> RosKeys:
+    def ros_keys(self) -> RosKeys:
         """Zenoh keys of the configured flavour and domain."""
         return RosKeys(self.flavor, self.domain, hashes=self.distro != "humble")
 

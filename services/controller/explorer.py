@@ -49,6 +49,7 @@ class Explorer:
         self.phase: Literal["exploring", "returning", "finished", "failed"] = "exploring"
         self.goal: Goal | None = None  # of the exploration, not of a user
         self.paused = False  # whether a goal of a user takes precedence
+        self.viewpoint_due = True  # whether a viewpoint has to be chosen; cleared by the caller that chooses it
         self.path_m = 0.0
         self._pose, self._located = pose, True
         # The start is stored relative to the last key scan, so that it moves with the map when a loop closes.
@@ -75,6 +76,10 @@ class Explorer:
         poses = self.map.message.poses
         return se2.compose(poses[min(self._home_key, len(poses) - 1)], self._home)
 
+    def use_map(self, planned: PlannedMap) -> None:
+        """Uses a new version of the map, whose frontier is another one."""
+        self.map, self.viewpoint_due = planned, self.drives
+
     def pause(self) -> None:
         """Pauses the exploration, because a user has set or cancelled a goal."""
         self.goal, self.paused, self._user_goal_over_since_ns = None, True, None
@@ -97,25 +102,24 @@ class Explorer:
             self.map.graph, poses, self._arrivals, field_of_view, self._pose, home, target, self._unreachable
         )
 
-    def update(self, state: GoalState, stamp_ns: int, *, moving: bool) -> bool:
-        """Processes the state of the robot's goal after a scan. Returns whether a viewpoint must be chosen now.
+    def update(self, state: GoalState, stamp_ns: int, *, moving: bool) -> None:
+        """Processes the state of the robot's goal after a scan.
 
         ``moving``: the latest command is a motion. A robot may stop late, beyond the goal that it has reached.
         """
         if not self.active or not (self.paused or self.goal is not None):
-            return False
+            return
         if state.phase is Phase.UNLOCALISED:
             self._last_moved = self._pose, 0  # the policy drives to localise
-            return False
-        if self.paused:
-            return self._resume_after_user_goal(state, stamp_ns)
-        if self.goal is None:
-            return False
-        self._note_motion(stamp_ns)
-        stalled = stamp_ns - self._last_moved[1] > STALLED_NS
-        if self.phase == "returning":
-            return self._update_return(state, stalled=stalled, moving=moving)
-        return self._update_viewpoint(self.goal, state, stalled=stalled)
+        elif self.paused:
+            self.viewpoint_due |= self._resume_after_user_goal(state, stamp_ns)
+        elif self.goal is not None:
+            self._note_motion(stamp_ns)
+            stalled = stamp_ns - self._last_moved[1] > STALLED_NS
+            if self.phase == "returning":
+                self.viewpoint_due |= self._update_return(state, stalled=stalled, moving=moving)
+            else:
+                self.viewpoint_due |= self._update_viewpoint(self.goal, state, stalled=stalled)
 
     def _resume_after_user_goal(self, state: GoalState, stamp_ns: int) -> bool:
         """Ends the pause if the goal of a user has been over for `PAUSE_NS`; returns whether it did."""

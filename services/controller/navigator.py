@@ -59,7 +59,6 @@ class Navigator:
         self._floor: Floor | None = None  # for which the destination was chosen; None to choose it again
         self.explorer: Explorer | None = None  # the last exploration, unless it was cancelled
         self._exploration_request: Goal | None = None  # waits for the first map and a pose in it
-        self._viewpoint_due = False  # whether the exploration has to choose a viewpoint
         self._scan: Scan | None = None
         self._scan_points = np.zeros((0, 2))  # m in base_link
 
@@ -99,28 +98,28 @@ class Navigator:
         """Begins the requested exploration when there is a map and a pose in it."""
         if self._exploration_request is not None and self._map is not None and self._pose is not None:
             self.explorer = Explorer(self._exploration_request.seq, self._pose, self._map)
-            self._exploration_request, self._viewpoint_due = None, True
+            self._exploration_request = None
 
     def on_map(self, planned: PlannedMap) -> None:
         """Uses a new version of the mapper's map for exploration; the caller passes it to the policy."""
         self._map = planned
         if self.explorer is not None:
-            self.explorer.map = planned
-            self._viewpoint_due = self.explorer.drives
+            self.explorer.use_map(planned)
 
     def take_exploration_state(self) -> ExplorationState | None:
         """Returns the input for the choice of a viewpoint, or None if no choice is due.
 
         The caller passes the viewpoint that was chosen to `use_viewpoint`.
         """
-        if self.goal_state.phase is Phase.UNLOCALISED:
-            return None  # the robot first has to be localised
-        due, self._viewpoint_due = self._viewpoint_due, False
-        if not due or self.explorer is None or self._map is None or self._scan is None or not self.explorer.drives:
+        explorer = self.explorer
+        if explorer is None or self.goal_state.phase is Phase.UNLOCALISED:  # the robot first has to be localised
+            return None
+        due, explorer.viewpoint_due = explorer.viewpoint_due, False
+        if not due or not explorer.drives or self._scan is None:
             return None
         from services.controller.policies.exploration import FieldOfView  # slow: numba
 
-        return self.explorer.exploration_state(FieldOfView.of(self._scan, self._map.message.grid.resolution))
+        return explorer.exploration_state(FieldOfView.of(self._scan, explorer.map.message.grid.resolution))
 
     def use_viewpoint(self, viewpoint: Viewpoint | None, exploration_state: ExplorationState) -> None:
         """Drives to the viewpoint that was chosen, or back to the start if there is none."""
@@ -223,8 +222,8 @@ class Navigator:
         command, limited_by_scan = self._command.limit(belief.stamp_ns, desired, self._scan_points)
         moving = is_moving(self._command.velocity)
         self.goal_state.update_progress(belief.stamp_ns, self.decision, moving=moving, limited_by_scan=limited_by_scan)
-        if self.explorer is not None and self.explorer.update(self.goal_state, belief.stamp_ns, moving=moving):
-            self._viewpoint_due = True
+        if self.explorer is not None:
+            self.explorer.update(self.goal_state, belief.stamp_ns, moving=moving)
         status = self._add_exploration(self.goal_state.status(belief.stamp_ns, shown_distance))
         if (terms := self.decision.terms) is not None:
             status = status.model_copy(update={"energy": PolicyEnergy(**terms)})

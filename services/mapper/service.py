@@ -22,11 +22,11 @@ from common.robot.scan_geometry import Sweep
 from common.runtime.odometry_sync import OdometrySync
 from common.runtime.service import Service
 from services.mapper.settings import MapperSettings
+from services.mapper.slam.correlative_search import correlative_search
 from services.mapper.slam.drive import Laser
 from services.mapper.slam.elements import elements_of_scan
 from services.mapper.slam.front_end import ScanPose
 from services.mapper.slam.mapper import Mapper, MapSnapshot
-from services.mapper.slam.search import search
 
 UPDATE_PERIOD_NS = 1_000_000_000  # between the beginnings of two updates of the map, which leaves time for the scans
 REPEAT_PERIOD_NS = 5_000_000_000  # an unchanged map is published again after this time, for later subscribers
@@ -58,7 +58,7 @@ class MapperService(Service):
     def open(self) -> None:
         """Compiles the search now, so that no scan has to wait for it."""
         wall = elements_of_scan(np.full(9, 2.0), np.linspace(-0.1, 0.1, 9), np.zeros(3), 10.0)
-        search(wall, wall, np.zeros(3), np.full(3, 0.1))
+        correlative_search(wall, wall, np.zeros(3), np.full(3, 0.1))
 
     def close(self) -> None:
         """Waits for the running update."""

@@ -86,10 +86,9 @@ class Recording:
         One chunk at a time is held in memory. Stops at the first damaged place, which `problem` then describes.
         """
         try:
+            read = self._read_indexed if self.indexed else self._read_unindexed
             with self.path.open("rb") as stream:
-                for channel, message in (self._read_indexed if self.indexed else self._read_unindexed)(
-                    stream, keys, start_ns, end_ns
-                ):
+                for channel, message in read(stream, keys, start_ns, end_ns):
                     yield RawMessage(channel.topic, message.data, message.publish_time, message.log_time)
         except OSError as error:
             raise _unreadable(self.path, error) from None

@@ -54,9 +54,9 @@ class OpenRecording:
         self.writer.write(sample.topic, sample.key, sample.payload, published, self._logged_ns)
         self.message_counts.add(sample.key, sample.payload)
 
-    def describe(self, service: str, answer: DescriptionReply) -> None:
+    def describe(self, service: str, reply: DescriptionReply) -> None:
         """Writes a service's reply about its configuration, world or model."""
-        write_description(self.writer, service, answer)
+        write_description(self.writer, service, reply)
 
     def state(self) -> RecordReply:
         """File, number of messages and duration so far."""
@@ -127,9 +127,9 @@ def file_path(options: RecorderSettings) -> Path:
     return options.directory / (name if name.endswith(".mcap") else name + ".mcap")
 
 
-def write_description(writer: RecordingWriter | PartsWriter, service: str, answer: DescriptionReply) -> None:
+def write_description(writer: RecordingWriter | PartsWriter, service: str, reply: DescriptionReply) -> None:
     """Writes a service's reply as the metadata and attachments of `records_of`."""
-    for record in records_of(service, answer):
+    for record in records_of(service, reply):
         if isinstance(record, MetadataRecord):
             writer.metadata(record.name, record.values)
         else:

@@ -36,9 +36,9 @@ class RecorderService(Service):
         self.options = settings
         self.inputs = parse_topics(settings.topics)  # type: ignore[misc]
         self.recording: OpenRecording | None = None
-        self.describer: DescriptionCollector | None = None
+        self.descriptions: DescriptionCollector | None = None
         # By service and type: the last description of each.
-        self._descriptions: dict[tuple[str, type[DescriptionReply]], DescriptionReply] = {}
+        self._last_descriptions: dict[tuple[str, type[DescriptionReply]], DescriptionReply] = {}
         self._ended = RecordReply()  # final state of the last recording
         self._written: Counter[str] = Counter()  # by key, in completed recordings
         self._missing: Counter[str] = Counter()  # by key, in completed recordings
@@ -56,7 +56,7 @@ class RecorderService(Service):
         self._update_note()
         self._flush_at = time.monotonic() + options.flush
         self._warn_at = time.monotonic() + LINK_WARNING_DELAY_S if options.link().connect else None
-        self.describer = DescriptionCollector(self.loop.bus, self.name, self.log, weights=options.weights)
+        self.descriptions = DescriptionCollector(self.loop.bus, self.name, self.log, weights=options.weights)
 
     def on_sample(self, sample: Sample) -> None:
         """Writes the sample if a recording is open."""
@@ -82,7 +82,7 @@ class RecorderService(Service):
         elif request.action == "stop":
             if self.recording is None:
                 return state.model_copy(update={"ok": False, "reason": "not recording"})
-            self._write_answers()
+            self._write_descriptions()
             self._end()
         return self._state()
 
@@ -94,11 +94,11 @@ class RecorderService(Service):
         self.recording = OpenRecording(self.options, self.inputs, self.loop.inbox, numbered=numbered)
         self._update_note()
         self.log.info("recording", file=self.recording.state().file)
-        if self.describer is not None:
-            for (service, _), answer in self._descriptions.items():
-                if service in self.describer.present:
-                    self.recording.describe(service, answer)
-            self.describer.query_all()
+        if self.descriptions is not None:
+            for (service, _), reply in self._last_descriptions.items():
+                if service in self.descriptions.present:
+                    self.recording.describe(service, reply)
+            self.descriptions.query_all()
 
     def _end(self) -> None:
         """Completes the file. The recording counts as ended even if this fails."""
@@ -145,17 +145,17 @@ class RecorderService(Service):
     def on_timer(self) -> None:
         """Writes new descriptions, checks the link and flushes the file."""
         self._flush_at = time.monotonic() + self.options.flush
-        self._write_answers()
+        self._write_descriptions()
         self._check_link()
         if self.recording is not None:
             self.recording.writer.flush()
 
     def close(self) -> None:
         """Writes the messages that are still queued and completes the file."""
-        inbox, describer = self.loop.inbox, self.describer
-        if describer is None:
+        inbox, descriptions = self.loop.inbox, self.descriptions
+        if descriptions is None:
             return
-        describer.stop()
+        descriptions.stop()
         try:
             if self.recording is not None and not self.recording.writer.failed:
                 for _ in range(inbox.capacity):  # bounded, because others may continue to publish
@@ -163,11 +163,11 @@ class RecorderService(Service):
                         break
                     if isinstance(entry, Sample):
                         self.on_sample(entry)
-                self._write_answers()
+                self._write_descriptions()
         finally:
             if self.recording is not None:
                 self._end()
-            describer.join()
+            descriptions.join()
 
     def _check_link(self) -> None:
         """Warns once if the router is not reached, and logs when it is reached after that."""
@@ -189,13 +189,13 @@ class RecorderService(Service):
         self.idle = self.recording is None
         self.note = self._no_link_note or ("not recording until a request starts it" if self.idle else "")
 
-    def _write_answers(self) -> None:
-        if self.describer is None:
+    def _write_descriptions(self) -> None:
+        if self.descriptions is None:
             return
-        for service, answer in self.describer.answers():
-            self._descriptions[service, type(answer)] = answer
+        for service, reply in self.descriptions.new_replies():
+            self._last_descriptions[service, type(reply)] = reply
             if self.recording is not None:
-                self.recording.describe(service, answer)
+                self.recording.describe(service, reply)
 
 
 def parse_topics(names: str) -> tuple[Topic, ...]:

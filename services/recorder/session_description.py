@@ -16,7 +16,7 @@ from common.log import Logger
 from common.messages.requests import ConfigReply, ModelReply, ModelRequest, Request, WorldReply
 from common.messages.topics import CONFIG, MODEL, WORLD, Query
 
-ANSWER_TIMEOUT_S = 2.0  # for one reply
+REPLY_TIMEOUT_S = 2.0  # for one reply
 RETRY_DELAY_S = 5.0  # after a service did not reply
 MAX_ATTEMPTS = 5
 MODEL_RETRY_DELAY_S = 0.5  # while an estimator has no model yet because it has received no scan
@@ -44,14 +44,14 @@ class AttachmentRecord:
     media_type: str
 
 
-def records_of(service: str, answer: DescriptionReply) -> Iterator[MetadataRecord | AttachmentRecord]:
+def records_of(service: str, reply: DescriptionReply) -> Iterator[MetadataRecord | AttachmentRecord]:
     """Yields the records that store a reply. Attachments come before the metadata that refers to them."""
-    if isinstance(answer, WorldReply):
-        yield from _records_of_world(answer)
-    elif isinstance(answer, ModelReply):
-        yield from _records_of_model(answer)
+    if isinstance(reply, WorldReply):
+        yield from _records_of_world(reply)
+    elif isinstance(reply, ModelReply):
+        yield from _records_of_model(reply)
     else:
-        yield MetadataRecord(f"config:{service}", {"config": answer.config, **answer.versions})
+        yield MetadataRecord(f"config:{service}", {"config": reply.config, **reply.versions})
 
 
 def _records_of_world(reply: WorldReply) -> Iterator[MetadataRecord | AttachmentRecord]:
@@ -91,27 +91,26 @@ class DescriptionCollector:
         self._bus, self._own_name, self._log, self._weights = bus, own_name, log, weights
         # Services that came (True) or went (False), from zenoh's thread; None wakes the thread.
         self._events: queue.SimpleQueue[tuple[str, bool] | None] = queue.SimpleQueue()
-        self._answers: queue.SimpleQueue[tuple[str, DescriptionReply]] = queue.SimpleQueue()
-        self._scheduled: dict[
-            tuple[str, str], tuple[float, int]
-        ] = {}  # by service and query: due time, attempts so far
+        self._replies: queue.SimpleQueue[tuple[str, DescriptionReply]] = queue.SimpleQueue()
+        # By service and query: due time, and attempts so far.
+        self._scheduled: dict[tuple[str, str], tuple[float, int]] = {}
         self._last: dict[tuple[str, str], DescriptionReply] = {}  # an unchanged reply is not stored again
         self.present: frozenset[str] = frozenset()  # services that are alive
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="describer", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="session-description", daemon=True)
         self._thread.start()
         bus.watch_alive(lambda service, alive: self._events.put((service, alive)))
 
-    def answers(self) -> Iterator[tuple[str, DescriptionReply]]:
+    def new_replies(self) -> Iterator[tuple[str, DescriptionReply]]:
         """Yields service and reply for each reply since the last call."""
         while True:
             try:
-                yield self._answers.get_nowait()
+                yield self._replies.get_nowait()
             except queue.Empty:
                 return
 
     def query_all(self) -> None:
-        """Queries all services again. Changed replies appear in `answers`."""
+        """Queries all services again. Changed replies appear in `new_replies`."""
         self._events.put((ALL_SERVICES, True))
 
     def stop(self) -> None:
@@ -121,7 +120,7 @@ class DescriptionCollector:
 
     def join(self) -> None:
         """Waits for the thread after `stop`. It ends within the timeout of one query."""
-        self._thread.join(ANSWER_TIMEOUT_S + 1.0)
+        self._thread.join(REPLY_TIMEOUT_S + 1.0)
 
     def _run(self) -> None:
         while not self._stopping.is_set():
@@ -174,33 +173,33 @@ class DescriptionCollector:
         """Queries the service and queues a changed reply. Returns the delay until the next query in s, or None."""
         if query is CONFIG:
             self._queue_if_new(
-                service, query, self._bus.query(CONFIG, Request(), ConfigReply, ANSWER_TIMEOUT_S, service)
+                service, query, self._bus.query(CONFIG, Request(), ConfigReply, REPLY_TIMEOUT_S, service)
             )
         elif query is WORLD:
-            self._queue_if_new(service, query, self._bus.query(WORLD, Request(), WorldReply, ANSWER_TIMEOUT_S))
+            self._queue_if_new(service, query, self._bus.query(WORLD, Request(), WorldReply, REPLY_TIMEOUT_S))
         else:
             return self._query_model(service)
         return None
 
     def _query_model(self, service: str) -> float:
-        reply = self._bus.query(MODEL, ModelRequest(), ModelReply, ANSWER_TIMEOUT_S)
+        reply = self._bus.query(MODEL, ModelRequest(), ModelReply, REPLY_TIMEOUT_S)
         if not reply.ok:
             return MODEL_RETRY_DELAY_S
         if reply != self._last.get((service, MODEL.name)):
             with_weights = reply
             if self._weights and 0 < reply.size <= MAX_WEIGHTS_BYTES:
-                with_weights = self._bus.query(MODEL, ModelRequest(weights=True), ModelReply, ANSWER_TIMEOUT_S)
+                with_weights = self._bus.query(MODEL, ModelRequest(weights=True), ModelReply, REPLY_TIMEOUT_S)
                 if not with_weights.ok:
                     self._log.warning("the weights are not stored", reason=with_weights.reason)
                     with_weights = reply
             self._last[service, MODEL.name] = reply
-            self._answers.put((service, with_weights))
+            self._replies.put((service, with_weights))
         return MODEL_RECHECK_PERIOD_S
 
-    def _queue_if_new(self, service: str, query: Query, answer: ConfigReply | WorldReply) -> None:
-        if answer != self._last.get((service, query.name)):
-            self._last[service, query.name] = answer
-            self._answers.put((service, answer))
+    def _queue_if_new(self, service: str, query: Query, reply: ConfigReply | WorldReply) -> None:
+        if reply != self._last.get((service, query.name)):
+            self._last[service, query.name] = reply
+            self._replies.put((service, reply))
 
 
 QUERIES = {query.name: query for query in (CONFIG, WORLD, MODEL)}

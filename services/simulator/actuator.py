@@ -57,8 +57,6 @@ class Actuator:
         """Velocity (3,) of a base whose wheels roll with ``wheels`` (3,) and slip."""
         if self.robot.drive == "holonomic":
             return wheels * self._grip
-        to_wheel = (
-            self.robot.radius
-        )  # m from the centre to each of the two wheels: they are assumed at the edge of the body
-        left, right = (wheels[0] + np.array([-1, 1]) * to_wheel * wheels[2]) * self._grip[:2]
-        return np.array([(left + right) / 2, 0.0, (right - left) / (2 * to_wheel)])
+        half_track = self.robot.radius  # m; the two wheels are assumed at the edge of the body
+        left, right = (wheels[0] + np.array([-1, 1]) * half_track * wheels[2]) * self._grip[:2]
+        return np.array([(left + right) / 2, 0.0, (right - left) / (2 * half_track)])

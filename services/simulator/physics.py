@@ -21,7 +21,7 @@ class Physics(Protocol):
     """The world's walls, furniture and people, and the robot. Poses are of base_link in map."""
 
     def close(self) -> None:
-        """Free what the engine holds."""
+        """Releases what the engine holds."""
 
     def add(self, name: str, obstacle: Obstacle) -> None:
         """Adds a piece of furniture."""

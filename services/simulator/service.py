@@ -204,7 +204,7 @@ class SimulatorService(Service):
                 self._next_step_s = now
 
     def on_request(self, query: Query, request: Request) -> Reply:
-        """Carry out a request. Raises UserError if that is not possible."""
+        """Carries out a request. Raises UserError if that is not possible."""
         if query is WORLD:
             simulation = self.simulation
             world = None if self.settings.hide_world else simulation.world

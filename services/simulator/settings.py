@@ -93,7 +93,8 @@ class SimulatorSettings(RobotSettings):
 
     def required_services(self) -> set[str]:
         """Names of the services that must be running before the first scan."""
-        text = self.wait_for if self.wait_for is not None else "estimator,controller" * (self.pace == "lockstep")
+        default = "estimator,controller" if self.pace == "lockstep" else ""
+        text = default if self.wait_for is None else self.wait_for
         return {name.strip() for name in text.split(",") if name.strip()}
 
     def start_pose(self) -> tuple[float, float, float] | None:

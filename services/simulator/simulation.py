@@ -92,7 +92,7 @@ class Simulation:
         self._scan_points = np.zeros((0, 2))  # m in base_link
 
     def close(self) -> None:
-        """Free what the physics engine holds."""
+        """Releases the physics engine."""
         self.physics.close()
 
     @property
@@ -279,27 +279,29 @@ class Simulation:
 
     def change_obstacle(self, action: str, name: str, obstacle: Obstacle | None) -> None:
         """Adds, moves or removes a piece of furniture. Raises UserError if that is not possible."""
-        known = {o.name: o for o in self.world.obstacles}
-        if (name in known) == (action == "add"):
-            there = ", ".join(known) or "none"
-            raise UserError(f"there is {'already an' if action == 'add' else 'no'} obstacle {name!r} (there: {there})")
+        known = [o.name for o in self.world.obstacles]
+        there = ", ".join(known) or "none"
+        if action == "add" and name in known:
+            raise UserError(f"there is already an obstacle {name!r} (there: {there})")
+        if action != "add" and name not in known:
+            raise UserError(f"there is no obstacle {name!r} (there: {there})")
         if not name or name == "boundary":
             raise UserError(f"an obstacle needs a name of its own, not {name!r}")
+        obstacles = [o for o in self.world.obstacles if o.name != name]
+        placed: Obstacle | None = None  # None if the obstacle is removed
         if action != "remove":
             if obstacle is None:
                 raise UserError(f"{action} needs the obstacle's shape")
             self._check_place(obstacle)
-        obstacles = [o for o in self.world.obstacles if o.name != name]
-        if action != "remove" and obstacle is not None:
-            obstacle = obstacle.model_copy(update={"name": name})
-            obstacles.append(obstacle)
-        # A new world, because a copy would keep cached geometry. It is built first, because that may raise an error.
+            placed = obstacle.model_copy(update={"name": name})
+            obstacles.append(placed)
+        # The world is built first, because that may raise an error.
         world = self.world.with_obstacles(obstacles)
         self._make_room(self.physics.pose(), world)
-        if action != "add":
+        if name in known:
             self.physics.remove(name)
-        if action != "remove" and obstacle is not None:
-            self.physics.add(name, obstacle)
+        if placed is not None:
+            self.physics.add(name, placed)
         self.world = world
 
     def _check_place(self, obstacle: Obstacle) -> None:

@@ -83,16 +83,16 @@ class RobotControl:
         self._numbers: defaultdict[str, Iterator[int]] = defaultdict(itertools.count)  # of drive messages, by robot
         self._handlers: dict[type[requests.Action], Callable[[str, Any], ActionResult]] = {
             requests.GoTo: self._goal,
-            requests.Cancel: self._cancel,
+            requests.CancelGoal: self._cancel,
             requests.Explore: self._explore,
             requests.Teleport: self._teleport,
             requests.Localise: self._localise,
             requests.EditObstacle: self._obstacle,
             requests.ControlClock: self._clock,
-            requests.Reset: self._reset,
+            requests.ResetSimulation: self._reset,
             requests.SetSpeed: self._speed,
             requests.DriveByHand: self._drive,
-            requests.Record: self._record,
+            requests.ControlRecorder: self._record,
             requests.SaveMap: self._save_map,
         }
 
@@ -160,7 +160,7 @@ class RobotControl:
             raise UserError(status.reason)
         return ActionResult(ok=True, reason="exploring until nothing is left to see; goals take precedence")
 
-    def _cancel(self, robot: str, _action: requests.Cancel) -> ActionResult:
+    def _cancel(self, robot: str, _action: requests.CancelGoal) -> ActionResult:
         self._check_controller(robot, GOAL)
         goal = Goal(stamp_ns=self._lookup.stamp_ns(robot), seq=time.time_ns(), pose=Pose(x=0.0, y=0.0), cancel=True)
         self._bus.put(GOAL, goal.encode(), key=GOAL.key(robot))
@@ -206,7 +206,7 @@ class RobotControl:
         self.send_request(robot, CLOCK_QUERIES[action.do], Request(), Reply)
         return ActionResult(ok=True, reason=CLOCK_RESULTS[action.do])
 
-    def _reset(self, robot: str, action: requests.Reset) -> ActionResult:
+    def _reset(self, robot: str, action: requests.ResetSimulation) -> ActionResult:
         self.send_request(robot, RESET, ResetRequest(seed=action.seed), Reply)
         seed = "" if action.seed is None else f" with seed {action.seed}"
         return ActionResult(ok=True, reason=f"simulation restarted{seed}")
@@ -228,7 +228,7 @@ class RobotControl:
         self._bus.put(DRIVE, drive.encode(), key=key)
         return ActionResult(ok=True)
 
-    def _record(self, robot: str, action: requests.Record) -> ActionResult:
+    def _record(self, robot: str, action: requests.ControlRecorder) -> ActionResult:
         reply = self.send_request(robot, RECORDING, RecordRequest(action=action.action), RecordReply)
         more = {
             "recording": reply.recording,

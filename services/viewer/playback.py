@@ -69,8 +69,8 @@ class Playback:
             if self._leaving:
                 raise UserError("the viewer is shutting down")
             child = self._child = self._start(name)
-            started_or_failed = lambda: alive() or self._leaving or child.process.poll() is not None  # noqa: E731
-            if wait_until(started_or_failed, START_TIMEOUT_S) and alive():
+            wait_until(lambda: alive() or self._leaving or child.process.poll() is not None, START_TIMEOUT_S)
+            if alive():
                 return
             reason = self._end() or f"it did not start within {START_TIMEOUT_S:g} s"
         raise UserError(f"{name} cannot be played: {reason}")

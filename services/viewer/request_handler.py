@@ -79,9 +79,9 @@ class RequestHandler:
                     return self._watch(visitor, action.robot)
                 case requests.ListRecordings():
                     return await self._recordings()
-                case requests.Open():
+                case requests.OpenRecordingFile():
                     return await self._open(visitor, action.name)
-                case requests.Close():
+                case requests.CloseRecordingFile():
                     return await self._close()
                 case requests.ControlPlayer():
                     return await self._in_thread(self._play, action)
@@ -92,7 +92,7 @@ class RequestHandler:
 
     async def _on_robot(self, robot: str, action: requests.Action) -> ActionResult:
         answer = await self._in_thread(self.context.control.carry_out, robot, action)
-        if answer.ok and isinstance(action, requests.EditObstacle | requests.Reset):
+        if answer.ok and isinstance(action, requests.EditObstacle | requests.ResetSimulation):
             self.refresh_world(robot)
         return answer
 

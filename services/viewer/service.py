@@ -1,7 +1,8 @@
 """The viewer service: receives messages, and passes frames to the web server's thread.
 
 The service's thread encodes frames and passes the bytes to the hub, which runs in the web server's thread and knows
-which robots are watched. For a robot that no visitor watches, only the messages for the charts and the log are decoded.
+which robots are watched. For a robot that no visitor watches, only the messages for the charts and the journal are
+decoded.
 """
 
 from __future__ import annotations
@@ -232,7 +233,8 @@ class ViewerService(Service):
             followed.view.live = "replay" not in self.roster.services(robot)
             if robot in watched:
                 self._send_text(robot, "services", self._services(robot, followed))
-        self.counters.update({name: n - self.counters[name] for name, n in dict(self.hub.counters).items()})
+        for name, count in dict(self.hub.counters).items():  # a copy, because the web server's thread changes it
+            self.counters[name] = count
         self.counters["visitors"] = len(self.hub)
         if self._web is not None and not self._web.running and not self.note:
             self.note = "the web server ended"

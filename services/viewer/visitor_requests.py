@@ -49,7 +49,7 @@ class GoTo(Action):
     tolerance: Annotated[float, Field(allow_inf_nan=False, gt=0, le=100)] | None = None
 
 
-class Cancel(Action):
+class CancelGoal(Action):
     """Cancel the goal."""
 
     do: Literal["cancel"]
@@ -94,7 +94,7 @@ class ControlClock(Action):
     do: Literal["pause", "resume", "step"]
 
 
-class Reset(Action):
+class ResetSimulation(Action):
     """Restart the simulation."""
 
     do: Literal["reset"]
@@ -117,7 +117,7 @@ class DriveByHand(Action):
     wz: Speed = 0.0
 
 
-class Record(Action):
+class ControlRecorder(Action):
     """Start or stop a recording, or query its state."""
 
     do: Literal["record"]
@@ -137,14 +137,14 @@ class ListRecordings(Action):
     do: Literal["recordings"]
 
 
-class Open(Action):
+class OpenRecordingFile(Action):
     """Open a recording."""
 
     do: Literal["open"]
     name: Annotated[str, Field(min_length=1, max_length=255)]
 
 
-class Close(Action):
+class CloseRecordingFile(Action):
     """Close the open recording."""
 
     do: Literal["close"]
@@ -161,20 +161,20 @@ class ControlPlayer(Action):
 ACTIONS = (
     WatchRobot,
     GoTo,
-    Cancel,
+    CancelGoal,
     Explore,
     Teleport,
     Localise,
     EditObstacle,
     ControlClock,
-    Reset,
+    ResetSimulation,
     SetSpeed,
     DriveByHand,
-    Record,
+    ControlRecorder,
     SaveMap,
     ListRecordings,
-    Open,
-    Close,
+    OpenRecordingFile,
+    CloseRecordingFile,
     ControlPlayer,
 )
 # By the names that the field ``do`` may have.

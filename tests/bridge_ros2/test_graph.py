@@ -5,17 +5,17 @@ from __future__ import annotations
 import pytest
 
 from services.bridge_ros2.diagnostics import diagnose
-from services.bridge_ros2.graph import Graph
-from services.bridge_ros2.keys import Node, Qos, RosKeys
+from services.bridge_ros2.graph import RosGraph
+from services.bridge_ros2.keys import BridgeNode, Qos, RosKeys
 from services.bridge_ros2.ros_types import LASER_SCAN, OCCUPANCY_GRID, ODOMETRY, TWIST, TWIST_STAMPED, type_hash
 from services.bridge_ros2.settings import BridgeRos2Settings
 
 
-def token(kind, topic, message, number=1, **names):
-    return Node(RosKeys(**names), "ab", "", "driver").endpoint_token(kind, number, topic, message, Qos())
+def token(kind, topic, message, number=1, **keys):
+    return BridgeNode(RosKeys(**keys), "ab", "", "driver").endpoint_token(kind, number, topic, message, Qos())
 
 
-NODE = Node(RosKeys(), "ab", "", "driver").token()
+NODE = BridgeNode(RosKeys(), "ab", "", "driver").token()
 SCANS, ODOM = token("MP", "/scan", LASER_SCAN), token("MP", "/odom", ODOMETRY, 9)
 LISTENS_STAMPED, LISTENS = token("MS", "/cmd_vel", TWIST_STAMPED), token("MS", "/cmd_vel", TWIST, 2)
 FAR = token("MP", "/scan", LASER_SCAN, domain=5)
@@ -27,8 +27,8 @@ RVIZ = token("MS", "/amcl_pose", ODOMETRY, 3)
 DDS_SCAN = "@/a1/@ros2_lv/MP/scan/sensor_msgs§msg§LaserScan/:::"
 
 
-def graph_of(tokens, **names):
-    graph = Graph(**names)
+def graph_of(tokens, **keys):
+    graph = RosGraph(**keys)
     for each in tokens:
         graph.change(each, alive=True)
     return graph
@@ -67,7 +67,7 @@ def test_expected_twist_type(tokens, kind):
 
 def diagnosis(*tokens, problem="", linked=True, scan_age=0.0, received=True, with_odometry=True, **options):
     settings = BridgeRos2Settings(**options)
-    graph = graph_of(tokens, names=settings.names())
+    graph = graph_of(tokens, keys=settings.ros_keys())
     return diagnose(
         settings, graph, problem, linked=linked, scan_age=scan_age, received=received, with_odometry=with_odometry
     )

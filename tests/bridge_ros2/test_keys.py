@@ -8,12 +8,12 @@ import pytest
 from zenoh import KeyExpr
 
 from services.bridge_ros2.keys import (
-    LATCHED,
-    SENSOR,
-    TOKENS,
-    Endpoint,
-    Node,
+    LATCHED_QOS,
+    SENSOR_QOS,
+    TOKEN_KEYS,
+    BridgeNode,
     Qos,
+    RosEndpoint,
     RosKeys,
     attachment,
     full_name,
@@ -29,7 +29,7 @@ TOKEN = (
     "@ros2_lv/0/100f0e0d0c0b0a090807060504030201/0/16/MS/%/%/nucleo_h743zi2/%nucleo%cmd_vel/"
     "geometry_msgs::msg::dds_::Twist_/" + type_hash(TWIST) + "/::,:,:,:,,"
 )
-NODE = Node(RosKeys(), "100f0e0d0c0b0a090807060504030201", "", "nucleo_h743zi2")
+NODE = BridgeNode(RosKeys(), "100f0e0d0c0b0a090807060504030201", "", "nucleo_h743zi2")
 
 
 def test_keys_of_rmw_zenoh():
@@ -47,27 +47,29 @@ def test_keys_of_ros2dds():
     names = RosKeys("ros2dds", domain=3)
     assert names.publish("/robot1/scan", LASER_SCAN) == names.subscribe("/robot1/scan", LASER_SCAN) == "robot1/scan"
     assert KeyExpr(names.caches("/tf_static")[0]).includes(KeyExpr("@/a1/@ros2_pub_cache/tf_static"))
-    assert any(KeyExpr(k).includes(KeyExpr("@/a1/@ros2_lv/MP/scan/sensor_msgs§msg§LaserScan/:::")) for k in TOKENS)
+    assert any(KeyExpr(k).includes(KeyExpr("@/a1/@ros2_lv/MP/scan/sensor_msgs§msg§LaserScan/:::")) for k in TOKEN_KEYS)
 
 
 def test_tokens():
     qos = Qos(depth=42)  # the default of rmw_zenoh
     assert NODE.endpoint_token("MS", 16, "/nucleo/cmd_vel", TWIST, qos) == TOKEN
     assert NODE.token() == "@ros2_lv/0/100f0e0d0c0b0a090807060504030201/0/0/NN/%/%/nucleo_h743zi2"
-    spaced = Node(RosKeys(domain=5), "ab", "/robot1/", "presage").endpoint_token("MP", 1, "/robot1/x", TWIST, qos)
+    spaced = BridgeNode(RosKeys(domain=5), "ab", "/robot1/", "presage").endpoint_token("MP", 1, "/robot1/x", TWIST, qos)
     assert spaced.startswith("@ros2_lv/5/ab/0/1/MP/%/%robot1/presage/%robot1%x/")
     KeyExpr(spaced)  # a key expression that zenoh takes
-    assert any(KeyExpr(k).includes(KeyExpr(TOKEN)) for k in TOKENS)
+    assert any(KeyExpr(k).includes(KeyExpr(TOKEN)) for k in TOKEN_KEYS)
 
 
 def test_quality_of_service():
-    assert (SENSOR.text(), LATCHED.text(), Qos().text()) == ("2::,5:,:,:,,", ":1:,1:,:,:,,", "::,10:,:,:,,")
+    assert (SENSOR_QOS.text(), LATCHED_QOS.text(), Qos().text()) == ("2::,5:,:,:,,", ":1:,1:,:,:,,", "::,10:,:,:,,")
 
 
 def test_read_tokens():
-    assert read_token(TOKEN) == Endpoint(False, "/nucleo/cmd_vel", TWIST, type_hash(TWIST), "/nucleo_h743zi2", domain=0)
+    assert read_token(TOKEN) == RosEndpoint(
+        False, "/nucleo/cmd_vel", TWIST, type_hash(TWIST), "/nucleo_h743zi2", domain=0
+    )
     for key in ("@/a1/@ros2_lv/MP/robot1§scan/sensor_msgs§msg§LaserScan/:::", "@ros2_lv/a1/MP/robot1§scan/sensor_msgs§msg§LaserScan/:::"):  # fmt: skip  # noqa: E501
-        assert read_token(key) == Endpoint(True, "/robot1/scan", LASER_SCAN, flavor="ros2dds")
+        assert read_token(key) == RosEndpoint(True, "/robot1/scan", LASER_SCAN, flavor="ros2dds")
     for key in (
         NODE.token(),
         "@/a1/@ros2_lv",

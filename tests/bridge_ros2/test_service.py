@@ -13,7 +13,7 @@ import zenoh.ext
 from common.bus.bus import Link, open_bus, wait_until
 from common.bus.inbox import Inbox, Sample
 from common.geometry import se2
-from common.geometry.rasterize import rasterise
+from common.geometry.rasterisation import rasterise
 from common.geometry.world import load_world
 from common.messages.definitions import Goal, Health, Odom, Scan
 from common.messages.requests import LocaliseRequest, Reply

@@ -124,7 +124,7 @@ def test_viewpoints_then_the_way_back():
         5,
     )
     assert np.isclose(status.exploration.area, 50.0)
-    robot.until(lambda _: robot.navigator._viewpoint_due)
+    robot.until(lambda _: robot.navigator.explorer.viewpoint_due)
     assert np.hypot(*(robot.pose[:2] - [5.0, 2.5])) < 0.1
     robot.explore(None)
     assert robot.step().exploration.phase == "returning"
@@ -138,11 +138,11 @@ def test_viewpoints_then_the_way_back():
 def test_a_robot_that_stops_late_returns_again():
     robot = exploring_robot()
     robot.explore((4.0, 2.5))
-    robot.until(lambda _: robot.navigator._viewpoint_due)
+    robot.until(lambda _: robot.navigator.explorer.viewpoint_due)
     robot.explore(None)
     robot.until(lambda _: robot.navigator.goal_state.phase is Phase.REACHED)
     robot.pose = robot.pose - [0.06, 0.0, 0.0]
-    robot.until(lambda _: robot.navigator._viewpoint_due)
+    robot.until(lambda _: robot.navigator.explorer.viewpoint_due)
     robot.explore(None)
     assert robot.step().exploration.phase == "returning"
     robot.until(lambda status: status.exploration.phase == "finished")
@@ -159,7 +159,7 @@ def test_a_goal_of_a_user_takes_precedence():
     status = robot.until(lambda status: status.state == "reached")
     assert (status.goal_seq, status.exploration.phase) == (6, "exploring")
     count = robot.scans
-    robot.until(lambda _: robot.navigator._viewpoint_due)
+    robot.until(lambda _: robot.navigator.explorer.viewpoint_due)
     assert robot.scans - count >= 2 * SCANS_PER_S - 1  # long enough to publish that the goal was reached
     robot.explore((8.0, 2.5))
     assert robot.step().state == "exploring"
@@ -187,7 +187,7 @@ def test_cancelling_ends_it():
 def test_a_place_without_progress_is_given_up():
     robot = exploring_robot()
     robot.explore((8.0, 2.5))
-    robot.until(lambda _: robot.navigator._viewpoint_due, moves=False)
+    robot.until(lambda _: robot.navigator.explorer.viewpoint_due, moves=False)
     exploration_state = robot.navigator.take_exploration_state()
     assert exploration_state.unreachable.tolist() == [[8.0, 2.5]]
     assert not len(exploration_state.arrivals)
@@ -196,7 +196,7 @@ def test_a_place_without_progress_is_given_up():
 def test_a_way_back_that_stays_refused_fails():
     robot = exploring_robot()
     robot.explore((5.0, 2.5))
-    robot.until(lambda _: robot.navigator._viewpoint_due)
+    robot.until(lambda _: robot.navigator.explorer.viewpoint_due)
     shut = GRID.values.copy()
     shut[:, 70:76] = OCCUPIED
     grid = OccupancyGrid.of(shut, 0.05, (0.0, 0.0, 0.0))
@@ -204,7 +204,7 @@ def test_a_way_back_that_stays_refused_fails():
     robot.explore(None)
     count, status = robot.scans, robot.step()
     while status.exploration.phase == "returning":
-        if robot.navigator._viewpoint_due:
+        if robot.navigator.explorer.viewpoint_due:
             robot.explore(None)
         status = robot.step()
     assert status.exploration.phase == "failed"

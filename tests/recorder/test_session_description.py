@@ -139,7 +139,7 @@ def next_answers(collector, count):
     found = []
 
     def check():
-        found.extend(collector.answers())
+        found.extend(collector.new_replies())
         return len(found) >= count
 
     assert wait_until(check, 10), found
@@ -214,13 +214,13 @@ def test_late_and_changed_model(bus, collect):
     collector = collect()
     bus.changed("estimator", True)
     assert wait_until(lambda: bus.count("estimator", "model") > session_description.MAX_ATTEMPTS, 10)
-    assert [type(answer) for _, answer in collector.answers()] == [ConfigReply]
+    assert [type(answer) for _, answer in collector.new_replies()] == [ConfigReply]
     scans.append(1)
     ((_, first),) = next_answers(collector, 1)
     assert first.weights.tobytes() == WEIGHTS.tobytes()
     before = len(bus.asked)
     assert wait_until(lambda: len(bus.asked) > before + 3, 10)  # queried repeatedly, but
-    assert list(collector.answers()) == []  # an unchanged reply is not stored twice
+    assert list(collector.new_replies()) == []  # an unchanged reply is not stored twice
     bus.replies["estimator", "model"] = model_of(WEIGHTS[:5])
     ((_, second),) = next_answers(collector, 1)
     assert second.weights.tobytes() == WEIGHTS[:5].tobytes()

@@ -15,7 +15,7 @@ GOOD = [
     ({"do": "watch", "robot": "robot-2"}, requests.WatchRobot(do="watch", robot="robot-2")),
     ({"do": "goal", "x": 1, "y": 2.5}, requests.GoTo(do="goal", x=1.0, y=2.5)),
     ({"do": "goal", "x": 1, "y": 2, "yaw": -1.5, "tolerance": 0.1}, requests.GoTo(do="goal", x=1, y=2, yaw=-1.5, tolerance=0.1)),  # noqa: E501
-    ({"do": "cancel"}, requests.Cancel(do="cancel")),
+    ({"do": "cancel"}, requests.CancelGoal(do="cancel")),
     ({"do": "teleport", "x": 1, "y": 2, "yaw": 3}, requests.Teleport(do="teleport", x=1, y=2, yaw=3)),
     ({"do": "localise"}, requests.Localise(do="localise")),
     ({"do": "localise", "x": 1, "y": 2, "yaw": None}, requests.Localise(do="localise", x=1, y=2)),
@@ -23,14 +23,14 @@ GOOD = [
      requests.EditObstacle(do="obstacle", action="remove", name="crate")),
     ({"do": "pause"}, requests.ControlClock(do="pause")),
     ({"do": "step"}, requests.ControlClock(do="step")),
-    ({"do": "reset", "seed": 7}, requests.Reset(do="reset", seed=7)),
+    ({"do": "reset", "seed": 7}, requests.ResetSimulation(do="reset", seed=7)),
     ({"do": "speed", "factor": 2}, requests.SetSpeed(do="speed", factor=2)),
     ({"do": "drive", "vx": 0.5, "vy": 0, "wz": -1}, requests.DriveByHand(do="drive", vx=0.5, vy=0, wz=-1)),
-    ({"do": "record", "action": "start"}, requests.Record(do="record", action="start")),
+    ({"do": "record", "action": "start"}, requests.ControlRecorder(do="record", action="start")),
     ({"do": "save_map", "name": "here"}, requests.SaveMap(do="save_map", name="here")),
     ({"do": "recordings"}, requests.ListRecordings(do="recordings")),
-    ({"do": "open", "name": "run.mcap"}, requests.Open(do="open", name="run.mcap")),
-    ({"do": "close"}, requests.Close(do="close")),
+    ({"do": "open", "name": "run.mcap"}, requests.OpenRecordingFile(do="open", name="run.mcap")),
+    ({"do": "close"}, requests.CloseRecordingFile(do="close")),
     ({"do": "player", "action": "seek", "value": 3.5}, requests.ControlPlayer(do="player", action="seek", value=3.5)),
 ]  # fmt: skip
 

@@ -206,7 +206,7 @@ def cost_near_walls(clearance: Array, min_clearance: float) -> Array:
 
 
 def _dilate(cells: npt.NDArray[np.bool_], by: int) -> npt.NDArray[np.bool_]:
-    """Dilate a mask (rows, columns) bool by a square of ``by`` cells to each side."""
+    """Dilates a mask (rows, columns) bool by a square of ``by`` cells to each side."""
     for _ in range(2):  # one axis after the other; the transpose swaps them
         dilated = cells.copy()
         for shift in range(1, by + 1):

@@ -32,7 +32,7 @@ def delay_until_effect(robot: Robot, scan: Scan | None) -> float:
 
 
 def rollouts(current: Array, policies: Array, robot: Robot) -> tuple[Array, Array, Array]:
-    """Predict the motion of policies (N, 5).
+    """Predicts the motion of policies (N, 5).
 
     ``current`` (3,) is the present velocity in base_link. A holonomic base keeps its direction in the map while it
     turns, because each scan leads to a new command; a differential base drives arcs.

@@ -60,15 +60,16 @@ class GeodesicPolicy:
         self.graph = FreeSpaceGraph(self.free, robot.radius)
         self.obstacles = TemporaryObstacles(self.free)
         self.localiser = ActiveLocaliser(robot, self.graph, robot.radius + OBSTACLE_GAP_M, may_turn=not keep_heading)
-        self.field: CostField | None = None  # to the goal, around obstacles unless `closed`
-        self.closed = False  # obstacles leave no path, and the field ignores them
+        self.field: CostField | None = None  # to the goal, around obstacles unless `ignores_obstacles`
+        self.ignores_obstacles = False  # whether the field leads through obstacles, because they leave no path
         self.field_changed = False  # set with each new field, and cleared by the caller that publishes it
         self._goal: Array | None = None
         self._component: int | None = None  # of the graph, where the robot was when last tracked
         self._scan: Scan | None = None
         self._information: ScanInformation | None = None  # None before the first scan, and without `epistemic`
-        # Stamp at which obstacles were last given to the graph, and their cells; whether the field is older than that.
-        self._planned: tuple[int, npt.NDArray[Any]] = (-REPLAN_PERIOD_NS, np.zeros(0, int))
+        # When obstacles were last given to the graph, and their cells; whether the field is older than that.
+        self._obstacles_set_ns = -REPLAN_PERIOD_NS
+        self._obstacle_cells: npt.NDArray[Any] = np.zeros(0, int)
         self._field_outdated = False
         self._reachable_from: int | None = None  # component of the graph from which the goal is known to be reachable
         self._field_of_view = ALL_ROUND
@@ -115,7 +116,7 @@ class GeodesicPolicy:
             self.obstacles.change_map(self.free)
         self.localiser.use_graph(graph)
         self.field = self._component = self._reachable_from = None
-        self._planned = (-REPLAN_PERIOD_NS, np.zeros(0, int))
+        self._obstacles_set_ns, self._obstacle_cells = -REPLAN_PERIOD_NS, np.zeros(0, int)
 
     def set_goal(self, goal: Array | None) -> None:
         """Sets the goal (2,) m in map, or none."""
@@ -235,9 +236,8 @@ class GeodesicPolicy:
             self.field = None
             return
         cells = np.unique(self.free.grid.cell_of(points)) if len(points) else np.zeros(0, int)
-        planned_ns, planned_cells = self._planned
-        changed = np.setxor1d(cells, planned_cells, assume_unique=True)
-        age = stamp_ns - planned_ns
+        changed = np.setxor1d(cells, self._obstacle_cells, assume_unique=True)
+        age = stamp_ns - self._obstacles_set_ns
         due = (
             age < 0  # the simulation was reset
             or age >= REPLAN_PERIOD_FAR_NS
@@ -245,22 +245,23 @@ class GeodesicPolicy:
         )
         if self.field is None or (len(changed) and due):
             self.graph.set_obstacles(points)
-            self._planned, self._field_outdated = (stamp_ns, cells), True
-            if self.field is not None and not self.closed:
+            self._obstacles_set_ns, self._obstacle_cells, self._field_outdated = stamp_ns, cells, True
+            if self.field is not None and not self.ignores_obstacles:
                 return
         if self.field is not None and not self._field_outdated:
             return
         self._field_outdated = False
         max_goal_shift = self.robot.radius + 2 * self.free.grid.resolution
-        self.field, self.field_changed, self.closed = self.graph.cost_field(self._goal, max_goal_shift), True, False
+        self.field, self.field_changed = self.graph.cost_field(self._goal, max_goal_shift), True
+        self.ignores_obstacles = False
         if self.field is None or not self.field.reaches(position):
             # Obstacles leave no path. Drive by the map alone, up to the obstacle that blocks the path, and wait there.
             self.graph.set_obstacles(np.zeros((0, 2)))
-            self.field, self.closed = self.graph.cost_field(self._goal, max_goal_shift), bool(len(points))
+            self.field, self.ignores_obstacles = self.graph.cost_field(self._goal, max_goal_shift), bool(len(points))
 
     def _near_path(self, position: Array, cells: npt.NDArray[Any]) -> bool:
         """Whether any of these cells lies near the path from ``position`` (2,) m, or there is no path yet."""
-        if self.field is None or not len(cells) or self.closed:
+        if self.field is None or not len(cells) or self.ignores_obstacles:
             return True
         path = self.field.path(position)
         if not len(path):
@@ -318,7 +319,7 @@ class GeodesicPolicy:
         return Decision(reason=reason, state="blocked", path=path, refused=True) if arrived or stuck else None
 
     def _back_off(self, pose: Array, velocity: Array, surroundings: Surroundings, path: Array) -> Decision:
-        """Recover: drive towards the direction with the largest gap to walls and obstacles."""
+        """Recovers: drives towards the direction with the largest gap to walls and obstacles."""
         angle = np.arange(16) * np.pi / 8
         targets = 0.4 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         target = targets[int(np.argmax(surroundings.gaps(targets[:, None, :], np.zeros(1))[:, 0]))]
@@ -333,7 +334,7 @@ class GeodesicPolicy:
         """Status text: why the robot does not drive freely, or nothing."""
         if self.robot.drive == "differential" and not bool(surroundings.sees(0.0)):
             return BLIND_AHEAD
-        if self.closed:
+        if self.ignores_obstacles:
             return self._no_path(pose, surroundings)
         return self._hindrance(pose, surroundings, standing=standing) if hindered else ""
 

@@ -65,7 +65,7 @@ class StraightLinePolicy:
         return Decision(np.array([self._action[0], self._action[1], 0.0]))
 
     def decide_unlocalised(self, belief: Belief, velocity: Array) -> Decision:  # noqa: ARG002
-        """Stand until the pose is known."""
+        """Stands until the pose is known."""
         self._action = np.zeros(2)
         state: DecisionState = "lost" if belief.state == "lost" else "navigating"
         return Decision(reason=f"standing until localised: the belief is {belief.state}", state=state)

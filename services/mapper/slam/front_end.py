@@ -23,6 +23,7 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from common.robot.motion_distortion import beam_times, correct_beams, evenly_spaced
 from common.robot.scan_geometry import Sweep
+from services.mapper.slam.correlative_search import correlative_search
 from services.mapper.slam.drive import Laser, RawDrive
 from services.mapper.slam.elements import Elements, concatenate, elements_of_scan
 from services.mapper.slam.pose_graph import PoseLink
@@ -34,7 +35,6 @@ from services.mapper.slam.registration import (
     Surface,
     register,
 )
-from services.mapper.slam.search import search
 from services.mapper.slam.segments import PosedScans, Segment, compare_segments
 
 KEY_DISTANCE_M, KEY_TURN_RAD = 0.4, 0.5  # a key scan is taken after a motion of either size since the last one
@@ -215,7 +215,7 @@ class FrontEnd:
         starts = [last if self._velocity is None else se2.compose(last, self._velocity * period)]
         near = elements.part(np.hypot(*elements.points.T) < SEARCH_RANGE_M)
         if len(near):
-            starts += list(search(surface.elements, near, prior.mean, SEARCH_WINDOW))
+            starts += list(correlative_search(surface.elements, near, prior.mean, SEARCH_WINDOW))
         others = [register(surface, elements, start, prior) for start in starts]
         matches = [each for each in (found, *others) if each is not None]
         best = min(matches, key=lambda each: each.cost, default=None)

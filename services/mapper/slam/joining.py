@@ -15,10 +15,10 @@ import numpy.typing as npt
 
 from common.geometry import se2
 from common.geometry.se2 import Array
+from services.mapper.slam.correlative_search import correlative_search
 from services.mapper.slam.loop_closure import MAX_DISTANCE_M, MIN_MATCHED, RIVAL_SHARE, LoopClosure, match_segments
 from services.mapper.slam.pose_graph import PoseLink
 from services.mapper.slam.registration import Surface
-from services.mapper.slam.search import search
 from services.mapper.slam.segments import Segment, compare_segments, submap
 
 TARGET_SPACING_M = 2.0  # between segments of the map in which a segment is searched for
@@ -91,7 +91,7 @@ def _search_segment(segments: Sequence[Segment], first: int, second: int, poses:
     target, moved = submap(segments, first, poses), segments[second]
     surface = Surface(target.elements)
     window = np.array([SEARCH_RANGE_M, SEARCH_RANGE_M, np.pi])
-    starts = search(surface.elements, moved.elements, np.zeros(3), window, TURN_STEP)
+    starts = correlative_search(surface.elements, moved.elements, np.zeros(3), window, TURN_STEP)
     matches = [match_segments(target, surface, moved, start) for start in starts]
     references = target.reference, moved.reference
     return [

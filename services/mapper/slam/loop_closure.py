@@ -13,9 +13,9 @@ import numpy as np
 
 from common.geometry import se2
 from common.geometry.se2 import Array
+from services.mapper.slam.correlative_search import correlative_search
 from services.mapper.slam.pose_graph import PoseLink, Uncertainty
 from services.mapper.slam.registration import Surface, register
-from services.mapper.slam.search import search
 from services.mapper.slam.segments import Agreement, Segment, compare_segments, submap
 
 MAX_DISTANCE_M = 6.0  # between the references of segments that are matched
@@ -129,7 +129,7 @@ def _close_loop(
     window = SEARCH_SIGMAS * np.sqrt(np.diag(covariance))
     wide = bool((window > NO_SEARCH_WINDOW).any())
     surface = Surface(target.elements)
-    starts = search(surface.elements, moved.elements, predicted, window) if wide else predicted[None]
+    starts = correlative_search(surface.elements, moved.elements, predicted, window) if wide else predicted[None]
     found = [match_segments(target, surface, moved, start) for start in starts]
     matches = [each for each in found if each is not None and _is_plausible(each, predicted, covariance)]
     if not matches:

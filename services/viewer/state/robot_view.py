@@ -195,7 +195,7 @@ class RobotView:
             self._goals.popitem(last=False)
 
     def _update(self, message: Stamped) -> None:
-        """Updates history, log and latency with a message."""
+        """Updates history, journal and latency with a message."""
         if isinstance(message, Truth):
             self._truths[message.stamp_ns] = message
             if len(self._truths) > MAX_TRUTHS:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.errors import UserError
 from common.geometry.building import GAP_M, GRID_GAP_M
 from common.geometry.occupancy_grid import OccupancyGrid
-from common.geometry.rasterize import rasterise
+from common.geometry.rasterisation import rasterise
 from common.geometry.world import World, load_world, save_world
 from common.messages.requests import WorldReply
 from tests.common.geometry.maps import HUT, ROOM, building, write_map
@@ -51,6 +51,7 @@ FLOORS = [
 
 
 @pytest.mark.parametrize(("tower", "name", "alone"), FLOORS)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_floor_is_like_the_floor_alone(tower, name, alone, seed):
     rng, floor = np.random.default_rng(seed), tower.floor(name)

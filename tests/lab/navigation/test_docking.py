@@ -25,10 +25,10 @@ def final(x, y, yaw_deg, state="reached") -> dict:
 
 @pytest.mark.parametrize("index", [0, 1])
 def test_random_docks(index):
-    trip, approach = docking.draw_docking(docking.DockingJob(index, 3))
-    line = np.array(trip.goal) - np.linspace(0, LINE_LENGTH_M, 20)[:, None] * [np.cos(approach), np.sin(approach)]
+    task, approach = docking.draw_docking(docking.DockingJob(index, 3))
+    line = np.array(task.goal) - np.linspace(0, LINE_LENGTH_M, 20)[:, None] * [np.cos(approach), np.sin(approach)]
     assert load_world("maze").clearance(line).min() > 0.27 + docking.LINE_CLEARANCE_M - 0.01
-    goal = docking.DockingJob(index, 3).goal(trip, approach)
+    goal = docking.DockingJob(index, 3).goal(task, approach)
     assert abs(se2.wrap(goal.pose.yaw - approach)) == pytest.approx(index * np.pi)
 
 
@@ -49,7 +49,7 @@ def test_summary():
 
 
 def test_arguments_of_the_services():
-    trip, approach = docking.draw_docking(docking.DockingJob(0, 3))
-    run = replace(docking.DockingJob(0, 3), drive="differential", latency=0.1).lockstep_run(trip, approach)
+    task, approach = docking.draw_docking(docking.DockingJob(0, 3))
+    run = replace(docking.DockingJob(0, 3), drive="differential", latency=0.1).lockstep_run(task, approach)
     assert ("--latency", "0.1") == run.controller[2:4] == run.simulator[2:4]
     assert "--slip" not in run.controller

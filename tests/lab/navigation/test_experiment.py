@@ -20,13 +20,13 @@ from common.errors import UserError
 from common.geometry.world import Box, Obstacle, World, load_world, save_world
 from common.messages.definitions import Belief, Health, Pose, Status, Truth, Twist
 from common.robot.base import Robot
-from lab.experiments.journeys import Journey
 from lab.experiments.lockstep import LockstepRun, RunTrace, _append, _is_final
+from lab.experiments.start_and_goal import StartAndGoal
 from lab.navigation import drive as driven
 from lab.navigation import experiment as driving
 from lab.navigation import shortest_path as shortest
-from lab.navigation.shortest_path import ShortestPaths, Trip, draw_trip, length, load_shortest_paths
-from lab.navigation.worlds import RULES, TripRule, seed_of, world_of
+from lab.navigation.shortest_path import NavigationTask, ShortestPaths, draw_task, length, load_shortest_paths
+from lab.navigation.worlds import RULES, StartGoalRule, seed_of, world_of
 from lab.pages import tables_page as page
 from tests.conftest import ended
 
@@ -91,23 +91,23 @@ def test_clearance_and_no_shortcut(seed):
 @pytest.mark.parametrize("world", ["maze", "office", "twins"])
 def test_valid_trips(world):
     known, _ = load_shortest_paths(world)
-    trips = [draw_trip(world, np.random.default_rng((1, k)), ROBOT) for k in range(25)]
-    for k, trip in enumerate(trips):
-        assert trip == draw_trip(world, np.random.default_rng((1, k)), TURNING)
-        ends = [trip.start[:2], trip.goal]
+    tasks = [draw_task(world, np.random.default_rng((1, k)), ROBOT) for k in range(25)]
+    for k, task in enumerate(tasks):
+        assert task == draw_task(world, np.random.default_rng((1, k)), TURNING)
+        ends = [task.start[:2], task.goal]
         assert known.clearance(ends).min() >= ROBOT.radius + shortest.START_GOAL_MARGIN - 1e-3
-        assert length(np.array(trip.shortest)) >= TripRule().min_length - 1e-3
-        assert trip.shortest[0] == trip.start[:2]
-        assert trip.shortest[-1] == trip.goal
-    assert len({trip.start for trip in trips}) == 25
-    assert np.ptp([trip.start[2] for trip in trips]) > 4  # any heading
+        assert length(np.array(task.shortest)) >= StartGoalRule().min_length - 1e-3
+        assert task.shortest[0] == task.start[:2]
+        assert task.shortest[-1] == task.goal
+    assert len({task.start for task in tasks}) == 25
+    assert np.ptp([task.start[2] for task in tasks]) > 4  # any heading
 
 
 def test_world_too_small(tmp_path):
     cell = tmp_path / "cell.yaml"
     cell.write_text(save_world(World(name="cell", boundary=[(0, 0), (1.5, 0), (1.5, 1.5), (0, 1.5)])))
     with pytest.raises(UserError, match="no two places 2 m apart"):
-        draw_trip(str(cell), np.random.default_rng(0), ROBOT)
+        draw_task(str(cell), np.random.default_rng(0), ROBOT)
 
 
 def truth(number, x, speed=0.0, **more):
@@ -124,7 +124,7 @@ def status(number, state, reason="", goal_seq=1, *, refused=False):
     return Status(stamp_ns=number * 100_000_000, state=state, reason=reason, goal_seq=goal_seq, refused=refused)
 
 
-TRIP = Trip((1.0, 1.0, 0.0), (5.0, 1.0), ((1.0, 1.0), (5.0, 1.0)))
+TASK = NavigationTask((1.0, 1.0, 0.0), (5.0, 1.0), ((1.0, 1.0), (5.0, 1.0)))
 
 
 def a_trace(last="reached", ends_at=4.99):
@@ -151,7 +151,7 @@ def a_trace(last="reached", ends_at=4.99):
 
 
 def test_measurements_of_a_drive():
-    found = driven.measure(a_trace(), TRIP, HALL, ROBOT)
+    found = driven.measure(a_trace(), TASK, HALL, ROBOT)
     assert found["outcome"] == "reached"
     assert found["driven_m"] == pytest.approx(3.99)
     assert found["path_over_shortest"] == pytest.approx(1.0)  # stopping short saves nothing
@@ -177,12 +177,12 @@ def test_measurements_of_a_drive():
 def test_errors_by_state():
     trace = a_trace()
     trace.beliefs[3] = belief(3, 7.0, "localising")
-    found = driven.measure(trace, TRIP, HALL, ROBOT)
+    found = driven.measure(trace, TASK, HALL, ROBOT)
     assert found["longest_untracked_s"] == pytest.approx(0.2)  # from 0.2 to 0.4 s
     assert found["error_max_m"] == pytest.approx(4.0)
     assert found["claimed_error_max_m"] == pytest.approx(0.01)
     assert found["untracked_s"] == pytest.approx(0.3 / 4)  # of four scans since 0.1 s one
-    never = driven.measure(RunTrace(trace.truths, [belief(k, 9.0, "lost") for k in range(5)]), TRIP, HALL, ROBOT)
+    never = driven.measure(RunTrace(trace.truths, [belief(k, 9.0, "lost") for k in range(5)]), TASK, HALL, ROBOT)
     assert never["tracking_s"] is never["error_max_m"] is None
 
 
@@ -203,28 +203,28 @@ def test_clearance_between_scans():
 
 
 def test_outcomes():
-    far = driven.measure(a_trace(ends_at=4.97), TRIP, HALL, ROBOT)
+    far = driven.measure(a_trace(ends_at=4.97), TASK, HALL, ROBOT)
     assert far["outcome"] == "claimed elsewhere"
     assert not far["reached"]
-    late = driven.measure(a_trace("blocked"), TRIP, HALL, ROBOT)
+    late = driven.measure(a_trace("blocked"), TASK, HALL, ROBOT)
     assert late["outcome"] == "too late"
     assert "0.01 m from the goal after 0.4 s; at last blocked" in late["why"]
     trace = a_trace("blocked")
     trace.failure = "controller ended with status 1: x"
-    broken = driven.measure(trace, TRIP, HALL, ROBOT)
+    broken = driven.measure(trace, TASK, HALL, ROBOT)
     assert (broken["outcome"], broken["why"]) == ("failed", trace.failure)
     trace = a_trace()
     why = "goal refused: (5.00, 1.00) in hall is inside something, or off the map"
     trace.statuses[400_000_000] = status(4, "blocked", why, refused=True)
-    assert driven.measure(trace, TRIP, HALL, ROBOT)["outcome"] == "refused"
+    assert driven.measure(trace, TASK, HALL, ROBOT)["outcome"] == "refused"
     trace.health = None
-    assert driven.measure(trace, TRIP, HALL, ROBOT)["step_mean_ms"] is None
+    assert driven.measure(trace, TASK, HALL, ROBOT)["step_mean_ms"] is None
 
 
 def test_worst_trials():
     rows = []
     for number, trace in enumerate([a_trace(), a_trace(ends_at=4.0), a_trace()]):
-        rows.append({"trial": number, **driven.measure(trace, TRIP, HALL, ROBOT)})
+        rows.append({"trial": number, **driven.measure(trace, TASK, HALL, ROBOT)})
     rows[2] |= {"contacts_moving": 0, "contacts_standing": 0, "contact_at": [], "time_over_bound": 3.0}
     summary = driving.summarise(rows)
     assert (summary["trials"], summary["reached"], summary["trials_claimed_elsewhere"]) == (3, 2, 1)
@@ -244,7 +244,9 @@ def test_worst_trials():
 
 
 def test_end_of_a_drive():
-    lockstep_run = LockstepRun(Journey((1.0, 1.0), (5.0, 1.0)), 0.0, "maze", 101, 0, (), 100, ends_with_status=True)
+    lockstep_run = LockstepRun(
+        StartAndGoal((1.0, 1.0), (5.0, 1.0)), 0.0, "maze", 101, 0, (), 100, ends_with_status=True
+    )
     trace, end = RunTrace(), None
     # A possible order: another process's messages about the next scan arrive before this scan's status.
     order = [truth(0, 1.0), status(0, "navigating"), belief(0, 1.0), truth(1, 5.0), belief(1, 5.0), truth(2, 5.0),
@@ -360,8 +362,8 @@ def test_rooms_of_trips():
     assert all(shapely.intersection(free, shapely.box(*room)).area > 10 for room in rooms)
     rng = np.random.default_rng(0)
     for _ in range(20):
-        trip = shortest.draw_trip("twins", rng, Robot())
-        places = shapely.points([trip.start[:2], trip.goal])
+        task = shortest.draw_task("twins", rng, Robot())
+        places = shapely.points([task.start[:2], task.goal])
         assert all(any(shapely.box(*room).covers(place) for room in rooms) for place in places)
 
 
@@ -371,9 +373,9 @@ def test_generated_worlds():
     assert len({job.world_seed for job in jobs[:5]}) == 1
     assert jobs[5].world_seed != jobs[0].world_seed
     for job in jobs[::5]:
-        hall, trip = world_of("hall", job.world_seed), job.trip()
-        assert hall.clearance([trip.start[:2], trip.goal]).max() <= 2.0
-        assert length(np.array(trip.shortest)) >= 10 - 1e-3
+        hall, task = world_of("hall", job.world_seed), job.task()
+        assert hall.clearance([task.start[:2], task.goal]).max() <= 2.0
+        assert length(np.array(task.shortest)) >= 10 - 1e-3
         assert shapely.area(shapely.buffer(hall.free_space, -4.0)) > 20  # out of sight with a range of 4 m
     for seed in (5_000_000, 5_000_001):  # the second one's first building is the same after a half turn
         x, y = world_of("look-alike", seed).center()

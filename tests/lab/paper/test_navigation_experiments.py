@@ -14,8 +14,15 @@ from common.geometry.world import World, load_world
 from common.messages.definitions import Belief, Pose, Truth, Twist
 from common.robot.base import Robot
 from lab.experiments.estimators import ExperimentWorld
-from lab.experiments.journeys import ARRIVAL_DISTANCE, CLEARANCE, Journey, draw_journey, least_time, path_ratio
 from lab.experiments.lockstep import RunTrace, _is_next
+from lab.experiments.start_and_goal import (
+    ARRIVAL_DISTANCE,
+    CLEARANCE,
+    StartAndGoal,
+    draw_start_and_goal,
+    least_time,
+    path_ratio,
+)
 from lab.paper import e3_navigation as navigation
 from lab.paper import step_sizes as stepping
 from lab.paper import teleports
@@ -28,25 +35,27 @@ CORRIDOR = load_world("corridor")
 
 @given(st.integers(0, 10_000), st.floats(2.0, 14.0))
 @settings(max_examples=30)
-def test_valid_journeys(seed, apart):
-    journey = draw_journey(CORRIDOR, np.random.default_rng(seed), ROBOT, apart)
-    assert journey.straight >= apart
-    along = np.linspace(journey.start, journey.goal, 200)
+def test_valid_starts_and_goals(seed, apart):
+    ends = draw_start_and_goal(CORRIDOR, np.random.default_rng(seed), ROBOT, apart)
+    assert ends.straight >= apart
+    along = np.linspace(ends.start, ends.goal, 200)
     assert CORRIDOR.clearance(along).min() >= ROBOT.radius + CLEARANCE - 1e-3  # between places, to a millimetre
-    assert journey == draw_journey(CORRIDOR, np.random.default_rng(seed), ROBOT, apart)
-    assert [float(repr(v)) for v in journey.start] == [round(v, 3) for v in journey.start]
+    assert ends == draw_start_and_goal(CORRIDOR, np.random.default_rng(seed), ROBOT, apart)
+    assert [float(repr(v)) for v in ends.start] == [round(v, 3) for v in ends.start]
 
 
 def test_rejected_pairs():
-    drawn = [draw_journey(CORRIDOR, np.random.default_rng(k), ROBOT) for k in range(60)]
+    drawn = [draw_start_and_goal(CORRIDOR, np.random.default_rng(k), ROBOT) for k in range(60)]
     assert sum(each.obstructed for each in drawn) > 5
     assert sum(each.too_near for each in drawn) > sum(each.obstructed for each in drawn)
     assert len({each.start for each in drawn}) == 60
 
 
-def test_world_without_a_journey():
+def test_world_without_a_start_and_goal():
     with pytest.raises(UserError, match=r"no two places 12 m apart"):
-        draw_journey(World(name="cell", boundary=[(0, 0), (3, 0), (3, 3), (0, 3)]), np.random.default_rng(0), ROBOT)
+        draw_start_and_goal(
+            World(name="cell", boundary=[(0, 0), (3, 0), (3, 3), (0, 3)]), np.random.default_rng(0), ROBOT
+        )
 
 
 def test_least_time():
@@ -77,7 +86,7 @@ def belief(number, x):
 
 def test_measurements_of_a_journey():
     trace = RunTrace([truth(0, 1.0), truth(1, 2.0, contact=True), truth(2, 14.3)], [belief(k, 2.0) for k in range(3)])
-    found = navigation.measure(trace, Journey((1.0, 1.0), (15.0, 1.0)))
+    found = navigation.measure(trace, StartAndGoal((1.0, 1.0), (15.0, 1.0)))
     assert found["reached"]
     assert found["iterations"] == 2
     assert found["contacts"] == 1
@@ -102,13 +111,13 @@ def test_missing_message():
 
 
 def test_estimator_without_a_service(tmp_path):
-    job = navigation.JourneyJob(0, 1, estimators=("particle-filter, heading known",))
+    job = navigation.PaperNavigationJob(0, 1, estimators=("particle-filter, heading known",))
     with pytest.raises(UserError, match="heading known"):
         navigation.run(job, 1, tmp_path, 1, QUIET)
 
 
 def test_e3_through_real_processes(tmp_path):
-    job = navigation.JourneyJob(0, 7, apart=3.0, estimators=("precise",), field=ExperimentWorld(beams=101))
+    job = navigation.PaperNavigationJob(0, 7, apart=3.0, estimators=("precise",), field=ExperimentWorld(beams=101))
     result = navigation.run(job, 1, tmp_path, 1, QUIET)
     summary = result.summary["precise"]
     assert (summary["reached"], summary["trials_with_contact"]) == (1, 0)
@@ -134,7 +143,9 @@ class Linear:
 def linear_travel(steps, start=(2.0, 2.0), goal=(15.0, 2.5), limit=200):
     model = Linear()
     room = World(name="hall", boundary=[(0, 0), (18, 0), (18, 5), (0, 5)])
-    return teleports.travel(Journey(start, goal), steps, model, lambda pose: model.predict(pose)[0], room, 0.0, limit)
+    return teleports.travel(
+        StartAndGoal(start, goal), steps, model, lambda pose: model.predict(pose)[0], room, 0.0, limit
+    )
 
 
 def test_iterations_of_the_paper():

@@ -179,7 +179,7 @@ def test_unusable_scans_are_counted(tmp_path):
     lines[scans[8]] = lines[scans[6]]  # late
     short = lines[scans[9]].split()
     lines[scans[9]] = " ".join([*short[:8], "30", *short[9 : 9 + 30], *short[9 + BEAMS :]])
-    lines.insert(4, "\x1b[0m@@ garbage")
+    lines.insert(4, "\x1b[0m garbage")
     lines.insert(9, "GPS 1 2 3 of no interest")
     log, sweeps = read(write(tmp_path, lines))
     assert dict(log.left_out) == {

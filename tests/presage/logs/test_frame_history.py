@@ -10,7 +10,7 @@ import pytest
 from common.errors import UserError
 from common.messages.ros_messages import Transform, read_rotation
 from presage.logs.frame_history import FrameHistory
-from presage.logs.poses import PoseTrack
+from presage.logs.pose_track import PoseTrack
 
 SECOND = 1_000_000_000
 

@@ -22,9 +22,9 @@ from common.messages.definitions import Goal, Pose, Stamped, Truth, Twist
 from common.messages.topics import BELIEF, GOAL, ODOM, TOPICS, TRUTH, Topic
 from presage.recordings.export import ExportOptions, run_export
 from presage.recordings.foxglove import export_foxglove
+from presage.recordings.foxglove_numbers import FIELDS
 from presage.recordings.foxglove_session import WallClock
 from presage.recordings.foxglove_shapes import ELLIPSE_SCALE_95, ellipse, grid, world_entities
-from presage.recordings.plain_numbers import FIELDS
 from services.recorder.reader import read_recording
 from tests.lab.navigation import drives as driven
 from tests.recorder.sessions import WORLD

@@ -57,7 +57,7 @@ def job(file, mode="global", frame="base_link", estimator="precise", model="lear
     estimator_options = build_estimator_options(
         file, world, estimator, model, models, 0.02, 0, more.pop("initial_pose", "")
     )
-    given = {"fresh": False, "odometry": True, "out": out, **more}
+    given = {"independent_scans": False, "odometry": True, "out": out, **more}
     return LocalizeOptions.of(file, estimator_options, mode, frame, given.pop("reading", Reading()), **given)
 
 
@@ -65,10 +65,10 @@ def errors(rows, path=PATH):
     return np.hypot(*(np.array([[r["x"], r["y"]] for r in rows]) - path[:, :2]).T)
 
 
-@pytest.mark.parametrize("fresh", [False, True])
+@pytest.mark.parametrize("independent_scans", [False, True])
 @pytest.mark.parametrize("model", ["learned", "exact"])
-def test_csv(tmp_path, capsys, fresh, model):
-    localize(job(npz(tmp_path), fresh=fresh, model=model), Console(stderr=True))
+def test_csv(tmp_path, capsys, independent_scans, model):
+    localize(job(npz(tmp_path), independent_scans=independent_scans, model=model), Console(stderr=True))
     rows = list(csv.DictReader(capsys.readouterr().out.splitlines()))  # nothing else on standard output
     assert tuple(rows[0]) == COLUMNS
     assert len(rows) == 10

@@ -18,8 +18,8 @@ from common.messages.definitions import Belief, Pose
 from common.messages.topics import BELIEF, PREDICTION, SCAN, TRUTH
 from presage.recordings.selection import robot_of
 from presage.replay import rerun as shell
-from presage.replay.recorded_session import estimator_settings, recorded_settings, settings_with
-from presage.replay.report import BeliefSeries, compare
+from presage.replay.estimator_comparison import BeliefSeries, compare
+from presage.replay.recorded_settings import estimator_settings, recorded_settings, settings_with
 from presage.replay.rerun import RerunOptions, rerun_command, unused_robot_name
 from services.estimator.settings import EstimatorSettings
 from services.recorder.files.writer import RecordingWriter

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.messages.definitions import Belief, CmdVel, Pose, Status, Twist
-from presage.replay.comparison import MessagePairs, ReplayOutcome
 from presage.replay.goal_times import GoalTimes
+from presage.replay.replay_outcome import MessagePairs, ReplayOutcome
 from presage.replay.service_replay import describe
 
 

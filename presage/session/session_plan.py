@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from common.errors import UserError
-from common.geometry.world import load_world
+from common.geometry.world import World, load_world
 from common.runtime.config import load_settings
 from presage.terminal.options import arguments
 from services.controller.settings import ControllerSettings
@@ -67,10 +67,7 @@ def plan_session(
     loaded_world = load_world(estimator_settings.world)
     if simulated:
         simulator_settings.build_scanner()
-        radius, start = simulator_settings.build_robot().radius, simulator_settings.start_pose()
-        pose = loaded_world.start_pose(radius) if start is None else np.array(start)
-        if (error := loaded_world.placement_error(pose, radius)) is not None:
-            raise UserError(f"start {error} (settings start and radius)")
+        _check_start(simulator_settings, loaded_world)
     if not mapping:
         check_options(estimator_options(estimator_settings), loaded_world)
     return SessionPlan(
@@ -81,3 +78,11 @@ def plan_session(
         simulator_settings,
         estimator_settings,
     )
+
+
+def _check_start(settings: SimulatorSettings, world: World) -> None:
+    """Raises UserError if the simulated robot has no room at its start."""
+    radius, start = settings.build_robot().radius, settings.start_pose()
+    pose = world.start_pose(radius) if start is None else np.array(start)
+    if (error := world.placement_error(pose, radius)) is not None:
+        raise UserError(f"start {error} (settings start and radius)")

@@ -21,7 +21,7 @@ MAX_DRAWS = 20_000
 
 
 @dataclass(frozen=True)
-class Journey:
+class StartAndGoal:
     """Start and goal, in m. The robot begins at rest and must come within `ARRIVAL_DISTANCE` of the goal."""
 
     start: tuple[float, float]
@@ -35,9 +35,9 @@ class Journey:
         return float(np.hypot(self.goal[0] - self.start[0], self.goal[1] - self.start[1]))
 
 
-def draw_journey(
+def draw_start_and_goal(
     world: World, rng: np.random.Generator, robot: Robot, apart: float = MIN_DISTANCE, *, free: bool = True
-) -> Journey:
+) -> StartAndGoal:
     """Draws uniformly from pairs of places that are ``apart`` m or more apart with a free straight line between them.
 
     With ``free`` False the line may be obstructed. Coordinates are rounded to whole millimetres, so that they pass
@@ -55,7 +55,7 @@ def draw_journey(
                 obstructed += 1
             else:
                 ends = [(float(x), float(y)) for x, y in (start, goal)]
-                return Journey(ends[0], ends[1], too_near, obstructed)
+                return StartAndGoal(ends[0], ends[1], too_near, obstructed)
     raise UserError(
         f"world {world.name!r}: no two places {apart:g} m apart with a free straight line for the robot between them"
     )

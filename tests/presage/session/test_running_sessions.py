@@ -10,7 +10,7 @@ import pytest
 from common.bus.bus import DEFAULT_ENDPOINT
 from common.errors import UserError
 from presage.session import credentials as secure
-from presage.session.running import OBSERVER, announced, find_session, link_of, runtime_folder
+from presage.session.running_sessions import OBSERVER, announced, find_session, link_of, runtime_folder
 
 HERE = "tcp/127.0.0.1:7001"
 

@@ -16,11 +16,10 @@ from common.errors import UserError
 from common.geometry import se2
 from common.geometry.se2 import Array
 from common.messages.definitions import Belief
-from presage.plotting.style import COLOURS, figure_of, legend_below, log_metres
+from presage.plotting.style import COLOURS, MIN_LOG_VALUE, figure_of, legend_below, log_metres
 from presage.recordings.session_summary import statistic_of_finite
 
 RECORDED_COLOUR = "#444444"
-MIN_LOG_VALUE = 1e-4  # m, lower limit of the logarithmic axis
 
 
 @dataclass

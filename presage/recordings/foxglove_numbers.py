@@ -1,4 +1,4 @@
-"""Numbers for plots, with units from the schema."""
+"""Foxglove's channels of plain numbers, for its plots; their JSON schemas state the units."""
 
 from __future__ import annotations
 

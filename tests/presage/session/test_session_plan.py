@@ -6,7 +6,7 @@ import pytest
 
 from common.errors import UserError
 from common.geometry.world import load_world, save_world
-from presage.session.preflight import plan_session
+from presage.session.session_plan import plan_session
 
 
 def plan(world="", drive="", simulator=(), estimator=(), *, config=None, mapping=False):

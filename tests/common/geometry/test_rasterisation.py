@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from common.geometry.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from common.geometry.rasterize import rasterise
+from common.geometry.rasterisation import rasterise
 from common.geometry.world import Obstacle, World, load_world
 from tests.common.geometry.maps import HUT, TURNED
 

@@ -1,4 +1,4 @@
-"""Reads a recording's messages by kind, with bounded memory."""
+"""The messages of a recorded session by type, with bounded memory."""
 
 from __future__ import annotations
 
