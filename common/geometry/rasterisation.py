@@ -26,7 +26,8 @@ def classify_points(
         covered = shapely.contains_xy(world.furniture, x, y)
         return (values == FREE) & ~covered, (values == OCCUPIED) | covered
     free = shapely.contains_xy(world.free_space, x, y)
-    around = shapely.Polygon(world.boundary).buffer(1.5 * cell, join_style="mitre")
+    rooms = shapely.multipolygons([shapely.Polygon(ring) for ring in world.wall_rings])
+    around = rooms.buffer(1.5 * cell, join_style="mitre")
     return free, shapely.contains_xy(around, x, y) & ~free
 
 

@@ -1,4 +1,4 @@
-"""A world: walls and furniture in metres, or a ROS map; free space and exact ranges."""
+"""A world: walls and furniture in metres, or a ROS map, of one floor or several; free space and exact ranges."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ import yaml
 from pydantic import Field, ValidationError, model_validator
 
 from common.errors import UserError
-from common.geometry import ros_map
+from common.geometry import building, ros_map
+from common.geometry.floors import Floor, Lift, bounds_of, check_floors, corners_of, no_floor
 from common.geometry.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
-from common.geometry.shapes import Box, Circle, Degrees, Obstacle, Ring, WorldPart, check_ring
+from common.geometry.shapes import Box, Circle, Degrees, Obstacle, Ring, WorldName, WorldPart, check_ring
 from common.geometry.yaml_text import TooLargeError, parse_yaml
 from common.limits import Coordinate
 
@@ -42,24 +43,33 @@ class Start(WorldPart):
 
 
 class World(WorldPart):
-    """A world. Free space is the inside of the boundary, or the free cells of the grid, without the obstacles.
+    """A world. Free space is the inside of the walls, or the free cells of the grid, without the obstacles.
 
-    The edge of a grid is not a wall.
+    The walls are the boundary, or those of the floors. The edge of a grid is not a wall.
     """
 
-    name: Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[\w.-]+$")]
-    boundary: Ring  # m, the walls; with a grid, the grid's edge, which may be left out
+    name: WorldName
+    boundary: Ring  # m, the walls; with a grid its edge, with floors a box around them: both may be left out
     obstacles: Annotated[list[Obstacle], Field(max_length=10_000)] = []  # noqa: RUF012 - pydantic copies it
     start: Start | None = None
     grid: Annotated[OccupancyGrid | None, Field(exclude_if=lambda grid: grid is None)] = None
     # a ROS map; worlds without one are sent without this field
+    floors: Annotated[list[Floor], Field(max_length=100, exclude_if=lambda floors: not floors)] = []  # noqa: RUF012
+    # the floors of a building, side by side in map
+    lifts: Annotated[list[Lift], Field(max_length=1000, exclude_if=lambda lifts: not lifts)] = []  # noqa: RUF012
+    # place (x m, y m) of each lift by the name of the floor, in the floor's frame
 
     @model_validator(mode="before")
     @classmethod
-    def _boundary_from_grid(cls, data: Any) -> Any:
-        if isinstance(data, dict) and data.get("grid") is not None and "boundary" not in data:
+    def _default_boundary(cls, data: Any) -> Any:
+        if not isinstance(data, dict) or "boundary" in data:
+            return data
+        if data.get("grid") is not None:
             grid = OccupancyGrid.model_validate(data["grid"])
             return {**data, "grid": grid, "boundary": grid.corners()}
+        if data.get("floors"):
+            floors = [Floor.model_validate(floor) for floor in data["floors"]]
+            return {**data, "floors": floors, "boundary": _box_around(floors)}
         return data
 
     @model_validator(mode="after")
@@ -69,12 +79,50 @@ class World(WorldPart):
             len(self.boundary) == 4 and np.allclose(self.boundary, self.grid.corners(), rtol=0, atol=1e-6)
         ):
             raise ValueError("the boundary of a world with a grid is the grid's edge: leave it out")
+        if self.floors and self.grid is None and self.boundary != _box_around(self.floors):
+            raise ValueError("the boundary of a world with floors is the box around them: leave it out")
+        check_floors(self.floors, self.lifts)
         return self
 
     def with_obstacles(self, obstacles: list[Obstacle]) -> World:
         """The same world with other obstacles."""
         # Not a copy, which would keep the cached geometry.
-        return World(name=self.name, boundary=self.boundary, obstacles=obstacles, start=self.start, grid=self.grid)
+        return World(
+            name=self.name,
+            boundary=self.boundary,
+            obstacles=obstacles,
+            start=self.start,
+            grid=self.grid,
+            floors=self.floors,
+            lifts=self.lifts,
+        )
+
+    @property
+    def wall_rings(self) -> list[Ring]:
+        """The closed rings of walls in m: the boundary, or that of each floor; none in a world with a grid."""
+        if self.grid is not None:
+            return []
+        return [floor.boundary for floor in self.floors] or [self.boundary]
+
+    def floor_at(self, place: npt.ArrayLike) -> Floor | None:
+        """The floor on which a point (2,) or pose (3,) in map is; None between floors, and in a world without any."""
+        return next((floor for floor in self.floors if floor.contains(place)), None)
+
+    def floor(self, name: str) -> Floor:
+        """The floor of that name; raises UserError if there is none."""
+        for floor in self.floors:
+            if floor.name == name:
+                return floor
+        if not self.floors:
+            raise UserError(f"there is no floor {name!r}: world {self.name!r} has no floors")
+        raise UserError(no_floor(name, [floor.name for floor in self.floors]))
+
+    def to_map(self, places: npt.ArrayLike, floor: str) -> Array:
+        """Points (..., 2) or poses (..., 3) in the frame of a floor, in map; if its name is empty, they are in map.
+
+        Raises UserError if there is no floor of that name.
+        """
+        return self.floor(floor).to_map(places) if floor else np.asarray(places, float)
 
     @functools.cached_property
     def segments(self) -> Array:
@@ -84,7 +132,7 @@ class World(WorldPart):
     @functools.cached_property
     def outlines(self) -> Array:
         """(S, 4) the `segments` without those of the grid's cells."""
-        rings = [] if self.grid is not None else [np.array(self.boundary)]
+        rings = [np.array(ring) for ring in self.wall_rings]
         rings += [ring for o in self.obstacles if (ring := o.ring()) is not None]
         return np.concatenate([np.zeros((0, 4)), *(np.hstack([ring, np.roll(ring, -1, axis=0)]) for ring in rings)])
 
@@ -108,7 +156,12 @@ class World(WorldPart):
     @functools.cached_property
     def free_space(self) -> shapely.Geometry:
         """The free area."""
-        room = shapely.Polygon(self.boundary) if self.grid is None else self.grid.shapes.free_space
+        if self.grid is not None:
+            room = self.grid.shapes.free_space
+        elif self.floors:
+            room = shapely.union_all([shapely.Polygon(ring) for ring in self.wall_rings])
+        else:
+            room = shapely.Polygon(self.boundary)
         return shapely.difference(room, self.furniture)
 
     @functools.cached_property
@@ -129,9 +182,7 @@ class World(WorldPart):
     @property
     def bounds(self) -> tuple[float, float, float, float]:
         """x0, y0, x1, y1 in m of the boundary's bounding box."""
-        corners = np.array(self.boundary)
-        (x0, y0), (x1, y1) = corners.min(axis=0), corners.max(axis=0)
-        return float(x0), float(y0), float(x1), float(y1)
+        return bounds_of(self.boundary)
 
     def center(self) -> Array:
         """(2,) centre of the bounding box in m, at which the paper's belief starts."""
@@ -287,19 +338,35 @@ class _Area:
         return np.where(shapely.contains(self._area, where), distance, -distance)
 
 
+def _box_around(floors: list[Floor]) -> list[tuple[float, float]]:
+    return corners_of(bounds_of([corner for floor in floors for corner in floor.boundary]))
+
+
 def known_worlds() -> list[str]:
     """Names of the shipped worlds."""
     return sorted(path.stem for path in FOLDER.glob("*.yaml"))
 
 
 def load_world(name: str) -> World:
-    """The shipped world of that name, or the world or ROS map in that file; raises UserError if it is invalid."""
-    path = FOLDER / f"{name}.yaml" if name in known_worlds() else Path(name)
+    """The shipped world of that name, or the world, building or ROS map in that file.
+
+    Raises UserError if it is invalid.
+    """
+    return _load(name, Path())
+
+
+def _load(name: str, folder: Path, *, is_floor: bool = False) -> World:
+    """`load_world` of a file relative to ``folder``; a floor must not be a building, which might contain itself."""
+    path = FOLDER / f"{name}.yaml" if name in known_worlds() else folder / name
     try:
         data: Any = parse_yaml(path.read_text(encoding="utf-8"))
+        if building.is_building(data):
+            if is_floor:
+                raise UserError("a floor cannot be a building with floors of its own")
+            return _load_building(path, data)
         return World.model_validate(ros_map.read_map(path, data) if ros_map.is_map(data) else data)
     except (FileNotFoundError, NotADirectoryError):
-        raise UserError(f"no world {name!r}: give a file or one of {', '.join(known_worlds())}") from None
+        raise UserError(f"no world {str(path)!r}: give a file or one of {', '.join(known_worlds())}") from None
     except UnicodeDecodeError:
         image = path.suffix.lower() in ros_map.IMAGES
         hint = (
@@ -315,6 +382,17 @@ def load_world(name: str) -> World:
         raise UserError(f"world {path}: {error}") from None
     except NOT_YAML as error:
         raise UserError(f"world {path}: not valid YAML ({' '.join(str(error).split())})") from None
+
+
+def _load_building(path: Path, data: dict[str, Any]) -> World:
+    file = building.BuildingFile.model_validate(data)
+    floors = {}
+    for name, world in file.floors.items():
+        try:
+            floors[name] = _load(world, path.parent, is_floor=True)
+        except UserError as error:
+            raise UserError(f"world {path}: floor {name!r}: {error}") from None
+    return World.model_validate(building.lay_out(file, floors))
 
 
 def save_world(world: World) -> str:

@@ -7,12 +7,13 @@ comments beside the fields.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
+from common.errors import UserError
 from common.geometry.occupancy_grid import OccupancyGrid
 from common.limits import Angle, Distance, PositiveAngle, PositiveDistance
 from common.messages.pose import Pose as Pose  # noqa: PLC0414 - most modules import it from here
@@ -33,6 +34,9 @@ from common.messages.wire import (
     Text,
 )
 from common.robot.motion_distortion import beam_times, sweep_time
+
+if TYPE_CHECKING:
+    from common.geometry.world import World
 
 GOAL_TOLERANCE_M = 0.02  # default of Goal.tolerance
 
@@ -134,6 +138,7 @@ class Belief(Stamped):
     estimator: Name = ""
     field_version: Count = 0  # of the field that was learned while driving, see `field`; 0 is the original model
     frame_id: Name = "map"
+    map_id: Name = ""  # the floor on which the pose is; empty between floors, and in a world without floors
 
     @model_validator(mode="after")
     def _shapes(self) -> Belief:
@@ -181,12 +186,22 @@ class LearnedField(Stamped):
 class Goal(Stamped):
     """The pose that the robot is to reach."""
 
-    pose: Pose  # base_link in map
+    pose: Pose  # base_link in map, or in the frame of the floor map_id
     tolerance: PositiveDistance = GOAL_TOLERANCE_M  # m, the goal is reached within this distance
     yaw_tolerance: PositiveAngle | None = None  # rad, tolerance of the final heading; nil accepts any heading
     approach: Angle | None = None  # rad in map, direction of motion over the last 0.6 m; nil accepts any direction
     cancel: bool = False  # drop the goal, end an exploration, and stop
     explore: bool = False  # explore what is unknown in the mapper's map, and return; the pose is not used
+    map_id: Name = ""  # the floor in whose frame pose and approach are; empty for map
+
+    def in_map(self, world: World | None) -> Goal:
+        """The same goal with its pose in map; raises UserError if ``world`` has no floor `map_id`."""
+        if not self.map_id:
+            return self
+        if world is None:
+            raise UserError(f"there is no floor {self.map_id!r}: there is no map with floors")
+        pose = Pose.of(world.to_map(self.pose.array(), self.map_id))
+        return self.model_copy(update={"pose": pose, "map_id": ""})
 
 
 class Drive(Stamped):

@@ -10,7 +10,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from common.geometry import occupancy_grid, world
+from common.geometry import floors, occupancy_grid, world
 from common.geometry import shapes as furniture
 from common.limits import MAX_BEAMS, MAX_COORDINATE_M, MAX_DISTANCE_M
 from common.messages import definitions as messages
@@ -73,7 +73,7 @@ def _queries() -> list[str]:
 
 def _models() -> list[type[BaseModel]]:
     found: list[type[BaseModel]] = []
-    for module in (pose, messages, requests, furniture, world, occupancy_grid, scanner, robot):
+    for module in (pose, messages, requests, furniture, world, floors, occupancy_grid, scanner, robot):
         models = [c for c in vars(module).values() if inspect.isclass(c) and issubclass(c, BaseModel)]
         found += [
             c

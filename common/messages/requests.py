@@ -35,14 +35,16 @@ class Reply(Message):
 class PoseRequest(Request):
     """Move the robot to a pose."""
 
-    pose: Pose  # base_link in map
+    pose: Pose  # base_link in map, or in the frame of the floor map_id
+    map_id: Name = ""  # a floor; empty for map
 
 
 class LocaliseRequest(Request):
     """Restart localisation, from a known pose or globally."""
 
-    pose: Pose | None = None  # base_link in map; nil searches the whole map
+    pose: Pose | None = None  # base_link in map, or in the frame of the floor map_id; nil searches the whole map
     heading_known: bool = True  # whether pose.yaw means anything
+    map_id: Name = ""  # a floor; empty for map
 
 
 class ResetRequest(Request):

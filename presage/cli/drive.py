@@ -19,6 +19,10 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
+Floor = Annotated[
+    str, typer.Option(help="Floor in whose frame the place is (docs/maps.md). Defaults to the frame of the whole map.")
+]
+
 
 def _number(text: str) -> float:
     try:
@@ -49,6 +53,7 @@ def goal(
     approach: Annotated[
         float | None, typer.Option(help="Direction of motion over the last 0.6 m, deg. Defaults to any direction.")
     ] = None,
+    floor: Floor = "",
     wait: Annotated[
         bool, typer.Option("--wait", help="Wait until the goal is reached, refused, or blocked for 30 s.")
     ] = False,
@@ -56,7 +61,8 @@ def goal(
 ) -> None:
     """Send the robot to a goal, or cancel its goal.
 
-    Examples: `presage goal 15 1.5 --wait`; `presage goal 15 1.5 90`; `presage goal --cancel`. To dock within 3 mm and
+    Examples: `presage goal 15 1.5 --wait`; `presage goal 15 1.5 90`; `presage goal --cancel`; in a building with floors
+    `presage goal 3 2 --floor first`. To dock within 3 mm and
     0.5 degrees: `presage goal 15 1.5 90 --approach 90 --tolerance 0.003 --yaw-tolerance 0.5`.
     """
     from common.messages.definitions import Goal
@@ -78,6 +84,7 @@ def goal(
         yaw_tolerance=None if yaw is None else float(np.deg2rad(yaw_tolerance)),
         approach=None if approach is None else float(se2.wrap(np.deg2rad(approach))),
         cancel=cancel,
+        map_id=floor,
     )
     raise typer.Exit(send_goal(chosen_link(context), request, console, wait=wait))
 
@@ -103,6 +110,7 @@ def teleport(
     x: Annotated[float, typer.Argument(help="x in the map, m.")],
     y: Annotated[float, typer.Argument(help="y in the map, m.")],
     yaw: Annotated[float, typer.Argument(parser=_number, help="Heading, deg, counter-clockwise from x.")] = 90.0,
+    floor: Floor = "",
 ) -> None:
     """Move the simulated robot to another place, without any trace in its odometry.
 
@@ -111,7 +119,7 @@ def teleport(
     """
     from presage.live.commands import teleport as run
 
-    run(chosen_link(context), _pose(x, y, yaw), console)
+    run(chosen_link(context), _pose(x, y, yaw), console, floor=floor)
 
 
 @app.command(
@@ -126,6 +134,7 @@ def relocalise(
     ] = None,
     y: Annotated[float | None, typer.Argument(help="y in the map, m.")] = None,
     yaw: Annotated[float | None, typer.Argument(parser=_number, help="Heading, deg. Defaults to any heading.")] = None,
+    floor: Floor = "",
 ) -> None:
     """Reset the estimator and localise again, near a given position or globally.
 
@@ -135,8 +144,10 @@ def relocalise(
 
     if (x is None) != (y is None):
         raise UserError("a position is two numbers, X Y in m")
+    if floor and x is None:
+        raise UserError("--floor needs a position on the floor, X Y in m")
     pose = _pose(x, y, yaw or 0.0) if x is not None and y is not None else None
-    run(chosen_link(context), pose, console, heading_known=yaw is not None)
+    run(chosen_link(context), pose, console, heading_known=yaw is not None, floor=floor)
 
 
 @app.command("save-map", rich_help_panel="Drive", short_help="Save the map that is being built.")

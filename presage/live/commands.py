@@ -66,7 +66,7 @@ def send_goal(link: Link, goal: Goal, console: Console, *, wait: bool) -> int:
             raise UserError("the controller did not acknowledge the goal within 3 s")
         if status.state == "blocked":
             raise UserError(status.reason)
-        console.print(f"going to ({goal.pose.x:g}, {goal.pose.y:g})")
+        console.print(f"going to {_place(goal.pose, goal.map_id)}")
         return _follow(messages, goal, console) if wait else 0
 
 
@@ -101,14 +101,21 @@ def _next_status(messages: LatestMessages, console: Console) -> Status | None:
     return status
 
 
-def teleport(link: Link, pose: Pose, console: Console) -> None:
-    """Moves the simulated robot; raises UserError with the reason if the simulator refuses."""
+def _place(pose: Pose, floor: str) -> str:
+    return f"({pose.x:g}, {pose.y:g})" + (f" on floor {floor!r}" if floor else "")
+
+
+def teleport(link: Link, pose: Pose, console: Console, *, floor: str = "") -> None:
+    """Moves the simulated robot to a pose in map, or in the frame of a floor.
+
+    Raises UserError with the reason if the simulator refuses.
+    """
     with session_bus(link) as bus:
-        reply = bus.query(TELEPORT, PoseRequest(pose=pose), Reply)
+        reply = bus.query(TELEPORT, PoseRequest(pose=pose, map_id=floor), Reply)
     if not reply.ok:
         raise UserError(f"refused: {reply.reason}")
     console.print(
-        f"moved to ({pose.x:g}, {pose.y:g}), {np.rad2deg(pose.yaw):g} deg; the estimator is not informed",
+        f"moved to {_place(pose, floor)}, {np.rad2deg(pose.yaw):g} deg; the estimator is not informed",
         soft_wrap=True,
     )
 
@@ -221,13 +228,16 @@ def echo(link: Link, name: str, count: int, console: Console, *, full: bool) -> 
     return 0
 
 
-def relocalise(link: Link, pose: Pose | None, console: Console, *, heading_known: bool = True) -> None:
-    """Resets the estimator's belief; raises UserError with the reason if the estimator refuses."""
+def relocalise(link: Link, pose: Pose | None, console: Console, *, heading_known: bool = True, floor: str = "") -> None:
+    """Resets the estimator's belief; the pose is in map, or in the frame of a floor.
+
+    Raises UserError with the reason if the estimator refuses.
+    """
     with session_bus(link) as bus:
-        reply = bus.query(LOCALISE, LocaliseRequest(pose=pose, heading_known=heading_known), Reply)
+        reply = bus.query(LOCALISE, LocaliseRequest(pose=pose, heading_known=heading_known, map_id=floor), Reply)
     if not reply.ok:
         raise UserError(f"refused: {reply.reason}")
-    console.print("localising again " + (f"from ({pose.x:g}, {pose.y:g})" if pose else "from the initial pose"))
+    console.print("localising again " + (f"from {_place(pose, floor)}" if pose else "from the initial pose"))
 
 
 def save_map(link: Link, name: str, console: Console) -> None:

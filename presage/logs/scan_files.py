@@ -15,6 +15,7 @@ from rich.console import Console
 
 from common.errors import UserError
 from common.geometry.se2 import Array
+from common.geometry.world import World
 from common.messages.definitions import CmdVel, Goal, Odom, Scan, Stamped, Truth
 from common.messages.topics import CMD_VEL, GOAL, ODOM, SCAN, TRUTH
 from common.robot.ranges import ranges_for_localisation
@@ -168,6 +169,7 @@ def mount_assumed(recording: Recording) -> bool:
 
 def _read_recording(path: Path) -> Scans:
     recording = read_recording(path)
+    world = recording.world()
     scans: list[Scan] = []
     keys: list[tuple[int, int]] = []  # of each scan
     odoms: dict[tuple[int, int], Array] = {}
@@ -188,7 +190,7 @@ def _read_recording(path: Path) -> Scans:
         elif isinstance(message, CmdVel):
             command = message.twist.array()
         elif isinstance(message, Goal):
-            goal = unknown if message.cancel or message.explore else message.pose.array()
+            goal = unknown if message.cancel or message.explore else _goal_pose(message, world)
     if recording.warning:  # damage is only found while reading
         print(f"warning: {recording.warning}", file=sys.stderr)
     if not scans:
@@ -197,7 +199,6 @@ def _read_recording(path: Path) -> Scans:
     alike = [s for s in scans if len(s.ranges) == len(first.ranges) and s.mount == first.mount]
     if len(alike) != len(scans):
         raise UserError(f"{path}: the scanner changes during the recording; only one scanner per file is supported")
-    world = recording.world()
     return Scans(
         replace(ScannerGeometry.of_scan(first), mount_assumed=mount_assumed(recording)),
         np.array([ranges_for_localisation(s.ranges) for s in scans]),
@@ -212,6 +213,14 @@ def _read_recording(path: Path) -> Scans:
         stamps_ns=np.array([s.stamp_ns for s in scans], np.int64),
         time_increment=first.time_increment,
     )
+
+
+def _goal_pose(goal: Goal, world: World | None) -> Array:
+    """Pose (3,) of a goal in map; NaN if it was refused because its floor is unknown."""
+    try:
+        return goal.in_map(world).pose.array()
+    except UserError:
+        return np.full(3, np.nan)
 
 
 class _StampCounter:

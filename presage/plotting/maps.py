@@ -17,13 +17,14 @@ WALL_THICKNESS_M = 0.12  # as drawn
 
 
 def draw_walls(axes: Axes, world: World, wall: str) -> None:
-    """Draws a ROS map, or the boundary of a world as walls of the colour ``wall``, below everything else; axes in m."""
+    """Draws a ROS map, or the walls of a world in the colour ``wall``, below everything else; axes in m."""
     if world.grid is not None:
         draw_cells(axes, world.grid, wall)
         return
-    outside = shapely.Polygon(world.boundary).buffer(WALL_THICKNESS_M, join_style="mitre")
-    axes.add_patch(Polygon(shapely.get_coordinates(outside.exterior), facecolor=wall, edgecolor="none", zorder=0.1))
-    axes.add_patch(Polygon(world.boundary, closed=True, facecolor="white", edgecolor="none", zorder=0.2))
+    for ring in world.wall_rings:
+        outside = shapely.Polygon(ring).buffer(WALL_THICKNESS_M, join_style="mitre")
+        axes.add_patch(Polygon(shapely.get_coordinates(outside.exterior), facecolor=wall, edgecolor="none", zorder=0.1))
+        axes.add_patch(Polygon(ring, closed=True, facecolor="white", edgecolor="none", zorder=0.2))
 
 
 def draw_cells(axes: Axes, grid: OccupancyGrid, wall: str) -> None:

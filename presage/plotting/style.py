@@ -93,8 +93,8 @@ def world_map(axes: Axes, world: World) -> None:
     """Draws the walls and furniture of a world; axes in m."""
     if world.grid is not None:
         draw_cells(axes, world.grid, "black")
-    else:
-        axes.add_patch(Polygon(np.array(world.boundary), fill=False, edgecolor="black", linewidth=1.2))
+    for ring in world.wall_rings:
+        axes.add_patch(Polygon(np.array(ring), fill=False, edgecolor="black", linewidth=1.2))
     for obstacle in world.obstacles:
         outline = shapely.get_coordinates(obstacle.shape())
         axes.add_patch(Polygon(outline, facecolor="#BBBBBB", edgecolor="black", linewidth=0.6))

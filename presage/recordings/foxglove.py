@@ -109,7 +109,7 @@ def _write(recording: Recording, robot: str, writer: Writer, console: Console) -
     believed, true = _paths(recording, robot, console)
     for converted in static_messages(recording.world(), recording.robot(), believed, true, recording.start_ns):
         channels.write(converted)
-    converter = SessionConverter(pose_source)
+    converter = SessionConverter(pose_source, recording.world())
     total = sum(counts[key] for key in keys)
     for topic, message, raw in with_progress(entries(recording, robot), total, "foxglove", console):
         for converted in converter.convert(topic, message, raw):

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +25,7 @@ from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletio
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import Message as Protobuf
 
+from common.errors import UserError
 from common.geometry.se2 import Array, between, compose
 from common.geometry.world import World
 from common.messages.definitions import (
@@ -106,9 +108,9 @@ def pose_source_of(names: set[str]) -> str:
 class SessionConverter:
     """Converts messages of presage to Foxglove messages."""
 
-    def __init__(self, pose_source: str) -> None:
+    def __init__(self, pose_source: str, world: World | None) -> None:
         """``pose_source`` is belief, truth or odom; see the docstring of the module."""
-        self.pose_source = pose_source
+        self.pose_source, self._world = pose_source, world
         self.left_out: Counter[str] = Counter()  # messages of unsupported topics, by topic
         self._clock = WallClock()
         self._odoms, self._truths = RecentValues(), RecentValues()
@@ -194,6 +196,8 @@ class SessionConverter:
             yield "/goal/shape", SceneUpdate(deletions=[SceneEntityDeletion(timestamp=time, id="goal")])
             yield from self._log("goal", f"cancelled {logged}", "the goal was cancelled", logged)
             return
+        with suppress(UserError):  # the controller refused it
+            goal = goal.in_map(self._world)
         self._goal = goal.pose.array()
         yield "/goal", shapes.pose_in("map", self._goal, logged)
         entity = shapes.disc("map", "goal", self._goal, goal.tolerance, 0.02, shapes.GOAL, 0.5, logged)

@@ -214,9 +214,9 @@ def path_entity(name: str, path: Array, rgb: Sequence[float], ns: int) -> SceneE
 def world_entities(world: World, ns: int) -> list[SceneEntity]:
     """Walls and furniture in map; the thickness of walls extends away from free space."""
     walls = SceneEntity(timestamp=time_of(ns), frame_id="map", id="walls", frame_locked=True)
-    if world.grid is None:
-        walls.cubes.extend(_slabs(np.array(world.boundary), WALL, outside=True))
-    else:  # a ROS map has thousands of walls: draw only their top edges, as one shape
+    for wall in world.wall_rings:
+        walls.cubes.extend(_slabs(np.array(wall), WALL, outside=True))
+    if world.grid is not None:  # a ROS map has thousands of walls: draw only their top edges, as one shape
         edges = line(world.grid.shapes.walls.reshape(-1, 2), WALL, z=WALL_HEIGHT)
         edges.type = LinePrimitive.LINE_LIST
         walls.lines.append(edges)

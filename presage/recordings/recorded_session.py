@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from common.errors import UserError
 from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.world import World
@@ -179,6 +181,8 @@ class _Gatherer:
             handler(message, logged)
 
     def _goal(self, goal: Goal, _: int) -> None:
+        with suppress(UserError):  # the controller refused it
+            goal = goal.in_map(self.session.world)
         self.session.goals.append(goal)
         self.session.goal_times_ns.append(self._last_stamp_ns)  # the goal's own stamp may be of another clock
 

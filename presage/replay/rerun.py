@@ -23,6 +23,7 @@ from typing import Any
 from rich.console import Console
 
 from common.errors import UserError
+from common.geometry.world import load_world
 from common.log import set_up_logging
 from common.messages.definitions import Belief, Prediction, Scan, Stamped
 from common.messages.topics import BELIEF, PREDICTION, SCAN, Topic, topic_of
@@ -125,7 +126,7 @@ def write_recording(
             writer.attachment(name, data, "application/octet-stream", recording.start_ns)
         facts = {"config": json.dumps(settings.effective()), "file": recording.path.name, **versions()}
         writer.metadata(f"rerun:{alias}", facts)
-        series = _copy(recording, robot, alias, settings.estimator, scans, localised, writer)
+        series = _copy(recording, robot, alias, settings, scans, localised, writer)
         writer.finish()
     except BaseException:
         writer.finish().unlink(missing_ok=True)
@@ -144,12 +145,13 @@ def _copy(
     recording: Recording,
     robot: str,
     alias: str,
-    estimator: str,
+    settings: EstimatorSettings,
     scans: Scans,
     localised: Iterator[TimedBelief],
     writer: RecordingWriter,
 ) -> tuple[BeliefSeries, BeliefSeries]:
     """Copies all messages, and writes each new belief after the recorded one, or else before the next scan."""
+    estimator, world = settings.estimator, load_world(settings.world)
     old, new = BeliefSeries(), BeliefSeries(estimator)
     stamps = [] if scans.stamps_ns is None else scans.stamps_ns.tolist()
     pending: list[tuple[Topic, Belief | Prediction]] = []  # of the last scan
@@ -172,7 +174,7 @@ def _copy(
         if isinstance(message, Scan) and len(new.stamps) < len(stamps) and message.stamp_ns == stamps[len(new.stamps)]:
             scan_published_ns, scan_logged_ns = raw.published_ns, raw.logged_ns
             timed = next(localised)
-            belief = belief_message(message, timed.posterior, estimator)
+            belief = belief_message(message, timed.posterior, estimator, world)
             new.add(belief, timed.update_ms)
             pending += [(PREDICTION, prediction_message(message, timed.posterior)), (BELIEF, belief)]
         elif isinstance(message, Belief):

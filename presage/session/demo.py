@@ -111,6 +111,8 @@ def _choose_goal(demo: DemoOptions, world: World) -> tuple[float, float]:
     if demo.goal is None:
         _, y0, _, y1 = world.bounds
         free = world.sample_free(2000, np.random.default_rng(demo.seed), robot.radius + 0.3)
+        if (floor := world.floor_at(start)) is not None:
+            free = free[[floor.contains(place) for place in free]]
         aligned = free[np.abs(free[:, 1] - start[1]) < 0.1 * (y1 - y0)]  # preset paper drives in a straight line
         farthest = aligned[np.argmax(np.abs(aligned[:, 0] - start[0]))] if len(aligned) else free[0]
         return (15.5, float(start[1])) if world.name == "corridor" else (float(farthest[0]), float(farthest[1]))

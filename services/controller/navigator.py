@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from common.errors import UserError
 from common.geometry import se2
 from common.messages.definitions import Belief, CmdVel, Drive, Exploration, Goal, PolicyEnergy, Scan, Status
 from common.robot.base import Robot
@@ -15,14 +16,17 @@ from common.runtime import safety
 from services.controller.docking import STANDING_TIME_S, Docking
 from services.controller.explorer import Explorer
 from services.controller.goal_state import GoalState, Phase
+from services.controller.lifts import LiftRide, plan_ride
 from services.controller.manual_drive import ManualDrive
 from services.controller.policies.decision import Decision, Policy
+from services.controller.policies.goal_check import wall_refusal
 from services.controller.policies.motion_model import delay_until_effect, is_moving, turn_rate
 from services.controller.policies.paper_action import ActionParameters
 from services.controller.policies.straight_line import StraightLinePolicy
 from services.controller.velocity_command import VelocityCommand
 
 if TYPE_CHECKING:
+    from common.geometry.floors import Floor
     from common.geometry.se2 import Array
     from common.geometry.world import World
     from services.controller.growing_map import PlannedMap
@@ -38,7 +42,7 @@ class Navigator:
 
     robot: Robot = field(default_factory=Robot)
     parameters: ActionParameters = field(default_factory=ActionParameters)  # of preset `paper`
-    world: World | None = None  # lets preset `paper` refuse goals inside walls; without it any goal is accepted
+    world: World | None = None  # for floors, and to refuse goals inside walls; without it any goal is accepted
     chosen_policy: Policy | None = None  # defaults to the straight-line policy, preset `paper`
 
     def __post_init__(self) -> None:
@@ -48,8 +52,11 @@ class Navigator:
         self._command = VelocityCommand(self.robot)
         self._manual = ManualDrive()
         self._docking: Docking | None = None  # if the goal has an approach direction
+        self._ride: LiftRide | None = None  # while the goal is on another floor
         self._map: PlannedMap | None = None  # the mapper's, if there is one
         self._pose: Array | None = None  # (3,) base_link in map, of the latest belief that tracks
+        self._tracking = False  # whether the latest belief tracks
+        self._floor: Floor | None = None  # for which the destination was chosen; None to choose it again
         self.explorer: Explorer | None = None  # the last exploration, unless it was cancelled
         self._exploration_request: Goal | None = None  # waits for the first map and a pose in it
         self._scan: Scan | None = None
@@ -124,23 +131,62 @@ class Navigator:
                 self._set_goal(goal)
 
     def _set_goal(self, goal: Goal) -> None:
-        self._docking = None if goal.approach is None or goal.cancel else Docking(goal, self.robot)
+        self._docking = self._ride = None
         if goal.cancel:
             self.goal_state.cancel()
-        else:
-            self.goal_state.start(goal, self._refusal(goal))
+            self.policy.set_goal(None)
+            return
+        try:
+            goal = goal.in_map(self.world)
+        except UserError as error:
+            self.goal_state.start(goal, f"goal refused: {error}")
+            self.policy.set_goal(None)
+            return
+        self._docking = None if goal.approach is None else Docking(goal, self.robot)
+        self.goal_state.start(goal, self._refusal(goal))
+        self._choose_destination(goal)
+
+    def _choose_destination(self, goal: Goal) -> None:
+        """Gives the policy the goal, or a lift if the goal is on another floor; refuses it if there is no lift."""
         destination = goal.pose.array()[:2] if self._docking is None else self._docking.line()[0]
+        self._ride, self._floor = None, self._present_floor()
+        if self.goal_state.active and self.world is not None and self._pose is not None and self._floor is not None:
+            ride = plan_ride(self.world, self._pose, destination)
+            if isinstance(ride, LiftRide) and (problem := self.policy.refusal(ride.place)) is not None:
+                problem = problem.removeprefix("goal refused: ")
+                ride = f"goal refused: the lift to floor {ride.floor!r} cannot be reached: {problem}"
+            if isinstance(ride, str):
+                self.goal_state.refuse(ride)
+            elif ride is not None:
+                self._ride, destination = ride, ride.place
         self.policy.set_goal(destination if self.goal_state.active else None)
 
+    def _present_floor(self) -> Floor | None:
+        """The floor on which the robot is known to be."""
+        if self.world is None or self._pose is None or not self._tracking:
+            return None
+        return self.world.floor_at(self._pose)
+
+    def _follow_floor(self) -> None:
+        """Chooses the destination again if the robot is on another floor than that for which it was chosen."""
+        goal, floor = self.goal_state.goal, self._present_floor()
+        if goal is not None and self.goal_state.active and floor is not None and floor != self._floor:
+            self._choose_destination(goal)
+
     def _refusal(self, goal: Goal) -> str | None:
+        def of_place(place: Array) -> str | None:
+            if self.world is not None and self.world.floors and self._present_floor() != self.world.floor_at(place):
+                return wall_refusal(self.world, place, self.robot.radius)  # which ways lead there is known there
+            return self.policy.refusal(place)
+
         if self._docking is None:
             place = goal.pose.array()[:2]
             # A goal at which the robot stands already is never refused, whatever the map says about walls.
             at_goal = self._pose is not None and np.hypot(*(self._pose[:2] - place)) <= goal.tolerance
-            return None if at_goal else self.policy.refusal(place)
+            return None if at_goal else of_place(place)
         if (reason := self._docking.refusal()) is not None:
             return reason
-        reasons = [self.policy.refusal(point) for point in self._docking.line()]
+        reasons = [of_place(point) for point in self._docking.line()]
         return next((f"the line to the goal is not free: {reason}" for reason in reasons if reason is not None), None)
 
     @property
@@ -153,20 +199,23 @@ class Navigator:
         pose, manual_twist = belief.pose.array(), self._manual.twist(belief.stamp_ns)
         self._resume_after_pause(belief.stamp_ns)
         self.decision = Decision()
-        if belief.state == "tracking":
+        self._tracking = belief.state == "tracking"
+        if self._tracking:
             self._pose = pose
         self._begin_exploration()
         if self.explorer is not None:
             self.explorer.move(pose, located=belief.state == "tracking")
-        if self._scan is not None and self._scan.stamp_ns == belief.stamp_ns:
-            self.policy.observe(self._scan, belief)
+        has_its_scan = self._scan is not None and self._scan.stamp_ns == belief.stamp_ns
+        self.policy.observe(self._scan if has_its_scan else None, belief)
+        self._follow_floor()
         if manual_twist is not None:
             self._suspend_goal()
         goal = self.goal_state.goal
         distance = None if goal is None else float(np.hypot(*(goal.pose.array() - pose)[:2]))
+        shown_distance = distance if self._ride is None else None
         if manual_twist is not None:
             command, _ = self._command.limit(belief.stamp_ns, manual_twist, self._scan_points)
-            return command, self._add_exploration(self._manual_status(belief.stamp_ns, distance))
+            return command, self._add_exploration(self._manual_status(belief.stamp_ns, shown_distance))
         desired = np.zeros(3)
         if goal is not None and distance is not None and self.goal_state.active:
             desired = self._goal_velocity(belief, pose, goal, distance)
@@ -175,7 +224,7 @@ class Navigator:
         self.goal_state.update_progress(belief.stamp_ns, self.decision, moving=moving, limited_by_scan=limited_by_scan)
         if self.explorer is not None:
             self.explorer.update(self.goal_state, belief.stamp_ns, moving=moving)
-        status = self._add_exploration(self.goal_state.status(belief.stamp_ns, distance))
+        status = self._add_exploration(self.goal_state.status(belief.stamp_ns, shown_distance))
         if (terms := self.decision.terms) is not None:
             status = status.model_copy(update={"energy": PolicyEnergy(**terms)})
         return command, status
@@ -247,6 +296,8 @@ class Navigator:
             self._interrupt_docking()
             return self.decision.action
         self.goal_state.find_pose()
+        if self._ride is not None:
+            return self._lift_velocity(self._ride, belief, pose)
         if self._docking is not None:
             velocity = self._docking_velocity(self._docking, belief, pose, goal)
             if velocity is not None:
@@ -259,10 +310,23 @@ class Navigator:
                 return np.zeros(3)
             self.decision = Decision(turn, "at the goal: turning into its heading")
             return turn
+        return self._policy_velocity(belief)
+
+    def _policy_velocity(self, belief: Belief) -> Array:
         self.decision = self.policy.decide(belief, self._command.velocity)
         if self.decision.refused:
             self.goal_state.refuse(self.decision.reason)
         return self.decision.action
+
+    def _lift_velocity(self, ride: LiftRide, belief: Belief, pose: Array) -> Array:
+        """Velocity (3,) in base_link towards the lift, or zero at it."""
+        if ride.waits(pose):
+            self.policy.interrupt()
+            self.decision = Decision(reason=ride.reason(pose))
+            return np.zeros(3)
+        velocity = self._policy_velocity(belief)
+        self.decision.reason = self.decision.reason or ride.reason(pose)
+        return velocity
 
     def _docking_velocity(self, docking: Docking, belief: Belief, pose: Array, goal: Goal) -> Array | None:
         """Velocity (3,) in base_link on the line to the goal; None while the policy drives to the line."""

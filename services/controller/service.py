@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from common.errors import UserError
 from common.geometry.world import load_world
 from common.messages.definitions import Belief, CmdVel, Drive, Goal, Map, Plan, Pose, Preference, Scan, Stamped, Status
 from common.messages.requests import PredictReply, PredictRequest, Reply
@@ -120,9 +121,15 @@ class ControllerService(Service):
         if self.navigator.goal_state.goal is not None:
             return  # a new goal has arrived already
         under_way = status.state not in {"idle", "reached"} and not status.refused
-        if under_way and status.goal == goal.pose and status.goal_seq == goal.seq:
+        if under_way and status.goal == self._pose_in_map(goal) and status.goal_seq == goal.seq:
             self.navigator.on_goal(goal)
             self.log.warning("resuming the goal of the previous controller instance", x=goal.pose.x, y=goal.pose.y)
+
+    def _pose_in_map(self, goal: Goal) -> Pose | None:
+        try:
+            return goal.in_map(self.navigator.world).pose
+        except UserError:
+            return None
 
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
         """Answers a belief by a command with its stamp, and a goal by a status at once."""
@@ -132,7 +139,8 @@ class ControllerService(Service):
             self.navigator.on_drive(message)
         elif isinstance(message, Goal):
             self.navigator.on_goal(message)
-            self.log.info("goal", x=message.pose.x, y=message.pose.y, cancel=message.cancel, explore=message.explore)
+            x, y, floor = message.pose.x, message.pose.y, message.map_id
+            self.log.info("goal", x=x, y=y, floor=floor, cancel=message.cancel, explore=message.explore)
             stamp_ns = self._last_answer[0] if self._last_answer else 0
             self.publish(STATUS, self.navigator.status(stamp_ns))
         elif isinstance(message, Belief):

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from common.errors import UserError
 from common.geometry.pose_text import start_of_text
+from common.geometry.world import World, load_world
 from common.messages.definitions import (
     Belief,
     BeliefHypothesis,
@@ -61,6 +62,9 @@ from services.estimator.prediction_query import answer_prediction
 from services.estimator.settings import EstimatorSettings
 from services.estimator.shared.interface import Observation, PoseEstimator, Posterior
 
+if TYPE_CHECKING:
+    from common.geometry.se2 import Array
+
 # The learned field is published again after this time, for recordings that begin later.
 FIELD_PERIOD_NS = 30_000_000_000
 
@@ -85,6 +89,7 @@ class SharedModels:
     def __init__(self, settings: EstimatorSettings) -> None:
         """Raises UserError if there are no weights for the world."""
         self.options = estimator_options(settings)
+        self.world = load_world(settings.world)
         self.factory: EstimatorFactory = prepare_factory(self.options)
         self._described: dict[int | None, ModelInUse | str] = {}
 
@@ -121,7 +126,7 @@ class EstimatorService(Service):
         self.geometry: ScannerGeometry | None = None
         self.estimator: PoseEstimator | None = None
         self.model: ModelInUse | str = "no scan has come yet"  # or the reason why it is unknown
-        self.goal: Goal | None = None
+        self.goal: Array | None = None  # (3,) in map
         self.odometry_sync = OdometrySync()  # used if the prior is odometry
         self.command: CmdVel | None = None
         self.last: tuple[int, Belief, Prediction] | None = None  # stamp in ns and results of the latest scan
@@ -145,7 +150,7 @@ class EstimatorService(Service):
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
         """Processes a scan; stores goal, odometry and command for the scans after it."""
         if isinstance(message, Goal):
-            self.goal = None if message.cancel or message.explore else message
+            self.goal = self._pose_of_goal(message)
         elif isinstance(message, CmdVel):
             self.command = message
         elif isinstance(message, LearnedField):
@@ -168,7 +173,8 @@ class EstimatorService(Service):
             return answer_prediction(self.estimator, request, self.geometry.angles, self.geometry.range_max)
         if not isinstance(request, LocaliseRequest):
             return super().on_request(query, request)
-        start = None if request.pose is None else request.pose.array()
+        assert self.models is not None  # noqa: S101 - set in open
+        start = None if request.pose is None else self.models.world.to_map(request.pose.array(), request.map_id)
         self.estimator.restart(start if start is None or request.heading_known else start[:2])
         if self._learner is not None:
             self._learner.keys.forget_unverified()
@@ -178,6 +184,16 @@ class EstimatorService(Service):
         if isinstance(self.model, str):
             return ModelReply(ok=False, reason=self.model)
         return self.model.reply(weights=request.weights)
+
+    def _pose_of_goal(self, goal: Goal) -> Array | None:
+        """Pose (3,) of a goal in map; None if it has none, or is on an unknown floor."""
+        assert self.models is not None  # noqa: S101 - set in open
+        if goal.cancel or goal.explore:
+            return None
+        try:
+            return goal.in_map(self.models.world).pose.array()
+        except UserError:
+            return None  # the controller refuses it
 
     def _update_all(self, scans: list[ScanWithOdometry]) -> None:
         for scan, odom in scans:
@@ -249,7 +265,8 @@ class EstimatorService(Service):
 
     def publish_posterior(self, scan: Scan, posterior: Posterior, estimator: str) -> None:
         """Publishes the belief and the prediction after a scan."""
-        belief = belief_message(scan, posterior, estimator, self.field_version)
+        world = None if self.models is None else self.models.world
+        belief = belief_message(scan, posterior, estimator, world, self.field_version)
         prediction = prediction_message(scan, posterior)
         self.last = (scan.stamp_ns, belief, prediction)
         self._publish(belief, prediction)
@@ -303,13 +320,16 @@ class EstimatorService(Service):
             scan.stamp_ns * 1e-9,
             odom.pose.array() if odom else None,
             command.twist.array() if command else None,
-            self.goal.pose.array() if self.goal else None,
+            self.goal,
             time_increment=scan.time_increment,
         )
 
 
-def belief_message(scan: Scan, posterior: Posterior, estimator: str, field_version: int = 0) -> Belief:
-    """The posterior after a scan as a message."""
+def belief_message(
+    scan: Scan, posterior: Posterior, estimator: str, world: World | None = None, field_version: int = 0
+) -> Belief:
+    """The posterior after a scan as a message; ``world`` tells the floor."""
+    floor = None if world is None else world.floor_at(posterior.pose)
     return Belief(
         stamp_ns=scan.stamp_ns,
         state=posterior.state,
@@ -328,6 +348,7 @@ def belief_message(scan: Scan, posterior: Posterior, estimator: str, field_versi
         protection=None if posterior.protection is None else posterior.protection.astype(np.float32),
         estimator=estimator,
         field_version=field_version,
+        map_id="" if floor is None else floor.name,
     )
 
 

@@ -50,10 +50,11 @@ class PybulletPhysics:
         for link in range(-1, p.getNumJoints(self.body, physicsClientId=self.client)):
             mask = WORLD_GROUP | PEOPLE_GROUP
             p.setCollisionFilterGroupMask(self.body, link, ROBOT_GROUP, mask, physicsClientId=self.client)
-        self.shapes: dict[str, int] = {}  # bodies of the furniture and of the boundary by name
+        self.shapes: dict[str, int] = {}  # bodies of the furniture by name
         self.people: list[int] = []  # bodies
         if world.grid is None:
-            self._add_ring("boundary", np.array(world.boundary))
+            for ring in world.wall_rings:
+                self._body(self._shape(np.array(ring)))
         else:
             self._add_walls(world.grid.shapes.walls)
         self.place(pose)

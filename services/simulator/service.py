@@ -216,7 +216,7 @@ class SimulatorService(Service):
         if isinstance(request, SpeedRequest):
             return self._set_speed(request.factor)
         if isinstance(request, PoseRequest):
-            self.simulation.teleport(request.pose.array())
+            self.simulation.teleport(self.simulation.world.to_map(request.pose.array(), request.map_id))
         elif isinstance(request, ObstacleRequest):
             self.simulation.change_obstacle(request.action, request.name, request.obstacle)
         elif isinstance(request, ResetRequest):

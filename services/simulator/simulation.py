@@ -306,7 +306,8 @@ class Simulation:
 
     def _check_place(self, obstacle: Obstacle) -> None:
         shape = obstacle.shape()
-        if not shapely.intersects(shapely.Polygon(self.world.boundary), shape):
+        rooms = [shapely.Polygon(ring) for ring in self.world.wall_rings or [self.world.boundary]]
+        if not shapely.intersects(rooms, shape).any():
             raise UserError("the obstacle would stand outside the world")
         if shapely.distance(shape, shapely.Point(self.physics.pose()[:2])) < self.setup.robot.radius:
             raise UserError("the obstacle would stand on the robot")

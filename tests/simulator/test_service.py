@@ -9,9 +9,9 @@ import pytest
 from structlog.testing import capture_logs
 
 from common.bus.inbox import Inbox, IncomingRequest
-from common.messages.definitions import CmdVel, Twist
-from common.messages.requests import Request, ResetRequest, SpeedRequest
-from common.messages.topics import PAUSE, RESET, RESUME, SCAN, SPEED, STEP, TRUTH, WORLD
+from common.messages.definitions import CmdVel, Pose, Twist
+from common.messages.requests import PoseRequest, Request, ResetRequest, SpeedRequest
+from common.messages.topics import PAUSE, RESET, RESUME, SCAN, SPEED, STEP, TELEPORT, TRUTH, WORLD
 from common.runtime.service import Loop
 from services.simulator import service as shell
 from services.simulator.service import SimulatorService
@@ -105,6 +105,19 @@ def test_steps_only_while_paused(simulator, pace):
         assert running.service.due() <= 0
         running.service.on_timer()
         assert running.scans() == [4]
+
+
+def test_teleport_to_a_floor(simulator, tmp_path):
+    path = tmp_path / "tower.yaml"
+    path.write_text("{name: tower, floors: {ground: corridor, first: office}}")
+    with simulator(world=str(path)) as running:
+        assert running.request(TELEPORT, PoseRequest(pose=Pose(x=3.0, y=2.0), map_id="first")).ok
+        running.service.on_timer()
+        truth, world = running.sent(TRUTH)[-1].pose.array(), running.request(WORLD).world
+        assert world.floor_at(truth).name == "first"
+        np.testing.assert_allclose(world.floor("first").from_map(truth), [3, 2, 0], atol=1e-6)
+        refused = running.request(TELEPORT, PoseRequest(pose=Pose(x=3.0, y=2.0), map_id="attic"))
+        assert (refused.ok, refused.reason) == (False, "there is no floor 'attic': choose one of ground, first")
 
 
 def test_stop_during_a_pause(simulator):

@@ -3,7 +3,7 @@
 python -m tests.viewer.stub_server --port 8123
 
 http://127.0.0.1:8123/planning/ is the scene of that name; there are: tracking, planning, blocked, exploring, ambiguous,
-lost, half-dead, empty, watching, mapped (a ROS map). Without a name it is `tracking`.
+lost, half-dead, empty, watching, mapped (a ROS map), floors (a building). Without a name it is `tracking`.
 """
 
 from __future__ import annotations
@@ -22,12 +22,21 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from common.geometry.occupancy_grid import OccupancyGrid
 from common.geometry.world import World, load_world
 from common.robot.base import Robot
-from tests.common.geometry.maps import rooms
+from tests.common.geometry.maps import building, rooms
 from tests.viewer.stub_session import DT, SCANNER, SCENES, WORLDS, Session, pulses
 
 STATIC = Path(__file__).resolve().parents[2] / "services" / "viewer" / "static"
 
 MAPPED = World(name="rooms", grid=OccupancyGrid.of(rooms(260), 0.05, (2.0, -1.0, 0.3)))
+
+
+def tower() -> World:
+    """A building of two floors with a lift."""
+    lifts = [{"ground": (17.0, 1.0), "first": (3.0, 2.0)}]
+    return building(lifts, ground=load_world("corridor"), first=load_world("office"))
+
+
+MADE = {"mapped": lambda: MAPPED, "floors": tower}  # the other worlds are shipped
 
 
 class Visitor:
@@ -88,7 +97,7 @@ def application(warm: float) -> Starlette:
 
     def session_of(scene: str) -> Session:
         if scene not in sessions:
-            world = MAPPED if scene == "mapped" else load_world(WORLDS.get(scene, "corridor"))
+            world = MADE[scene]() if scene in MADE else load_world(WORLDS.get(scene, "corridor"))
             sessions[scene] = Session(world, scene)
             for _ in range(int(warm / DT)):
                 sessions[scene].step()

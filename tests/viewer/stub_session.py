@@ -22,6 +22,7 @@ SCENES = (
     "empty",
     "watching",
     "mapped",
+    "floors",
 )
 WORLDS = {"planning": "office", "blocked": "office", "exploring": "maze"}  # other scenes: corridor
 PLANNED = tuple(WORLDS)
@@ -170,6 +171,9 @@ class Session:
             return "the robot does not fit there"
         self.goal = np.array([request["x"], request["y"], *([request["yaw"]] if "yaw" in request else [])])
         return ""
+
+    def do_teleport(self, request: dict) -> None:
+        self.pose = np.array([request["x"], request["y"], request["yaw"]])
 
     def do_obstacle(self, request: dict) -> None:
         others = [o for o in self.world.obstacles if o.name != request["name"]]

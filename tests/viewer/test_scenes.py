@@ -14,7 +14,7 @@ from tests.conftest import WAIT_TIMEOUT_S, accepts, free_tcp_port
 from tests.viewer.stub_server import MAPPED
 
 browser_tools = pytest.importorskip("tests.viewer.browser", reason="NO PLAYWRIGHT: the page is not tested")
-SCENES = ("planning", "blocked", "exploring", "ambiguous", "lost", "half-dead", "empty", "watching")
+SCENES = ("floors", "planning", "blocked", "exploring", "ambiguous", "lost", "half-dead", "empty", "watching")
 STANDING = {"blocked", "exploring", "ambiguous", "lost"}  # scenes that show a reason
 PHONE = {"width": 360, "height": 740, "has_touch": True, "is_mobile": True}
 NAMELESS = """[...document.querySelectorAll("button")].filter(
@@ -24,7 +24,8 @@ CUT_OFF = """[...document.querySelectorAll(".keys, .services .scroll, .card h2, 
 VISIBLE = "document.getElementById(arg).checkVisibility()"
 OVERLAPPING = """((boxes) => boxes.filter(([, a], i) => boxes.some(([, b], k) => k < i && a.left < b.right - 1
     && b.left < a.right - 1 && a.top < b.bottom - 1 && b.top < a.bottom - 1)).map(([name]) => name))(
-    ["#legend", "#zoom", "#why", "#sub", "#toolbar", "#joystick"].map((name) => [name, document.querySelector(name)])
+    ["#legend", "#zoom", ".floor", "#why", "#sub", "#toolbar", "#joystick"]
+        .map((name) => [name, document.querySelector(name)])
         .filter(([, box]) => box.checkVisibility()).map(([name, box]) => [name, box.getBoundingClientRect()]))"""
 TOOLS = """[...document.querySelectorAll("#toolbar button, #toolbar .speed")]
     .filter((tool) => tool.checkVisibility()).map((tool) => {
@@ -161,6 +162,30 @@ def test_cells_of_a_ros_map(look):
             else:  # lines of the metres run through all of them
                 shown = [seen.see(PIXEL, [at[0] + off, at[1] + off]) for off in (-2, 0, 2)]
                 assert colour in shown, (kind, x, y, shown)
+
+
+def test_floors(look):
+    seen = look("floors")
+    seen.wait("store.frame && view.floor?.name === 'ground'")
+    ground, first = seen.see("store.world.floors.map((floor) => floor.boundary)")
+    centre, choice = "[view.camera.x, view.camera.y]", seen.page.locator("#floor")
+    on_ground, on_first = ((np.min(ring, 0) + np.max(ring, 0)) / 2 for ring in (ground, first))
+    assert choice.locator("option").all_inner_texts() == ["robot’s floor", "all floors", "ground", "first"]
+    assert np.abs(seen.see(centre) - on_ground).max() < 3  # m, because the tools cover a part of the map
+    choice.select_option("first")
+    assert np.abs(seen.see(centre) - on_first).max() < 3
+    place = [first[0][0] + 2.0, first[0][1] + 1.2]
+    seen.click(*place)
+    seen.wait("Math.abs(store.frame.status.goal.x - arg) < 0.1", argument=place[0])
+    choice.select_option("robot’s floor")
+    assert seen.see("view.floor.name") == "ground"
+    seen.see("presage.actions.teleport({ x: arg[0], y: arg[1], yaw: 0 })", place)
+    seen.wait("view.floor.name === 'first'")
+    assert np.abs(seen.see(centre) - on_first).max() < 3
+    choice.select_option("all floors")
+    assert seen.see("view.floor") is None
+    plain = look("tracking")
+    plain.wait("store.world && document.getElementById('floor').parentElement.hidden")
 
 
 def test_reason_and_journal(look):

@@ -54,8 +54,8 @@ class Policy(Protocol):
     def prepare(self, scan: Scan) -> None:
         """Computes what depends on the scanner; called with each scan, before its belief."""
 
-    def observe(self, scan: Scan, belief: Belief) -> None:
-        """Processes a scan and the belief computed from it."""
+    def observe(self, scan: Scan | None, belief: Belief) -> None:
+        """Processes a belief and the scan from which it was computed, or None if that is no longer the latest scan."""
 
     def decide(self, belief: Belief, velocity: Array) -> Decision:
         """Chooses a velocity towards the goal when the pose is known; ``velocity`` (3,) is the latest command."""

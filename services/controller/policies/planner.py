@@ -138,15 +138,17 @@ class GeodesicPolicy:
         self._information = ScanInformation.of(self.graph, scan, 1 / (STEP_S * self.robot.max_speed))
         self.graph.set_extra_cost_per_metre(self._information.ambiguity.ravel() / efe.NATS_PER_METRE)
 
-    def observe(self, scan: Scan, belief: Belief) -> None:
+    def observe(self, scan: Scan | None, belief: Belief) -> None:
         """Updates the scanner's field of view, and while tracking the obstacles and the component of the graph."""
-        self._field_of_view = Sweep.of(scan).sector(scan.mount.yaw)
-        self._scan = scan
+        if scan is not None:
+            self._field_of_view = Sweep.of(scan).sector(scan.mount.yaw)
+            self._scan = scan
         if belief.state != "tracking":
             return  # the pose is not reliable; obstacles found so far are kept
         self.localiser.reset()
         pose = belief.pose.array()
-        self.obstacles.update(scan, pose)
+        if scan is not None:
+            self.obstacles.update(scan, pose)
         if (cell := self.graph.nearest_free(pose[:2], self.graph.min_clearance, map_only=True)) is not None:
             self._component = int(self.graph.component[cell])
 

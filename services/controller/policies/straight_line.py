@@ -51,7 +51,7 @@ class StraightLinePolicy:
     def prepare(self, scan: Scan) -> None:
         """Does nothing: this policy uses the belief alone."""
 
-    def observe(self, scan: Scan, belief: Belief) -> None:
+    def observe(self, scan: Scan | None, belief: Belief) -> None:
         """Does nothing: this policy uses the belief alone."""
 
     def decide(self, belief: Belief, velocity: Array) -> Decision:  # noqa: ARG002 - the sum replaces the last velocity

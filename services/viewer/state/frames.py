@@ -121,7 +121,7 @@ def status_as_json(status: Status | None, goals: Mapping[int, Goal]) -> Json | N
         return None
     goal: Json | None = pose_as_json(status.goal) if status.goal is not None else None
     message = goals.get(status.goal_seq)
-    if goal is not None and message is not None and message.pose == status.goal:
+    if goal is not None and message is not None and (message.map_id or message.pose == status.goal):
         goal |= {"tolerance": message.tolerance, "yaw_tolerance": message.yaw_tolerance}
     energy = None if status.energy is None else status.energy.model_dump()
     exploration = None if status.exploration is None else status.exploration.model_dump(exclude={"seq"})

@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from common.geometry.building import BuildingFile, lay_out
 from common.geometry.occupancy_grid import FREE, OCCUPIED, UNKNOWN
 from common.geometry.ros_map_writer import DEFAULT_KEYS, write_map
 from common.geometry.world import World
 from lab.benchmarks.maps import rooms
 
-__all__ = ["HUT", "ROOM", "TURNED", "rooms", "speckled", "values_of", "write_map", "write_yaml"]
+__all__ = ["HUT", "ROOM", "TURNED", "building", "rooms", "speckled", "values_of", "write_map", "write_yaml"]
 
 MARKS = {".": FREE, "#": OCCUPIED, "?": UNKNOWN}
 TURNED = (1.0, -2.0, 0.6)  # origin of a grid that is rotated in map
@@ -25,6 +26,12 @@ ROOM = World(
         {"name": "c", "circle": {"center": (3, 4.5), "radius": 0.6}},
     ],
 )
+
+
+def building(lifts=(), start=None, **floors: World) -> World:
+    """A building of these floors."""
+    file = BuildingFile(name="tower", floors=dict.fromkeys(floors, ""), lifts=list(lifts), start=start)
+    return World.model_validate(lay_out(file, floors))
 
 
 def values_of(drawing):

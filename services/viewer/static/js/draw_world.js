@@ -1,7 +1,7 @@
 // Draws what does not move: walls, furniture, grid and rulers.
 
 import { drawFreeCells, drawOccupiedCells } from "./draw_grid.js";
-import { boundsOf, middle, ring } from "./geometry.js";
+import { boundsOf, middle, ring, wallsOf } from "./geometry.js";
 
 /** Adds a closed path through points of the world. */
 function trace(ctx, camera, points) {
@@ -14,7 +14,7 @@ export function drawFloor(ctx, camera, world, colours, ready) {
   const step = [0.5, 1, 5, 10, 50].find((s) => s * camera.scale >= 26) ?? 100;
   ctx.save();
   ctx.beginPath();
-  trace(ctx, camera, world.boundary);
+  for (const walls of wallsOf(world)) trace(ctx, camera, walls);
   ctx.fillStyle = colours.free;
   if (!world.grid) ctx.fill();
   ctx.clip();
@@ -45,11 +45,27 @@ export function drawWalls(ctx, camera, world, colours, { selected, hovered, ghos
   }
   if (world.grid) return; // the edge of a ROS map is not a wall
   ctx.beginPath();
-  trace(ctx, camera, world.boundary);
+  for (const walls of wallsOf(world)) trace(ctx, camera, walls);
   ctx.strokeStyle = colours.wall;
   ctx.lineWidth = 3;
   ctx.lineJoin = "miter";
   ctx.stroke();
+}
+
+/** Writes the names of floors above them, and marks the lifts. */
+export function drawFloors(ctx, camera, world, colours) {
+  for (const { name, offset, boundary } of world.floors ?? []) {
+    const [x0, , , y1] = boundsOf(boundary), [left, top] = camera.toScreen(x0, y1);
+    label(ctx, name, left, top - 11, colours, { size: 12 });
+    for (const lift of world.lifts ?? []) {
+      if (!lift[name]) continue;
+      const [px, py] = camera.toScreen(lift[name][0] + offset[0], lift[name][1] + offset[1]);
+      ctx.strokeStyle = colours["ink-2"];
+      ctx.lineWidth = 1.5;
+      ctx.strokeRect(px - 8, py - 8, 16, 16);
+      label(ctx, "lift", px, py + 16, colours, { align: "center" });
+    }
+  }
 }
 
 function outline(ctx, camera, obstacle) {

@@ -90,6 +90,11 @@ export function moved(obstacle, dx, dy, turn = 0) {
   return { name, polygon: obstacle.polygon.map((point) => shift(turned(point))) };
 }
 
+/** Closed lines of a world's walls; with a ROS map, its edge. */
+export function wallsOf(world) {
+  return world.floors?.length && !world.grid ? world.floors.map((floor) => floor.boundary) : [world.boundary];
+}
+
 /** Bounding rectangle x0, y0, x1, y1 of points. */
 export function boundsOf(points) {
   const xs = points.map((p) => p[0]), ys = points.map((p) => p[1]);

@@ -6,7 +6,7 @@ const HELP = [
   ["click, drag", "set a goal, with a heading"], ["shift + click", "carry the robot there; the estimator is not informed"], ["right drag, two fingers", "move the view"],
   ["W A S D, arrows", "drive; Q and E sideways, shift faster"], ["space", "pause or resume"], [".", "go forward by one scan, while paused"],
   ["G C O V", "goal, carry, obstacle, look"], ["X", "cancel the goal"], ["L", "forget the believed pose and search the whole map"], ["R", "start or stop recording"],
-  ["T", "show or hide the true pose"], ["F", "follow the robot"], ["+ − 0", "zoom in, zoom out, show the whole world"],
+  ["T", "show or hide the true pose"], ["F", "follow the robot"], ["+ − 0", "zoom in, zoom out, show the whole world or floor"],
   ["Del, [ ]", "remove or turn the selected obstacle"], ["Esc", "cancel"], ["?", "this help"],
 ];
 

@@ -5,7 +5,7 @@ import { oncePerFrame } from "./canvas.js";
 import { Connection } from "./connection.js";
 import { $, h, storedSetting, setText } from "./dom.js";
 import { Drive } from "./drive.js";
-import { boundsOf } from "./geometry.js";
+import { Floors } from "./floors.js";
 import { startKeys } from "./keys.js";
 import { MapView } from "./map.js";
 import { Modes } from "./modes.js";
@@ -21,6 +21,7 @@ import { Toolbar } from "./toolbar.js";
 
 const store = new Store();
 const view = new MapView(store);
+const floors = new Floors(store, view);
 const panels = new Panels(store);
 const reasons = new Reasons(store);
 const services = new Services(store, toast);
@@ -93,6 +94,7 @@ function takeHello(hello) {
 function takeWorld({ world: simulatorWorld, scanner, robot }) {
   const before = store.world, world = store.map?.world ?? simulatorWorld; // the map has another frame than the simulator's world
   Object.assign(store, { world, simulatorWorld, scanner, robot });
+  floors.update();
   if (view.gesture.selected && !modes.selected) modes.select("");
   redraw(); // first, because the fit depends on the size of the tools
   if (!before || before.name !== world?.name || String(before.boundary) !== String(world?.boundary)) {
@@ -106,6 +108,7 @@ function takeMap(message) {
   const map = message.world ? message : null, changed = !map !== !store.map;
   if (!map && !changed) return;
   Object.assign(store, { map, world: map?.world ?? store.simulatorWorld });
+  floors.update();
   if (changed || view.camera.fitted) view.fit();
   if (changed) redraw();
   view.invalidate();
@@ -135,6 +138,7 @@ function takeField(field) {
 function takeFrame(frame) {
   const before = store.frame;
   store.takeFrame(frame, performance.now());
+  floors.follow();
   // Frames that arrive long after a pause or a step: another visitor has resumed the simulation.
   if (store.paused && before && frame.t > before.t && performance.now() - store.pausedAt > 1000) store.paused = false;
   const state = frame.belief?.state ?? frame.status?.state ?? "";
@@ -171,7 +175,7 @@ function connectionChanged(state, wait) {
 }
 
 function arrange() {
-  const [x0, y0, x1, y1] = store.world ? boundsOf(store.world.boundary) : [0, 0, 2, 1];
+  const [x0, y0, x1, y1] = store.world ? view.bounds : [0, 0, 2, 1];
   $("main").dataset.layout = layout ?? ((x1 - x0) / (y1 - y0) > 1.9 ? "wide" : "side");
 }
 

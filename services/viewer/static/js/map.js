@@ -35,6 +35,7 @@ export class MapView {
     this.camera = new Camera();
     const initial = (key) => (key === "field" && innerWidth <= 760 ? "off" : "on"); // a phone's map is small
     this.shown = Object.fromEntries(LAYERS.map(({ key }) => [key, (storedSetting(`layer.${key}`) ?? initial(key)) === "on"]));
+    this.floor = null; // of the building, to which the view is fitted; null for the whole world
     this.gesture = {}; // of the pointer: ghost, plan, goal, carry, hovered, selected
     this.invalidate = oncePerFrame(() => this.draw());
     this.surface = fitToScreen($("map"), ({ width, height }) => {
@@ -51,10 +52,11 @@ export class MapView {
   /** Sets the padding that the legend and the tools need; on a phone the tools are below the map. */
   arrange(width) {
     const stick = $("joystick").hidden ? 0 : 114;
+    const floors = !$("floor").parentElement.hidden;
     const dock = Math.max(0, $("map").getBoundingClientRect().bottom - $("dock").getBoundingClientRect().top);
     this.camera.padding = width < NARROW
-      ? { left: 26, right: 16, top: 56, bottom: 26 + dock + stick }
-      : { left: $("legend").open ? $("legend").offsetWidth + 44 : 40, right: 64, top: 28, bottom: 24 + dock };
+      ? { left: 26, right: 16, top: floors ? 108 : 56, bottom: 26 + dock + stick }
+      : { left: $("legend").open ? $("legend").offsetWidth + 44 : 40, right: 64, top: floors ? 50 : 28, bottom: 24 + dock };
   }
 
   buildLegend() {
@@ -100,8 +102,13 @@ export class MapView {
 
   fit() {
     this.arrange(this.surface.width);
-    if (this.store.world) this.camera.fit(boundsOf(this.store.world.boundary));
+    if (this.store.world) this.camera.fit(this.bounds);
     this.invalidate();
+  }
+
+  /** Bounds of the floor that is shown, or of the whole world. */
+  get bounds() {
+    return boundsOf((this.floor ?? this.store.world).boundary);
   }
 
   follow(on) {
@@ -132,6 +139,7 @@ export class MapView {
     const pose = frame ? scan.scannerPose(frame) : null;
     if (pose && shown.measured) scan.drawFan(ctx, camera, frame, pose, colours);
     if (world) ground.drawWalls(ctx, camera, world, colours, gesture, () => this.invalidate());
+    if (world) ground.drawFloors(ctx, camera, world, colours);
     $("legend").querySelector("[data-layer=mapping]").hidden = !store.map;
     if (store.map && shown.mapping) drawMapping(ctx, camera, store.map, colours);
     if (frame) this.drawRobot(ctx, frame, pose, colours);

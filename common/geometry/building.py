@@ -1,0 +1,140 @@
+"""Buildings with several floors: the floors' worlds side by side in one frame, `map`, as one world.
+
+Each floor keeps the axes of its own frame, and the first floor its origin. Nothing connects the floors for a robot or
+a beam, so being moved to another floor is a kidnapping like any other.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from common.errors import UserError
+from common.geometry.floors import Floor, FloorName, Lift, moved, no_floor
+from common.geometry.occupancy_grid import MAX_CELLS, UNKNOWN, OccupancyGrid
+from common.geometry.shapes import Degrees, Obstacle, WorldName, WorldPart
+from common.limits import Coordinate
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from common.geometry.world import World
+
+GAP_M = 2.0  # between floors; their walls stop all beams
+GRID_GAP_M = 30.0  # between ROS maps, which beams may leave through unknown cells; longer than a beam
+
+
+class FloorStart(WorldPart):
+    """Initial pose of the robot in the frame of a floor."""
+
+    floor: FloorName
+    x: Coordinate  # m
+    y: Coordinate  # m
+    yaw_deg: Degrees = 0.0
+
+
+class BuildingFile(WorldPart):
+    """Contents of the YAML file of a building."""
+
+    name: WorldName
+    floors: Annotated[dict[FloorName, str], Field(min_length=1, max_length=100)]  # name of a world, or a file
+    lifts: Annotated[list[Lift], Field(max_length=1000)] = []  # noqa: RUF012 - pydantic copies it
+    start: FloorStart | None = None  # defaults to that of the first floor
+
+
+def is_building(data: object) -> bool:
+    """Whether the contents of a YAML file are a building; a saved world has a list of floors."""
+    return isinstance(data, dict) and isinstance(data.get("floors"), dict)
+
+
+def lay_out(building: BuildingFile, worlds: Mapping[str, World]) -> dict[str, Any]:
+    """Fields of the World for a building, whose floors are ``worlds``; raises UserError if they do not go together."""
+    first = next(iter(worlds.values()))
+    for name, world in worlds.items():
+        if world.floors:
+            raise UserError(f"building {building.name!r}: floor {name!r} is itself a building")
+        if (world.grid is None) != (first.grid is None):
+            raise UserError(f"building {building.name!r}: floor {name!r}: floors are either all ROS maps, or none is")
+    fields: dict[str, Any] = {}
+    if first.grid is None:
+        offsets = _side_by_side(worlds)
+    else:
+        fields["grid"], offsets = _paste(building, {name: world.grid for name, world in worlds.items() if world.grid})
+    start = building.start
+    if start is None and first.start is not None:
+        start = FloorStart(floor=next(iter(worlds)), **first.start.model_dump())
+    if start is not None and start.floor not in worlds:
+        raise UserError(f"building {building.name!r}: start: {no_floor(start.floor, worlds)}")
+    if start is not None:
+        x, y = moved((start.x, start.y), offsets[start.floor]).tolist()
+        fields["start"] = {"x": x, "y": y, "yaw_deg": start.yaw_deg}
+    return {
+        "name": building.name,
+        **fields,
+        "obstacles": [
+            _obstacle(obstacle, name, offsets[name]) for name, world in worlds.items() for obstacle in world.obstacles
+        ],
+        "floors": [
+            Floor(name=name, offset=offsets[name], boundary=moved(world.boundary, offsets[name]).tolist())
+            for name, world in worlds.items()
+        ],
+        "lifts": building.lifts,
+    }
+
+
+def _side_by_side(worlds: Mapping[str, World]) -> dict[str, tuple[float, float]]:
+    """Offsets in m by name of floors with walls."""
+    offsets: dict[str, tuple[float, float]] = {}
+    right = 0.0  # m, the right edge of the previous floor
+    for name, world in worlds.items():
+        x0, _, x1, _ = world.bounds
+        shift = right + GAP_M - x0 if offsets else 0.0
+        offsets[name], right = (shift, 0.0), x1 + shift
+    return offsets
+
+
+def _paste(
+    building: BuildingFile, grids: Mapping[str, OccupancyGrid]
+) -> tuple[OccupancyGrid, dict[str, tuple[float, float]]]:
+    """One grid with the cells of all floors and unknown cells between them, and the floors' offsets in m by name."""
+    first = next(iter(grids.values()))
+    size = first.resolution
+    for name, grid in grids.items():
+        if not np.isclose(grid.resolution, size, rtol=1e-6, atol=0):
+            raise UserError(
+                f"building {building.name!r}: floor {name!r}: the resolution is {grid.resolution:g} m, that of "
+                f"floor {next(iter(grids))!r} {size:g} m; they must be equal"
+            )
+        if grid.origin[2]:
+            raise UserError(f"building {building.name!r}: floor {name!r}: its map is rotated; the yaw must be 0")
+    gap = round(GRID_GAP_M / size)
+    columns = np.cumsum([0, *(grid.width + gap for grid in grids.values())])  # in which the floors begin
+    rows = [round((grid.origin[1] - first.origin[1]) / size) for grid in grids.values()]
+    low = min(rows)
+    height = max(row + grid.height for row, grid in zip(rows, grids.values(), strict=True)) - low
+    width = int(columns[-1]) - gap
+    if width * height > MAX_CELLS:
+        raise UserError(f"building {building.name!r}: {width} x {height} cells are more than {MAX_CELLS}")
+    values = np.full((height, width), UNKNOWN, np.uint8)
+    x, y = first.origin[:2]
+    offsets = {}
+    for (name, grid), column, row in zip(grids.items(), columns.tolist(), rows, strict=False):
+        values[row - low : row - low + grid.height, column : column + grid.width] = grid.values
+        offsets[name] = (x + column * size - grid.origin[0], y + row * size - grid.origin[1])
+    return OccupancyGrid.of(values, size, (x, y + low * size, 0.0)), offsets
+
+
+def _obstacle(obstacle: Obstacle, floor: str, offset: tuple[float, float]) -> dict[str, Any]:
+    """Fields of an obstacle of a floor, in map; its name begins with that of the floor."""
+    fields = obstacle.model_dump(exclude_none=True)
+    if obstacle.polygon is not None:
+        fields["polygon"] = moved(obstacle.polygon, offset).tolist()
+    elif obstacle.box is not None:
+        fields["box"]["center"] = moved(obstacle.box.center, offset).tolist()
+    elif obstacle.circle is not None:
+        fields["circle"]["center"] = moved(obstacle.circle.center, offset).tolist()
+    if obstacle.name:
+        fields["name"] = f"{floor}/{obstacle.name}"
+    return fields

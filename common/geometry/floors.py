@@ -1,0 +1,89 @@
+"""The floors of a building and its lifts, as data."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field, model_validator
+
+from common.geometry.shapes import Point, Ring, WorldPart, check_ring
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from common.geometry.se2 import Array
+
+FloorName = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[\w.-]+$")]
+Lift = Annotated[dict[FloorName, Point], Field(min_length=2, max_length=100)]
+# its place in m on each floor that it stops at, in the floor's frame
+
+
+class Floor(WorldPart):
+    """One floor of a building."""
+
+    name: FloorName
+    offset: Point  # m, origin of the floor's frame in map; the axes are parallel
+    boundary: Ring  # m in map, the floor's walls; in a world with a grid, the edge of the floor's cells
+
+    @model_validator(mode="after")
+    def _boundary_is_simple(self) -> Floor:
+        check_ring(self.boundary)
+        return self
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """x0, y0, x1, y1 in m in map of the boundary's bounding box."""
+        return bounds_of(self.boundary)
+
+    def contains(self, place: npt.ArrayLike) -> bool:
+        """Whether a point (2,) or pose (3,) in map is on this floor."""
+        x0, y0, x1, y1 = self.bounds
+        x, y = np.asarray(place, float)[:2]
+        return bool(x0 <= x <= x1 and y0 <= y <= y1)
+
+    def to_map(self, places: npt.ArrayLike) -> Array:
+        """Points (..., 2) or poses (..., 3) in the floor's frame, in map."""
+        return moved(places, self.offset)
+
+    def from_map(self, places: npt.ArrayLike) -> Array:
+        """Inverse of `to_map`."""
+        return moved(places, (-self.offset[0], -self.offset[1]))
+
+
+def no_floor(name: str, floors: Iterable[str]) -> str:
+    """The message for an unknown floor ``name``."""
+    return f"there is no floor {name!r}: choose one of {', '.join(floors)}"
+
+
+def check_floors(floors: list[Floor], lifts: list[dict[str, tuple[float, float]]]) -> None:
+    """Raises ValueError if names of floors are not unique, or lifts are not on their floors."""
+    known = {floor.name: floor for floor in floors}
+    if len(known) < len(floors):
+        raise ValueError("two floors have the same name")
+    for lift in lifts:
+        for name, place in lift.items():
+            if name not in known:
+                raise ValueError(f"a lift stops at an unknown floor: {no_floor(name, known)}")
+            if not known[name].contains(known[name].to_map(place)):
+                raise ValueError(f"a lift is not on floor {name!r}: ({place[0]:g}, {place[1]:g}) is outside")
+
+
+def bounds_of(points: npt.ArrayLike) -> tuple[float, float, float, float]:
+    """x0, y0, x1, y1 of the bounding box of points (N, 2)."""
+    (x0, y0), (x1, y1) = np.min(points, axis=0), np.max(points, axis=0)
+    return float(x0), float(y0), float(x1), float(y1)
+
+
+def corners_of(bounds: tuple[float, float, float, float]) -> list[tuple[float, float]]:
+    """The corners of a bounding box, counter-clockwise."""
+    x0, y0, x1, y1 = bounds
+    return [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
+
+
+def moved(places: npt.ArrayLike, offset: tuple[float, float]) -> Array:
+    """Points (..., 2) or poses (..., 3) moved by an offset in m."""
+    result = np.array(places, float)
+    result[..., :2] += offset
+    return result

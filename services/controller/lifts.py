@@ -1,0 +1,53 @@
+"""Goals on another floor: which lift to take, and the wait until the robot has been taken there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from common.geometry.se2 import Array
+    from common.geometry.world import World
+
+LIFT_TOLERANCE_M = 0.1  # the robot waits within this distance of the lift's place
+
+
+@dataclass(frozen=True)
+class LiftRide:
+    """A lift from the robot's floor to the goal's."""
+
+    place: Array  # (2,) m in map, of the lift on the robot's floor
+    floor: str  # of the goal
+
+    def waits(self, pose: Array) -> bool:
+        """Whether the robot at ``pose`` (3,) is at the lift."""
+        return bool(np.hypot(*(pose[:2] - self.place)) <= LIFT_TOLERANCE_M)
+
+    def reason(self, pose: Array) -> str:
+        """Status text of the robot at ``pose`` (3,)."""
+        if self.waits(pose):
+            return f"waiting to be taken to floor {self.floor!r}"
+        return f"driving to the lift to floor {self.floor!r}"
+
+
+def plan_ride(world: World, place: Array, goal: Array) -> LiftRide | str | None:
+    """The lift with the shortest way, in straight lines, from a ``place`` (2,) to a goal (2,) on another floor.
+
+    Returns None on the same floor, and the reason to refuse the goal if there is no lift.
+    """
+    here, there = world.floor_at(place), world.floor_at(goal)
+    if here is None or there is None or here.name == there.name:
+        return None
+    ways = []
+    for lift in world.lifts:
+        if here.name in lift and there.name in lift:
+            enter, leave = here.to_map(lift[here.name]), there.to_map(lift[there.name])
+            ways.append((float(np.hypot(*(enter - place[:2])) + np.hypot(*(goal - leave))), enter))
+    if not ways:
+        return (
+            f"goal refused: it is on floor {there.name!r}, the robot is on floor {here.name!r}, and no lift "
+            "connects them"
+        )
+    return LiftRide(min(ways, key=lambda way: way[0])[1], there.name)
