@@ -264,15 +264,8 @@ class Prior:
 
     def energy(self, poses: Array) -> Array:
         """Negative log density (N,) of poses (N, 3) in nats, without its constant."""
-        offset = difference(poses, self.mean)
+        offset = se2.difference(poses, self.mean)
         return np.asarray(0.5 * np.einsum("ni,nij,nj->n", offset, self.information, offset))
-
-
-def difference(a: Array, b: Array) -> Array:
-    """Componentwise a - b (N, 3) of poses, with the angle wrapped."""
-    off = a - b
-    off[:, 2] = se2.wrap(off[:, 2])
-    return np.asarray(off)
 
 
 def position_information(curvature: Array) -> Array:
@@ -285,7 +278,7 @@ def _steps(poses: Array, evidence: Evidence, prior: Prior | None) -> Array:
     H, slope = evidence.curvature + DAMPING, evidence.xi
     if prior:
         H = H + prior.information
-        slope = slope + np.einsum("nij,nj->ni", prior.information, difference(prior.mean, poses))
+        slope = slope + np.einsum("nij,nj->ni", prior.information, se2.difference(prior.mean, poses))
     return limit_steps(np.linalg.solve(H, slope[..., None])[..., 0], MAX_STEP)
 
 

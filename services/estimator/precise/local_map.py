@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from common.geometry import se2
 from common.geometry.se2 import Array
-from services.estimator.precise.gauss_newton import View, difference, position_information
+from services.estimator.precise.gauss_newton import View, position_information
 from services.estimator.precise.motion_model import MotionCandidate
 from services.estimator.precise.scan_surfaces import MIN_BEAMS
 
@@ -237,7 +237,7 @@ class LocalMap:
             J = np.column_stack([normal, normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]])
             weight = 1 / (1 + (error / CAUCHY_SCALE_M) ** 2)
             H = (J.T * weight) @ J
-            to_prior = difference(mean[None], pose[None])[0]
+            to_prior = se2.difference(mean, pose)
             step = np.linalg.solve(
                 H + CAUCHY_SCALE_M**2 * information,
                 CAUCHY_SCALE_M**2 * information @ to_prior - (J.T * weight) @ error,

@@ -66,8 +66,7 @@ class MotionCandidate:
 
     def squared_distance(self, pose: Array) -> float:
         """Squared Mahalanobis distance of ``pose`` (3,) from the mean."""
-        off = pose - self.mean
-        off[2] = se2.wrap(off[2])
+        off = se2.difference(pose, self.mean)
         return float(off @ np.linalg.solve(self.covariance, off))
 
     def excess(self, pose: Array) -> float:
@@ -219,8 +218,7 @@ def fuse(candidate: MotionCandidate, mode: Array, slope: Array, curvature: Array
     """
     information = np.linalg.inv(candidate.covariance)
     total = curvature + information
-    off = mode - candidate.mean
-    off[2] = se2.wrap(off[2])
+    off = se2.difference(mode, candidate.mean)
     # Minus the gradient of the parabola at the candidate's mean.
     pull = slope + curvature @ off
     step = np.linalg.solve(total, pull)

@@ -13,7 +13,7 @@ from common.geometry import se2
 from common.geometry.ray_casting import MIN_COSINE
 from common.geometry.world import World
 from services.estimator.precise import beam_sums, global_seeds
-from services.estimator.precise.gauss_newton import MAX_STEP, Prior, View, descend, difference
+from services.estimator.precise.gauss_newton import MAX_STEP, Prior, View, descend
 from services.estimator.precise.global_seeds import Seeds, thin_places
 from services.estimator.precise.hypotheses import Mode, constraining_beams, select_distinct, weigh
 from services.estimator.precise.likelihood import Likelihood
@@ -199,7 +199,7 @@ def test_trust_region(numbers, curvatures, deviations):
     mean, mode, slope = np.array(numbers).reshape(3, 3)
     mean[2] = se2.wrap(mean[2])
     found = fuse(MotionCandidate("x", mean, np.diag(deviations) ** 2, 0.5), mode, slope, np.diag(curvatures))
-    taken, off = (np.abs(difference(pose[None], mean[None])[0]) for pose in (found.mean, mode))
+    taken, off = (np.abs(se2.difference(pose, mean)) for pose in (found.mean, mode))
     assert (taken <= (off + MAX_STEP) * (1 + 1e-6) + 1e-6).all()
     assert (taken <= (3 * np.array(deviations) + 5 * MAX_STEP) * (1 + 1e-6) + 1e-6).all()
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from pydantic import ConfigDict
 
 from common.geometry import se2
-from services.estimator.precise.gauss_newton import View, difference, polish
+from services.estimator.precise.gauss_newton import View, polish
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.motion_model import MotionNoise
 from services.estimator.precise.settings import PreciseSettings
@@ -126,7 +126,7 @@ def _pose_precision(
     """
     errors, covariances = [], []
     for reference, (found, evidence) in zip(references, fitted, strict=True):
-        error = difference(found, reference[None])[0]
+        error = se2.difference(found[0], reference)
         if np.hypot(error[0], error[1]) < MAX_POSITION_ERROR_M:
             inverse = np.linalg.inv(evidence.curvature[0] + np.eye(3))
             errors.append(error + inverse @ evidence.xi[0])
