@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from services.estimator.precise.gauss_newton import CORRELATED_M
-from services.estimator.precise.noise import estimate_noise
+from services.estimator.precise.noise import NORMAL_MAD, estimate_noise
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -23,7 +23,6 @@ UPDATE_SHARE = 0.1  # weight of the present scan, or key scan, in the averages, 
 MIN_CHANGED, MAX_CHANGED = 0.02, 0.5
 MAX_NOISE_FACTOR = 4.0  # the noise is never taken for more than this times the stated one, or less than its inverse
 MAX_MAP_ERROR_M = 0.1  # larger errors are not the map's, but changes of the surroundings
-NORMAL_MAD = 1.4826  # standard deviation of a Gaussian, in median absolute deviations
 MIN_LEARNING_BEAMS = 30
 DAMPING = 1e-9  # in m; keeps the inverse finite where a direction is not observed
 
