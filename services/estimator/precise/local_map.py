@@ -20,7 +20,7 @@ from services.estimator.precise.motion_model import MotionCandidate
 from services.estimator.precise.scan_surfaces import MIN_BEAMS
 
 MAX_SCANS = 12  # in the local map
-MIN_DISTANCE_M, MIN_TURN_RAD = 0.25, 0.35  # from the last scan of the local map, before another one is added
+MIN_DISTANCE_M, MIN_TURN_RAD = 0.25, 0.35  # a key scan is taken after a motion of either size
 CELL_M = 0.05
 NEIGHBOURS, NEIGHBOUR_RADIUS_M = 10, 0.3  # points from which the normal of a surface is estimated
 # Largest distance to a point's partner, iteration by iteration.
@@ -92,10 +92,7 @@ class LocalMap:
 
     def is_key_scan_due(self, local: Array) -> bool:
         """Whether ``local`` (3,) is so far from the last key scan that the scan there becomes another one."""
-        if not self.scans:
-            return True
-        off = se2.between(self.scans[-1].pose, local)
-        return bool(np.hypot(off[0], off[1]) >= MIN_DISTANCE_M or abs(off[2]) >= MIN_TURN_RAD)
+        return not self.scans or is_key_pose(self.scans[-1].pose, local)
 
     def add(self, key: LocalMapScan, pose: Array, covariance: Array) -> None:
         """Adds a key scan, taken at ``pose`` (3,) in map with ``covariance`` (3, 3)."""
@@ -250,6 +247,12 @@ class LocalMap:
         score = ((distance < 2 * MATCHED_RADIUS_M) / (1 + (error / CAUCHY_SCALE_M) ** 2)).mean()
         covariance = np.asarray(CAUCHY_SCALE_M**2 * np.linalg.inv(H + 1e-6 * np.eye(3)), float)
         return Match(pose, covariance, float((distance < MATCHED_RADIUS_M).mean()), float(score), _is_degenerate(H))
+
+
+def is_key_pose(last: Array, pose: Array) -> bool:
+    """Whether ``pose`` (3,) is so far from that of the ``last`` (3,) key scan that another one is taken there."""
+    motion = se2.between(last, pose)
+    return bool(np.hypot(motion[0], motion[1]) >= MIN_DISTANCE_M or abs(motion[2]) >= MIN_TURN_RAD)
 
 
 def _average_in_cells(points: Array) -> Array:
