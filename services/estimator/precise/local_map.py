@@ -21,17 +21,17 @@ from services.estimator.precise.scan_surfaces import MIN_BEAMS
 
 MAX_SCANS = 12  # in the local map
 MIN_DISTANCE_M, MIN_TURN_RAD = 0.25, 0.35  # a key scan is taken after a motion of either size
-CELL_M = 0.05
+CELL_M = 0.05  # points within one cell are averaged
 NEIGHBOURS, NEIGHBOUR_RADIUS_M = 10, 0.3  # points from which the normal of a surface is estimated
 # Largest distance to a point's partner, iteration by iteration.
 PARTNER_RADII_M = (0.6, 0.6, 0.4, 0.4, 0.2, 0.2, 0.1, 0.1, 0.1, 0.1)
-CAUCHY_SCALE_M = 0.02
+CAUCHY_SCALE_M = 0.02  # of a point's distance from its line; farther points count ever less
 MATCHED_RADIUS_M = 0.08  # a point this near to one of the local map counts as matched
 SEEN_RADIUS_M = 0.15  # and this near, as on a surface that was seen before; beams far away are this far apart
-MIN_POINTS = 20
+MIN_POINTS = 20  # of a scan, each with a partner in the local map
 MAX_SQUARED_DISTANCE = 4.0  # squared standard deviations of the result from the prior
 PASSED_M = 0.3  # behind a surface, from where a beam counts as having passed through it
-MIN_CHANGED_M, WALKING_SPEED = 0.2, 1.5  # width in m of one thing that may change at once, and m/s
+MIN_CHANGED_M, WALKING_SPEED = 0.2, 1.5  # m, width of one object that may change at once; m/s
 MIN_SHARE = 0.5  # of a scan's points that must match the local map
 CLEAR_SHARE = 0.8  # with a smaller share, matching is repeated from `EXTRA_HEADINGS_RAD`
 EXTRA_HEADINGS_RAD = np.array([-0.3, -0.15, 0.15, 0.3])
@@ -136,15 +136,15 @@ class LocalMap:
         return free
 
     def count_changes(self, last: LocalScan, now: LocalScan, period: float) -> int:
-        """Number of things that vanished or appeared between two scans.
+        """Number of objects that vanished or appeared between two scans.
 
-        One thing is as wide as somebody walking can have uncovered or covered in ``period`` s.
+        One object is as wide as what a walking person can have covered or uncovered in ``period`` s.
         """
         width = MIN_CHANGED_M + WALKING_SPEED * period
         return self._count_passed(last, now, width) + self._count_passed(now, last, width)
 
     def _count_passed(self, seen: LocalScan, by: LocalScan, width: float) -> int:
-        """How many things of ``width`` m another scan passes through, of those that one scan has ``seen``."""
+        """Number of objects of ``width`` m in the scan ``seen`` through which beams of the scan ``by`` pass."""
         points = se2.transform(se2.compose(seen.pose, self.mount), seen.view.points)
         ranges, beam, inside = _beams_towards(by.view, se2.compose(by.pose, self.mount), points)
         passed = inside & (by.view.nearest_of_neighbours[beam] > ranges + PASSED_M)
@@ -219,7 +219,10 @@ class LocalMap:
         return self._normals
 
     def _register(self, start: Array, points: Array, mean: Array, information: Array) -> Match | None:
-        """Registers points (K, 2) m in the laser frame, with a Gaussian prior; None if too few have a partner."""
+        """Registers points (K, 2) m in the laser frame by iteratively reweighted Gauss-Newton, with a Gaussian prior.
+
+        Returns None if too few points have a partner.
+        """
         tree, normals = self._tree_of_points(), self._normals_of_points()
         pose, H = np.array(start), np.eye(3)
         for radius in PARTNER_RADII_M:
