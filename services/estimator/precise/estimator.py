@@ -424,7 +424,7 @@ class PreciseEstimator:
         mapped = view.surface_evidence(best.pose[None]).weights[0] > 0.5
         if self._probability() >= self.settings.tracking_probability:
             self._precision.learn_changes(view, best.pose)
-            self._precision.learn(view, best.pose)
+            self._precision.learn_map_error(view, best.pose)
         self._unknown_place.add_key_scan()
         key = LocalMapScan(self._local_pose, view, self._old_beams, mapped, self._log_change, log_unknown)
         self._local_map.add(key, best.pose, best.noise_covariance)
@@ -474,7 +474,7 @@ class PreciseEstimator:
         Returns the view with the map's errors.
         """
         if not self._precision.scans:
-            self._precision.learn(view, self.modes[0].pose)
+            self._precision.learn_map_error(view, self.modes[0].pose)
         error, offset = self._precision.map_error, self._precision.offset
         significant = SIGNIFICANT_MAP_ERROR * view.likelihood.sigma
         if error < max(view.map_error, significant) and abs(offset - view.map_offset) < significant:

@@ -71,14 +71,14 @@ def learn_version(
     sigma = estimate_noise(tracked.ranges, tracked.angles)
     error = _estimate_map_error(original, tracked, sigma)
     replayed = replay_model(original, places, tracked, min(len(places), MAX_REPLAYED_SCANS), recipe.seed)
-    beside, elsewhere = _split_replayed_beams(replayed, tracked, error, recipe.seed)
+    overlapping, elsewhere = _split_replayed_beams(replayed, tracked, error, recipe.seed)
     aligned = tracked
     for _ in range(ALIGNMENTS):
-        aligned = _match_key_scans(_learn(aligned, beside, recipe, 1), aligned, tracked.poses, sigma)
+        aligned = _match_key_scans(_learn(aligned, overlapping, recipe, 1), aligned, tracked.poses, sigma)
     aligned = align_to_map(original, aligned)
     # A trial field, learned without the held-out key scans, shows whether learning is an improvement.
     others, held_out = hold_out(aligned)
-    trial = _learn(others, beside, recipe, EPOCHS)
+    trial = _learn(others, overlapping, recipe, EPOCHS)
     _, unaligned = hold_out(tracked)
     errors, present_errors = (
         range_errors(model, _match_key_scans(model, unaligned, unaligned.poses, sigma)) for model in (trial, present)
@@ -87,7 +87,7 @@ def learn_version(
         return None
     scales = learn_scales(trial.field, held_out.poses, held_out.mount, held_out.angles, held_out.ranges, sigma)
     ripple = measure_ripple(trial.field, se2.compose(held_out.poses, held_out.mount), held_out.angles)
-    final = _learn(aligned, beside.joined(elsewhere), recipe, EPOCHS)
+    final = _learn(aligned, overlapping.joined(elsewhere), recipe, EPOCHS)
     visited = se2.compose(aligned.poses, aligned.mount)[:, :2]
     starts = seed_places(final.field, np.concatenate([visited, free_places(final, places)]), final.seen)
     starts, scales = (values.astype(np.float32).astype(np.float64) for values in (starts, scales))  # as published
