@@ -78,7 +78,7 @@ class ParticleFilter:
         self._freeze_heading()
         self.weights = np.full(len(self.particles), 1 / len(self.particles))
         self._recovery = Recovery(s.recovery_alpha_slow, s.recovery_alpha_fast)
-        self._health = Recovery(0.01, 0.5)
+        self._health = Recovery(0.01, 0.5)  # averages over about 100 and 2 scans
         self._state: State = "localising"
         self._was_found, self._searches = False, 0
         self._scans = 0

@@ -394,7 +394,9 @@ class PreciseEstimator:
 
         kidnapping = max(mode.log_evidence for mode in self.modes) + float(np.log(self.settings.unknown_probability))
         self._unknown_place.allow_kidnapping(kidnapping, self.settings.unmapped_share)
-        self._unknown_place.allow_mismatch(max(map(self._log_mismatch, self.modes, modes)))
+        # Alternatives found for this scan come last in `modes`; they have no hypothesis before.
+        pairs = zip(self.modes, modes, strict=False)
+        self._unknown_place.allow_mismatch(max(self._log_mismatch(before, after) for before, after in pairs))
         # Either the surroundings have changed, or the robot was carried off and all surfaces are new.
         self._unknown_place.present = max(_log_anywhere(view, old) + log_change, _log_anywhere(view, small))
         self._set_hypotheses(modes)

@@ -198,7 +198,7 @@ def learn_motion(stamps: Array, poses: Array, odom: Array | None) -> MotionNoise
     speed = np.hypot(velocity[regular, 0], velocity[regular, 1])
 
     def deviation(values: Array) -> float:
-        return float(np.quantile(values, 0.9) / 1.645)
+        return float(np.quantile(values, 0.9) / 1.645)  # 90 % of a Gaussian are within 1.645 standard deviations
 
     learned = MotionNoise(
         period=usual_period,
@@ -236,4 +236,4 @@ def _non_negative_least_squares(by: Array, square: Array) -> tuple[float, float]
         k = int(found.argmax())
         found = np.zeros(2)
         found[k] = max(0.0, float(by[:, k] @ square / (by[:, k] @ by[:, k])))
-    return float(found[0]) + 1e-6, float(found[1]) + 1e-6
+    return float(found[0]) + 1e-6, float(found[1]) + 1e-6  # no motion is known exactly
