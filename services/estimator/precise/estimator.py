@@ -229,9 +229,6 @@ class PreciseEstimator:
             return None
         return se2.between(self._odom, observation.odom)
 
-    def _went_back(self, stamp: float | None) -> bool:
-        return stamp is not None and self._stamp is not None and stamp < self._stamp
-
     def _period(self, stamp: float | None) -> float:
         if stamp is None or self._stamp is None or stamp <= self._stamp:
             return self.settings.motion.period
@@ -321,7 +318,7 @@ class PreciseEstimator:
         ]
         best = min(fused, key=lambda each: each.surprise)
         updated = update_mode(mode, best, evidence, k, period, unobserved=unknown_motion)
-        if self._went_back(observation.stamp):
+        if observation.stamp is not None and self._stamp is not None and observation.stamp < self._stamp:
             return updated
         return replace(updated, log_evidence=mode.log_evidence - widest.excess(best.mean))
 
@@ -516,26 +513,23 @@ class PreciseEstimator:
         if not found:
             self._unknown_place.exclude_mapped_places()
             return
-        (stayed, clutter), carried = self._log_stayed(found, view), self._log_carried(found, view)
-        best = int(np.argmax(np.maximum(stayed, carried) + np.array([mode.log_evidence for mode in found])))
+        stayed, clutter = self._log_stayed(found, view)
+        present = np.array([mode.present for mode in found])
+        carried = self._unknown_place.log_evidence + present - _log_ideal(view, view.surfaces.small)
+        evidence = np.array([mode.log_evidence for mode in found]) + np.maximum(stayed, carried)
+        clutter = np.where(stayed > carried, clutter, CLUTTER_PROBABILITY)
         added = [
-            replace(mode, log_evidence=mode.log_evidence + stayed[k], present=0.0, present_clutter=clutter[k])
-            if stayed[k] > carried[k]
-            else replace(mode, log_evidence=mode.log_evidence + carried[k], present=0.0)
+            replace(mode, log_evidence=evidence[k], present=0.0, present_clutter=clutter[k])
             for k, mode in enumerate(found)
         ]
-        if added[best].log_weight > self.modes[0].log_weight:
+        best = int(np.argmax(evidence))
+        if evidence[best] > self.modes[0].log_weight:
             self._search_interval = 1
             if carried[best] > stayed[best]:
                 self._restart_local_map(view)
         self._unknown_place.exclude_mapped_places()
         self._set_hypotheses([*self.modes, *added])
         self._add_key_scan(view)
-
-    def _log_carried(self, found: list[Mode], view: View) -> Array:
-        """Evidence (N,) in nats that the robot was carried to each of the hypotheses just now."""
-        present = np.array([mode.present for mode in found])
-        return np.asarray(self._unknown_place.log_evidence + present - _log_ideal(view, view.surfaces.small))
 
     def _log_stayed(self, found: list[Mode], view: View) -> tuple[Array, Array]:
         """Evidence (N,) in nats that the robot has been at each of the hypotheses since one of the key scans.

@@ -49,13 +49,24 @@ class Optimiser(Protocol):
 
 
 class GaussNewton:
-    """The default optimiser: the function `descend` of this module."""
+    """The default optimiser: expectation maximisation, so only beams that end at surfaces of the map count.
+
+    Each step minimises F with the states of the beams held constant.
+    """
 
     def descend(
         self, view: View, poses: Array, prior: Prior | None, schedule: tuple[float, ...]
     ) -> tuple[Array, Evidence]:
         """See Optimiser."""
-        return descend(view, poses, prior, schedule)
+        poses = np.array(poses, float)
+        for extra_sigma in schedule:
+            evidence = view.evidence(poses, extra_sigma, view.surface_evidence(poses, extra_sigma).weights)
+            step = _newton_steps(poses, evidence, prior)
+            if extra_sigma == 0.0 and (np.abs(step) < SETTLED_STEP).all():
+                return poses, evidence
+            poses = poses + step
+            poses[:, 2] = se2.wrap(poses[:, 2])
+        return poses, view.evidence(poses, 0.0, view.surface_evidence(poses).weights)
 
 
 @dataclass(frozen=True)
@@ -285,25 +296,6 @@ def _newton_steps(poses: Array, evidence: Evidence, prior: Prior | None) -> Arra
 def limit_steps(steps: npt.NDArray[np.floating[Any]], largest: Array) -> Array:
     """Shortens steps (..., 3) without changing their direction, so that no component exceeds ``largest`` (3,)."""
     return np.asarray(steps / np.maximum((np.abs(steps) / largest).max(axis=-1, keepdims=True), 1.0))
-
-
-def descend(
-    view: View, poses: Array, prior: Prior | None, schedule: tuple[float, ...] = FOLLOWING_SCHEDULE_M
-) -> tuple[Array, Evidence]:
-    """Finds the minima near ``poses`` (N, 3), with only those beams that end at surfaces of the map.
-
-    This is expectation maximisation: each step minimises F with the states of the beams held constant. ``schedule`` has
-    the deviation in m that is added to every beam's at each step.
-    """
-    poses = np.array(poses, float)
-    for extra_sigma in schedule:
-        evidence = view.evidence(poses, extra_sigma, view.surface_evidence(poses, extra_sigma).weights)
-        step = _newton_steps(poses, evidence, prior)
-        if extra_sigma == 0.0 and (np.abs(step) < SETTLED_STEP).all():
-            return poses, evidence
-        poses = poses + step
-        poses[:, 2] = se2.wrap(poses[:, 2])
-    return poses, view.evidence(poses, 0.0, view.surface_evidence(poses).weights)
 
 
 def polish(view: View, poses: Array) -> tuple[Array, Evidence]:
