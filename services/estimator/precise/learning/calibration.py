@@ -29,9 +29,7 @@ EM_STEPS = 30  # of expectation maximisation
 PRIOR_BEAMS = 10.0  # pseudo-count of each kind of beam
 CHI2_MEDIAN = 2.366  # median of chi squared with three degrees of freedom
 MAX_POSITION_ERROR_M = 0.3  # larger errors mean that another place was found; the covariance does not describe them
-# Minimum share of explained beams, relative to the usual one: the default, 0.75, divided by the 0.97 that was usual in
-# simulation when it was chosen.
-MIN_EXPLAINED_RATIO = 0.77
+MIN_EXPLAINED_RATIO = 0.77  # minimum share of explained beams, relative to the usual one: the default if 97 % are usual
 # Probabilities at which the calibration curve is evaluated.
 PROBABILITIES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 
