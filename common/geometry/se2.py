@@ -43,6 +43,13 @@ def between(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
     return compose(inverse(a), b)
 
 
+def difference(a: Array, b: Array) -> Array:
+    """Componentwise a - b of poses (..., 3), with the angle wrapped."""
+    off = a - b
+    off[..., 2] = wrap(off[..., 2])
+    return off
+
+
 def compose_jacobians(a: npt.ArrayLike, b: npt.ArrayLike) -> tuple[Array, Array]:
     """Derivatives of compose(a, b) with respect to a and b, each (3, 3), for poses (3,)."""
     a, b = np.asarray(a, float), np.asarray(b, float)

@@ -25,7 +25,7 @@ from presage.terminal.output import check_file, make_folder, provenance, write_j
 from services.estimator.factory import ScannerGeometry
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.field import DistanceField, FieldModel
-from services.estimator.precise.gauss_newton import View, difference
+from services.estimator.precise.gauss_newton import View
 from services.estimator.precise.global_seeds import Seeds
 from services.estimator.precise.learning.field_learning import seed_places
 from services.estimator.precise.settings import PreciseSettings
@@ -198,7 +198,7 @@ def _trial(estimator: PreciseEstimator, observation: Observation, truth: Array) 
     began = time.process_time()
     ranked = estimator.seeds.rank(view, PreciseSettings().ranked_seeds)
     ranking = time.process_time() - began
-    errors = difference(ranked, truth)
+    errors = se2.difference(ranked, truth)
     seeded = bool(
         ((np.hypot(errors[:, 0], errors[:, 1]) < SEED_POSITION_M) & (np.abs(errors[:, 2]) < SEED_HEADING_RAD)).any()
     )

@@ -247,9 +247,8 @@ def check_mount(geometry: ScannerGeometry, trained: Scanner) -> None:
 
     A mount that is stated may differ, because a distance field predicts scans for any mount.
     """
-    difference = geometry.mount - np.array(trained.mount)
-    difference[2] = se2.wrap(difference[2])
-    if geometry.mount_assumed and np.abs(difference).max() > MOUNT_TOLERANCE:
+    difference = np.abs(se2.difference(geometry.mount, np.array(trained.mount)))
+    if geometry.mount_assumed and difference.max() > MOUNT_TOLERANCE:
         assumed, stated = (f"{x:g},{y:g},{np.rad2deg(yaw):g}" for x, y, yaw in (geometry.mount, trained.mount))
         raise UserError(
             f"the scans do not state where the laser sits in base_link: {assumed} was assumed, but the weights were "

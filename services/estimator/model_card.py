@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from services.estimator.factory import EstimatorOptions, ScannerGeometry, field_
 from services.estimator.precise.learning import weights as precise_weights
 from services.estimator.precise.learning.drive_learning import HELD_OUT_EVERY
 from services.estimator.precise.learning.live_learning import RECIPE, ModelVersion
+from services.estimator.shared.digest import sha256
 from services.estimator.shared.model_folder import find_folder
 
 
@@ -38,7 +38,7 @@ class ModelInUse:
         data = b""
         if weights and self.path is not None:
             data = _read(self.path)
-            if hashlib.sha256(data).hexdigest() != self.sha256:
+            if sha256(data) != self.sha256:
                 raise UserError(f"{self.path} was changed since the estimator loaded it: restart the estimator")
         return ModelReply(
             estimator=self.estimator,
@@ -117,8 +117,7 @@ def save_learned(
 
 def _learned(estimator: str, world: World, path: Path, file: str) -> ModelInUse:
     data = _read(path)
-    digest = hashlib.sha256(data).hexdigest()
-    return ModelInUse(estimator, world, path, file, _card(path), len(data), digest)
+    return ModelInUse(estimator, world, path, file, _card(path), len(data), sha256(data))
 
 
 def _card(path: Path) -> str:

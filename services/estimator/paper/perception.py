@@ -56,6 +56,9 @@ class PaperPerception:
     known: bool = False  # the initial belief is the true pose, so the state is tracking from the first scan
 
     def __post_init__(self) -> None:
+        self._clear()
+
+    def _clear(self) -> None:
         """Clears the averages of step and misfit."""
         self._steps: list[float] = []
         self._misfits: list[float] = []
@@ -65,7 +68,7 @@ class PaperPerception:
     def restart(self, pose: Array, *, known: bool = False) -> None:
         """Starts at ``pose`` (3,), which is the true pose if ``known``, else only a start for localisation."""
         self.pose, self.known = np.array(pose, float), known
-        self.__post_init__()
+        self._clear()
 
     def update(self, ranges: Array, goal: Array | None = None, measured: Mask | None = None) -> PaperEstimate:
         """Descends F for a scan of usable ranges (B,) m; ``goal`` (3,) attracts the belief if beta > 0.

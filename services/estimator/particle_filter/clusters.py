@@ -52,8 +52,7 @@ def moments(poses: Array, weights: Array) -> tuple[Array, Array]:
     w = weights / weights.sum()
     yaw = np.arctan2(w @ np.sin(poses[:, 2]), w @ np.cos(poses[:, 2]))
     mean = np.array([w @ poses[:, 0], w @ poses[:, 1], yaw])
-    off = poses - mean
-    off[:, 2] = se2.wrap(off[:, 2])
+    off = se2.difference(poses, mean)
     return mean, np.asarray((off * w[:, None]).T @ off)
 
 

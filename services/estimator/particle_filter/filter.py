@@ -78,7 +78,7 @@ class ParticleFilter:
         self._freeze_heading()
         self.weights = np.full(len(self.particles), 1 / len(self.particles))
         self._recovery = Recovery(s.recovery_alpha_slow, s.recovery_alpha_fast)
-        self._health = Recovery(0.01, 0.5)
+        self._health = Recovery(0.01, 0.5)  # averages over about 100 and 2 scans
         self._state: State = "localising"
         self._was_found, self._searches = False, 0
         self._scans = 0
@@ -204,7 +204,8 @@ class ParticleFilter:
         self._sigma = self.sensor.sigma(spread, self._sigma)
         self._searching &= self._sigma > self.settings.sigma_hit
 
-    def _judge(self, found: tuple[Hypothesis, ...]) -> State:
+    def _next_state(self, found: tuple[Hypothesis, ...]) -> State:
+        """The state after a scan, from the hypotheses and how well the best one has fitted the last scans."""
         tight = [
             h.covariance is not None and np.sqrt(np.trace(h.covariance[:2, :2])) < MAX_CLUSTER_DEVIATION_M
             for h in found
@@ -235,7 +236,7 @@ class ParticleFilter:
         scan_fit = self.sensor.explain(pose, self.mount, observation)
         self._recovery.add(scan_fit.fit)
         self._health.add(scan_fit.fit)
-        self._state = self._judge(found)
+        self._state = self._next_state(found)
         return Posterior(
             state=self._state,
             hypotheses=found,

@@ -1,4 +1,4 @@
-"""The precise estimator: matches each scan with the map, fuses it with the motion, weighs hypotheses, and searches."""
+"""The precise estimator. `PreciseEstimator.track` and `search` take the steps of docs/precise.md, section Update."""
 
 from __future__ import annotations
 
@@ -58,9 +58,10 @@ if TYPE_CHECKING:
 
 START_COVARIANCE = np.diag([0.25, 0.25, 0.09])  # of a pose given without one
 MAX_SEARCH_INTERVAL = 150  # scans between two searches without success; the interval doubles from 1
-# Probability that a match with recent scans is wrong, and the right motion one of many that fit the map.
+# Probability that a match with the local map is wrong, and the right motion one of many that fit the map: 14 nats.
 WRONG_MATCH = 1e-6
-SIGNIFICANT_MAP_ERROR = 0.25  # of the scanner's noise: less is within what the noise of one scan makes it seem
+# As a share of the scanner's noise: smaller errors of the map cannot be told from the noise of one scan.
+SIGNIFICANT_MAP_ERROR = 0.25
 UNKNOWN_SIGMA_M = 100.0  # published where the model does not know what to expect
 TARGET_BEAMS = 2000  # a scan with at least twice as many is thinned, because the time of a search grows with the beams
 
@@ -72,7 +73,7 @@ class ScanMatch:
     motions: list[list[MotionCandidate]]  # since the last scan, of each hypothesis; the last one is the widest
     poses: Array  # (N, 3), one per hypothesis
     evidence: Evidence  # at these poses
-    local_pose: Array | None = None  # (3,) in the local frame, if recent scans gave the motion
+    local_pose: Array | None = None  # (3,) in the local frame, if the local map gave the motion
 
 
 class PreciseEstimator:
@@ -143,37 +144,35 @@ class PreciseEstimator:
 
     def track(self, observation: Observation) -> Posterior | None:
         """Returns the posterior after one more scan, or None if `search` must be called for it."""
-        likelihood = self._precision.likelihood(self.likelihood, observation.ranges, observation.angles)
-        view = View(
-            self.model,
-            likelihood,
-            self.mount,
-            observation.angles,
-            observation.ranges,
-            observation.range_max,
-            self._optimiser,
-            self._precision.map_error,
-            self._precision.changed,
-            self._precision.offset,
-        )
-        velocity = self._velocity(self.modes[0], observation) if self.modes else None
-        view = self._correct_motion(view, observation, velocity)
-        if self.modes:
-            view = self._track_hypotheses(view, observation)
-        self._scan = view, observation
+        view = self._view(observation)
         if not self.modes:
+            self._scan = view, observation
             return None
+        # Motion prior
+        period, odom = self._period(observation.stamp), self._odometry_since_last_scan(observation)
+        motions = [self._predict_motion(mode, period, odom, observation.command) for mode in self.modes]
+        # Optimisation
+        match, explained = self._match_map(view, motions, period, with_odometry=odom is not None)
+        # Local map
+        if explained < self.settings.min_explained_share:
+            match = self._match_local_map(view, match)
+        if observation.time_increment and any(each.excess(match.poses[0]) == 0 for each in motions[0][:-1]):
+            # If the match is none of the predicted motions, the robot may have been carried off, and not have moved
+            # during the scan.
+            view, match = self._correct_motion_again(view, observation, match, period)
+        # Fusion of match and motion prior
+        modes = [self._fuse(view, k, match, motions[k][-1], observation) for k in range(len(match.poses))]
+        modes += self._find_alternatives(view, modes[0], match.motions[0])
+        # Weights, also of the unknown place
+        self._weigh_hypotheses(view, modes, match.local_pose, period)
+        self._scan = view, observation
+        # Global search
         self._scans_since_search += 1
         if not self._may_be_elsewhere():
             self._search_interval = 1
         elif self._is_search_due():
             return None
         return self._finish_scan(view, observation)
-
-    def _correct_motion(self, view: View, observation: Observation, velocity: Array | None) -> View:
-        """The view of the observation, corrected for a motion with ``velocity`` (3,) in base_link, and thinned."""
-        corrected = correct_motion(observation, velocity, self.mount)
-        return replace(view, angles=corrected.angles, ranges=corrected.ranges).thinned(TARGET_BEAMS)
 
     def search(self) -> Posterior:
         """Searches near the initial pose or in the whole map for the scan last given to `track`.
@@ -189,36 +188,34 @@ class PreciseEstimator:
             view = self._search_with_map_error(view, start)
         return self._finish_scan(view, observation)
 
-    def _search_with_map_error(self, view: View, start: tuple[Array, Array] | None) -> View:
-        """Searches again if the first scan contradicts what was assumed of the map's errors.
-
-        Returns the view with the map's errors.
-        """
-        if not self._precision.scans:
-            self._precision.learn(view, self.modes[0].pose)
-        error, offset = self._precision.map_error, self._precision.offset
-        significant = SIGNIFICANT_MAP_ERROR * view.likelihood.sigma
-        if error < max(view.map_error, significant) and abs(offset - view.map_offset) < significant:
-            return view
-        view = replace(view, map_error=error, map_offset=offset)
-        self.modes, self._start = [], start
-        self._search_for_hypotheses(view)
-        return view
-
     def predict(self, poses: Array, angles: Array) -> Predicted:
         """Predicts scans (see PoseEstimator); sigma combines the scanner's noise and the model's stated error."""
         expected = self.model.expect(se2.compose(poses, self.mount), angles)
         return self._predicted(moved_back(expected, self._precision.offset))
 
-    def _predicted(self, expected: Expected) -> Predicted:
-        unknown = np.isinf(expected.scale)
-        sigma = np.where(unknown, UNKNOWN_SIGMA_M, np.hypot(expected.scale, self.likelihood.deviation(expected.ranges)))
-        return Predicted(np.where(unknown, np.inf, expected.ranges), sigma)
+    def _view(self, observation: Observation) -> View:
+        """The scan with the noise and the map's errors as learned so far, corrected for motion and thinned."""
+        likelihood = self._precision.likelihood(self.likelihood, observation.ranges, observation.angles)
+        view = View(
+            self.model,
+            likelihood,
+            self.mount,
+            observation.angles,
+            observation.ranges,
+            observation.range_max,
+            self._optimiser,
+            self._precision.map_error,
+            self._precision.changed,
+            self._precision.offset,
+        )
+        return self._correct_motion(
+            view, observation, self._velocity(self.modes[0], observation) if self.modes else None
+        )
 
-    def _odometry_since_last_scan(self, observation: Observation) -> Array | None:
-        if observation.odom is None or self._odom is None:
-            return None
-        return se2.between(self._odom, observation.odom)
+    def _correct_motion(self, view: View, observation: Observation, velocity: Array | None) -> View:
+        """The view of the observation, corrected for a motion with ``velocity`` (3,) in base_link, and thinned."""
+        corrected = correct_motion(observation, velocity, self.mount)
+        return replace(view, angles=corrected.angles, ranges=corrected.ranges).thinned(TARGET_BEAMS)
 
     def _velocity(self, mode: Mode, observation: Observation) -> Array | None:
         """Velocity (3,) in base_link by the last poses, else by odometry; None if unknown."""
@@ -227,54 +224,31 @@ class PreciseEstimator:
             return mode.velocity
         return odom / self._period(observation.stamp)
 
-    def _predict(self, mode: Mode, period: float, odom: Array | None, command: Array | None) -> list[MotionCandidate]:
+    def _odometry_since_last_scan(self, observation: Observation) -> Array | None:
+        if observation.odom is None or self._odom is None:
+            return None
+        return se2.between(self._odom, observation.odom)
+
+    def _period(self, stamp: float | None) -> float:
+        if stamp is None or self._stamp is None or stamp <= self._stamp:
+            return self.settings.motion.period
+        return stamp - self._stamp
+
+    def _predict_motion(
+        self, mode: Mode, period: float, odom: Array | None, command: Array | None
+    ) -> list[MotionCandidate]:
         """Predicts the motions that the robot may have made since the last scan; the last one is the widest."""
         return predict_motion(
             self.settings.motion, mode.pose, mode.noise_covariance, period, odom, command, mode.velocity, mode.drift
         )
 
-    def _track_hypotheses(self, view: View, observation: Observation) -> View:
-        """Moves every hypothesis by the motion since the last scan, and fuses it with the scan.
-
-        Returns the scan as corrected for that motion.
-        """
-        period, odom = self._period(observation.stamp), self._odometry_since_last_scan(observation)
-        motions = [self._predict(mode, period, odom, observation.command) for mode in self.modes]
-        match = self._match(view, motions, period, with_odometry=odom is not None)
-        if observation.time_increment and any(each.excess(match.poses[0]) == 0 for each in motions[0][:-1]):
-            # Once more, corrected for the motion that the match has shown. If it is none of those predicted, the robot
-            # may have been carried off, and not have moved during the scan.
-            velocity = -se2.between(match.poses[0], self.modes[0].pose) / period
-            view = self._correct_motion(view, observation, velocity)
-            poses, evidence = view.descend(match.poses, _prior_of([each[-1] for each in match.motions]))
-            match = replace(match, poses=poses, evidence=evidence)
-        modes = [self._fuse(view, k, match, motions[k][-1], observation) for k in range(len(match.poses))]
-        modes += self._search_where_possible(view, modes[0], match.motions[0])
-        self._weigh_scan(view, modes, match.local_pose, period)
-        return view
-
-    def _search_where_possible(self, view: View, best: Mode, candidates: list[MotionCandidate]) -> list[Mode]:
-        """Other hypotheses that fit the scan, if it has just made the ``best`` one far less uncertain.
-
-        Before, the robot may have been at many poses, and the descent from one of them finds the nearest match only.
-        """
-        before = self.modes[0]
-        doubt = 1 - self._probability_of_being_near(before)
-        certain = doubt <= 1 - self.settings.tracking_probability
-        if certain or 1 - self._probability_of_being_near(best) > 0.5 * doubt:
-            return []
-        motion = candidates[0]
-        found = search_near(view, motion.mean, motion.covariance, self.seeds, self.settings, self._rng)
-        at_best = before.log_evidence + _prior_of([motion]).energy(best.pose[None])[0]
-        return [replace(mode, log_evidence=at_best + mode.log_evidence) for mode in found]
-
-    def _match(
+    def _match_map(
         self, view: View, motions: list[list[MotionCandidate]], period: float, *, with_odometry: bool
-    ) -> ScanMatch:
+    ) -> tuple[ScanMatch, float]:
         """Matches the scan to the map near the predicted pose of each hypothesis.
 
-        If the map explains much less than before, over a wider area. If it explains too little, recent scans give the
-        motion.
+        If the map explains much less than before, searches a wider area. Also returns the share of beams that the map
+        explains at the first pose.
         """
         widest = _prior_of([each[-1] for each in motions])
         poses, evidence = view.descend(np.array([each[-2].mean for each in motions]), widest)
@@ -288,11 +262,10 @@ class PreciseEstimator:
             if after > before:
                 poses, evidence = wider_poses, wider_evidence
                 explained = view.surface_evidence(poses).explained[0]
-        match = ScanMatch(motions, poses, evidence)
-        return match if explained >= self.settings.min_explained_share else self._match_recent_scans(view, match)
+        return ScanMatch(motions, poses, evidence), float(explained)
 
-    def _match_recent_scans(self, view: View, match: ScanMatch) -> ScanMatch:
-        """Matches the scan again, with the motion that recent scans give, if they give one."""
+    def _match_local_map(self, view: View, match: ScanMatch) -> ScanMatch:
+        """Matches the scan again, with the motion that the local map gives, unless it gives none or the map another."""
         candidates = match.motions[0]
         starts = np.array([*(each.mean for each in candidates), match.poses[0]])
         found = self._local_map.match(starts, view.points, candidates[-1])
@@ -303,11 +276,22 @@ class PreciseEstimator:
         step = se2.between(self.modes[0].pose, moved.mean)
         motions = [replace(moved, mean=se2.compose(mode.pose, step)) for mode in self.modes]
         poses, evidence = view.descend(np.array([each.mean for each in motions]), _prior_of(motions))
-        by_recent_scans = ScanMatch([[each] for each in motions], poses, evidence, found.pose)
+        by_local_map = ScanMatch([[each] for each in motions], poses, evidence, found.pose)
         # Recent scans mislead where people move all around the robot, the map where much has changed.
         both = np.stack([match.poses[0], poses[0]])
-        by_map, by_scans = _log_at_poses(view, both, view.surfaces.small, np.full(2, self.modes[0].clutter))[0]
-        return match if by_map + np.log(WRONG_MATCH) > by_scans else by_recent_scans
+        map_evidence, local_evidence = _log_at_poses(
+            view, both, view.surfaces.small, np.full(2, self.modes[0].clutter)
+        )[0]
+        return match if map_evidence + np.log(WRONG_MATCH) > local_evidence else by_local_map
+
+    def _correct_motion_again(
+        self, view: View, observation: Observation, match: ScanMatch, period: float
+    ) -> tuple[View, ScanMatch]:
+        """Corrects the scan for the motion that the match has shown, and matches it again."""
+        velocity = -se2.between(match.poses[0], self.modes[0].pose) / period
+        view = self._correct_motion(view, observation, velocity)
+        poses, evidence = view.descend(match.poses, _prior_of([each[-1] for each in match.motions]))
+        return view, replace(match, poses=poses, evidence=evidence)
 
     def _fuse(self, view: View, k: int, match: ScanMatch, widest: MotionCandidate, observation: Observation) -> Mode:
         """Fuses the k-th hypothesis with the scan.
@@ -319,7 +303,7 @@ class PreciseEstimator:
         mode, period = self.modes[k], self._period(observation.stamp)
         candidates, pose, evidence = match.motions[k], match.poses[k], match.evidence
         unobserved = self._remove_unobserved(view, mode, pose, evidence, k)
-        # A match with recent scans, the only candidate then, gives the motion in the unobserved directions, too.
+        # A match with the local map, the only candidate then, gives the motion in the unobserved directions, too.
         unknown_motion = len(unobserved) > 0 and len(candidates) > 1
         if unknown_motion and self._odometry_since_last_scan(observation) is None:
             *candidates, widest = (
@@ -334,7 +318,7 @@ class PreciseEstimator:
         ]
         best = min(fused, key=lambda each: each.surprise)
         updated = update_mode(mode, best, evidence, k, period, unobserved=unknown_motion)
-        if self._went_back(observation.stamp):
+        if observation.stamp is not None and self._stamp is not None and observation.stamp < self._stamp:
             return updated
         return replace(updated, log_evidence=mode.log_evidence - widest.excess(best.mean))
 
@@ -363,11 +347,26 @@ class PreciseEstimator:
         project_evidence(evidence, k, unobserved)
         return unobserved
 
-    def _weigh_scan(self, view: View, modes: list[Mode], local: Array | None, period: float) -> None:
+    def _find_alternatives(self, view: View, best: Mode, candidates: list[MotionCandidate]) -> list[Mode]:
+        """Other hypotheses within the motion prior that fit the scan, if it has made the ``best`` one far more certain.
+
+        Before, the robot may have been at many poses, and the descent from one of them finds the nearest match only.
+        """
+        before = self.modes[0]
+        doubt = 1 - self._probability_of_being_near(before)
+        certain = doubt <= 1 - self.settings.tracking_probability
+        if certain or 1 - self._probability_of_being_near(best) > 0.5 * doubt:
+            return []
+        motion = candidates[0]
+        found = search_near(view, motion.mean, motion.covariance, self.seeds, self.settings, self._rng)
+        at_best = before.log_evidence + _prior_of([motion]).energy(best.pose[None])[0]
+        return [replace(mode, log_evidence=at_best + mode.log_evidence) for mode in found]
+
+    def _weigh_hypotheses(self, view: View, modes: list[Mode], local: Array | None, period: float) -> None:
         """Weighs hypotheses by how well the map predicts those surfaces of the scan that are new to the robot.
 
-        Surfaces that were seen before are no evidence again. ``local`` (3,) is the pose in the local frame, if recent
-        scans gave it.
+        Surfaces that were seen before are no evidence again. ``local`` (3,) is the pose in the local frame, if the
+        local map gave it.
         """
         if local is None:
             local = self._local_map.to_local(modes[0].pose)
@@ -375,29 +374,34 @@ class PreciseEstimator:
         states = view.surface_evidence(poses)
         seen, appeared = self._local_map.find_old_beams(local, view, states.weights[0] > 0.5)
         old, small = seen | appeared | view.surfaces.small, view.surfaces.small
+
+        # Changes are as probable at all hypotheses. A sudden one more is a reason to search soon.
         changes = self._local_map.count_changes(self._last, LocalScan(local, view), period) if self._last else 0
         log_of_one = float(np.log(min(0.5, self.settings.change_rate * period)))
-        log_change = changes * log_of_one
-        log_change += float((view.surfaces.density - view.surfaces.ideal)[appeared & ~seen & ~small].sum())
+        log_change = changes * log_of_one + _log_anywhere(view, ~appeared | seen | small)
         if log_change <= self._log_change + log_of_one:
             self._search_interval = 1
+
         present, clutter = _log_at_poses(view, poses, old, np.array([mode.clutter for mode in modes]))
         modes = [
             replace(mode, explained=states.explained[k], present=present[k] + log_change, present_clutter=clutter[k])
             for k, mode in enumerate(modes)
         ]
         self._local_pose, self._old_beams, self._log_change = local, old, log_change
+
         kidnapping = max(mode.log_evidence for mode in self.modes) + float(np.log(self.settings.unknown_probability))
         self._unknown_place.allow_kidnapping(kidnapping, self.settings.unmapped_share)
-        self._unknown_place.allow_mismatch(max(map(self._log_mismatch, self.modes, modes)))
+        # Alternatives found for this scan come last in `modes`; they have no hypothesis before.
+        pairs = zip(self.modes, modes, strict=False)
+        self._unknown_place.allow_mismatch(max(self._log_mismatch(before, after) for before, after in pairs))
         # Either the surroundings have changed, or the robot was carried off and all surfaces are new.
         self._unknown_place.present = max(_log_anywhere(view, old) + log_change, _log_anywhere(view, small))
         self._set_hypotheses(modes)
 
     def _log_mismatch(self, before: Mode, after: Mode) -> float:
-        """Evidence in nats that a scan was matched at a wrong one of the poses that a hypothesis allowed ``before``.
+        """Evidence in nats that a scan was matched at the wrong pose, among those probable ``before`` it.
 
-        Such are all those at which it was not expected, if it has made an uncertain pose certain.
+        If the scan has made an uncertain pose certain, the probability gained may be due to a wrong match.
         """
         gained = self._probability_of_being_near(after) - self._probability_of_being_near(before)
         return before.log_evidence + (float(np.log(gained)) if gained > 0 else -np.inf)
@@ -419,7 +423,7 @@ class PreciseEstimator:
         mapped = view.surface_evidence(best.pose[None]).weights[0] > 0.5
         if self._probability() >= self.settings.tracking_probability:
             self._precision.learn_changes(view, best.pose)
-            self._precision.learn(view, best.pose)
+            self._precision.learn_map_error(view, best.pose)
         self._unknown_place.add_key_scan()
         key = LocalMapScan(self._local_pose, view, self._old_beams, mapped, self._log_change, log_unknown)
         self._local_map.add(key, best.pose, best.noise_covariance)
@@ -429,7 +433,7 @@ class PreciseEstimator:
         ]
 
     def _may_be_elsewhere(self) -> bool:
-        """Whether the whereabouts are uncertain, or another place could fit the scans much better."""
+        """Whether the pose is uncertain, or another place could fit the scans much better."""
         best = self.modes[0]
         if self._probability() < self.settings.tracking_probability:
             return True
@@ -463,6 +467,22 @@ class PreciseEstimator:
         else:
             self._add_hypotheses(self._search_everywhere(view), view)
 
+    def _search_with_map_error(self, view: View, start: tuple[Array, Array] | None) -> View:
+        """Searches again if the first scan contradicts what was assumed of the map's errors.
+
+        Returns the view with the map's errors.
+        """
+        if not self._precision.scans:
+            self._precision.learn_map_error(view, self.modes[0].pose)
+        error, offset = self._precision.map_error, self._precision.offset
+        significant = SIGNIFICANT_MAP_ERROR * view.likelihood.sigma
+        if error < max(view.map_error, significant) and abs(offset - view.map_offset) < significant:
+            return view
+        view = replace(view, map_error=error, map_offset=offset)
+        self.modes, self._start = [], start
+        self._search_for_hypotheses(view)
+        return view
+
     def _search_everywhere(self, view: View) -> list[Mode]:
         """Hypotheses in the whole map that predict the scan clearly better than none does; at least one."""
         found = search_everywhere(view, self.seeds, self.settings)
@@ -489,19 +509,21 @@ class PreciseEstimator:
         self._unknown_place.present = _log_anywhere(view, self._old_beams)
 
     def _add_hypotheses(self, found: list[Mode], view: View) -> None:
-        """Adds hypotheses at which the robot may have been for some time, or to which it was just carried."""
+        """Adds hypotheses at which the robot may have been since a key scan, or to which it was just carried."""
         if not found:
             self._unknown_place.exclude_mapped_places()
             return
-        (stayed, clutter), carried = self._log_stayed(found, view), self._log_carried(found, view)
-        best = int(np.argmax(np.maximum(stayed, carried) + np.array([mode.log_evidence for mode in found])))
+        stayed, clutter = self._log_stayed(found, view)
+        present = np.array([mode.present for mode in found])
+        carried = self._unknown_place.log_evidence + present - _log_ideal(view, view.surfaces.small)
+        evidence = np.array([mode.log_evidence for mode in found]) + np.maximum(stayed, carried)
+        clutter = np.where(stayed > carried, clutter, CLUTTER_PROBABILITY)
         added = [
-            replace(mode, log_evidence=mode.log_evidence + stayed[k], present=0.0, present_clutter=clutter[k])
-            if stayed[k] > carried[k]
-            else replace(mode, log_evidence=mode.log_evidence + carried[k], present=0.0)
+            replace(mode, log_evidence=evidence[k], present=0.0, present_clutter=clutter[k])
             for k, mode in enumerate(found)
         ]
-        if added[best].log_weight > self.modes[0].log_weight:
+        best = int(np.argmax(evidence))
+        if evidence[best] > self.modes[0].log_weight:
             self._search_interval = 1
             if carried[best] > stayed[best]:
                 self._restart_local_map(view)
@@ -509,18 +531,14 @@ class PreciseEstimator:
         self._set_hypotheses([*self.modes, *added])
         self._add_key_scan(view)
 
-    def _log_carried(self, found: list[Mode], view: View) -> Array:
-        """Evidence (N,) in nats that the robot was carried to each of the hypotheses just now."""
-        present = np.array([mode.present for mode in found])
-        return np.asarray(self._unknown_place.log_evidence + present - _log_ideal(view, view.surfaces.small))
-
     def _log_stayed(self, found: list[Mode], view: View) -> tuple[Array, Array]:
-        """Evidence (N,) in nats that the robot has been at each of the hypotheses since the best of the key scans.
+        """Evidence (N,) in nats that the robot has been at each of the hypotheses since one of the key scans.
 
-        Also the probability (N,) of clutter in the present scan then.
+        That is the key scan since which the evidence is greatest. Also returns the probability (N,) that the present
+        scan is clutter then.
         """
         poses = np.array([mode.pose for mode in found])
-        stayed = np.full((1, len(found)), -np.inf)  # since each of the key scans so far; first, since none
+        stayed = np.full((1, len(found)), -np.inf)  # a row for each key scan so far, after a first one for none
         clutter = np.full_like(stayed, CLUTTER_PROBABILITY)
         for key in self._local_map.scans:
             stayed = np.vstack([stayed, np.full(len(found), key.log_unknown)])
@@ -532,14 +550,6 @@ class PreciseEstimator:
         stayed += gain + self._log_change
         best, each = stayed.argmax(axis=0), np.arange(len(found))
         return stayed[best, each], clutter[best, each]
-
-    def _went_back(self, stamp: float | None) -> bool:
-        return stamp is not None and self._stamp is not None and stamp < self._stamp
-
-    def _period(self, stamp: float | None) -> float:
-        if stamp is None or self._stamp is None or stamp <= self._stamp:
-            return self.settings.motion.period
-        return stamp - self._stamp
 
     def _finish_scan(self, view: View, observation: Observation) -> Posterior:
         """Stores what the next scan needs, and returns the posterior."""
@@ -557,6 +567,11 @@ class PreciseEstimator:
             self._predicted(view.expected(poses[0])) if same_beams else self.predict(poses[0][None], observation.angles)
         )
         return self._posterior(view, poses, predicted, self._probability())
+
+    def _predicted(self, expected: Expected) -> Predicted:
+        unknown = np.isinf(expected.scale)
+        sigma = np.where(unknown, UNKNOWN_SIGMA_M, np.hypot(expected.scale, self.likelihood.deviation(expected.ranges)))
+        return Predicted(np.where(unknown, np.inf, expected.ranges), sigma)
 
     def _posterior(self, view: View, poses: list[Array], predicted: Predicted, probability: float) -> Posterior:
         """The posterior with the hypotheses at ``poses``, those at the stamp of the scan."""
@@ -604,19 +619,23 @@ class PreciseEstimator:
 
 
 def _log_ideal(view: View, skip: npt.NDArray[np.bool_]) -> float:
-    """Log likelihood of the beams that are not in ``skip`` (B,), in nats, if all surfaces were known."""
+    """Log likelihood in nats of the scan, without the beams in ``skip`` (B,), if all surfaces were known.
+
+    It is the reference for the likelihoods that the next two functions return.
+    """
     return float(view.surfaces.ideal[~skip].sum())
 
 
 def _log_anywhere(view: View, skip: npt.NDArray[np.bool_]) -> float:
-    """The same at a place of which no surface is known, minus `_log_ideal`."""
+    """Log likelihood in nats, minus `_log_ideal`, at a place of which no surface is known."""
     return float((view.surfaces.density - view.surfaces.ideal)[~skip].sum())
 
 
 def _log_at_poses(view: View, poses: Array, skip: npt.NDArray[np.bool_], clutter: Array) -> tuple[Array, Array]:
-    """The same (..., N) at ``poses`` (N, 3) in the map, or if the scan is clutter, which is as likely at all poses.
+    """Log likelihoods (..., N) in nats, minus `_log_ideal`, at ``poses`` (N, 3) in the map.
 
-    ``clutter`` (..., N) is the probability that the key scan before was clutter. Also returns that of this scan.
+    Each is a mixture: the scan may also be clutter, which is equally likely at all poses. ``clutter`` (..., N) is the
+    probability that the key scan before was clutter. Also returns the probability (..., N) that this scan is.
     """
     mapped = view.surface_evidence(poses, skip=skip).log_likelihood - _log_ideal(view, skip)
     # Clutter begins so often that `CLUTTER_PROBABILITY` is its share of all key scans.

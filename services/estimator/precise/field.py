@@ -30,7 +30,7 @@ DIP_EDGES = np.array([0.001, 0.002, 0.005, 0.01, 0.02, 0.03, 0.05, 0.1])
 DEPTH_EDGES = np.array([0.0, 0.25, 0.5, 0.75])
 FACING_EDGES = np.array([0.05, 0.1, 0.2, 0.5])
 SOLID_DIRECTIONS = 360  # of beams that find out what is solid
-SOLID_MARGIN_CELLS = 2  # between these beams
+SOLID_MARGIN_CELLS = 2  # a node this near to such a beam is free: the beams leave gaps
 SEEN_CELL_M = 0.2  # so large that neighbouring beams leave no gaps
 CLASSES = (len(DIP_EDGES) + 1, len(DEPTH_EDGES) + 1, len(FACING_EDGES) + 1)
 

@@ -71,7 +71,7 @@ def trace_beam(phi: Floats, h: float, x: float, y: float, ux: float, uy: float) 
         if falling and value > previous:
             dip = min(dip, previous * h)
         falling, previous = value < previous, value
-        step = max(0.98 * value, MIN_STEP_CELLS)
+        step = max(0.98 * value, MIN_STEP_CELLS)  # not all of phi, because it is not exactly a distance
         t += step
     return np.inf, dip
 
@@ -149,7 +149,7 @@ def mark_crossed(
                 if not (0 <= column < nx and 0 <= row < ny):
                     break
                 crossed[row, column] = True
-                t += 0.7
+                t += 0.7  # cells, so that no row or column is skipped
 
 
 @jit

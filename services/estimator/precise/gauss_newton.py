@@ -28,7 +28,7 @@ MAX_STEP = np.array([0.5, 0.5, 0.3])  # m, m, rad: beyond this distance the line
 SETTLED_STEP = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: this near, F is quadratic and needs no further evaluation
 # Added in quadrature to every beam's standard deviation during a descent, so that the minimum is wide at first.
 COARSE_SIGMA_M, MEDIUM_SIGMA_M = 0.3, 0.1
-FOLLOWING_SCHEDULE_M = (0.05, 0.0, 0.0, 0.0, 0.0)  # the same, from a predicted pose
+FOLLOWING_SCHEDULE_M = (0.05, 0.0, 0.0, 0.0, 0.0)  # the same step by step, in a descent from a predicted pose
 MAX_POLISHING_STEPS = 4
 CORRELATED_M = 2.0  # along a surface, on which the errors of a map are alike
 DAMPING = np.diag([1.0, 1.0, 1.0]) * 1e-6  # 1/m², 1/rad²: no step along directions without information
@@ -49,36 +49,47 @@ class Optimiser(Protocol):
 
 
 class GaussNewton:
-    """The default optimiser: the function `descend` of this module."""
+    """The default optimiser: expectation maximisation, so only beams that end at surfaces of the map count.
+
+    Each step minimises F with the states of the beams held constant.
+    """
 
     def descend(
         self, view: View, poses: Array, prior: Prior | None, schedule: tuple[float, ...]
     ) -> tuple[Array, Evidence]:
         """See Optimiser."""
-        return descend(view, poses, prior, schedule)
+        poses = np.array(poses, float)
+        for extra_sigma in schedule:
+            evidence = view.evidence(poses, extra_sigma, view.surface_evidence(poses, extra_sigma).weights)
+            step = _newton_steps(poses, evidence, prior)
+            if extra_sigma == 0.0 and (np.abs(step) < SETTLED_STEP).all():
+                return poses, evidence
+            poses = poses + step
+            poses[:, 2] = se2.wrap(poses[:, 2])
+        return poses, view.evidence(poses, 0.0, view.surface_evidence(poses).weights)
 
 
 @dataclass(frozen=True)
-class _AtPoses:
-    """What was computed of a scan at some poses."""
+class _PredictedScans:
+    """What the model predicts at some poses, and the evidence that was computed from it."""
 
     poses: Array  # (N, 3)
     stated: Expected  # as the model predicts
     expected: Expected  # the same with the map's error
     behind: Array  # (N, B) m, ranges behind the surfaces that the scan passed through
-    borders: npt.NDArray[np.bool_]  # (N, B) where the map shows another surface than at the beam before
+    borders: npt.NDArray[np.bool_]  # (N, B) see find_borders
     evidence: dict[tuple[float, bytes | None], SurfaceEvidence] = field(default_factory=dict)
 
-    def first(self, count: int) -> _AtPoses:
+    def first(self, count: int) -> _PredictedScans:
         """The same at the first ``count`` poses."""
         rows = slice(count)
         stated, expected = self.stated.part(rows), self.expected.part(rows)
-        return _AtPoses(self.poses[rows], stated, expected, self.behind[rows], self.borders[rows])
+        return _PredictedScans(self.poses[rows], stated, expected, self.behind[rows], self.borders[rows])
 
 
 @dataclass(frozen=True)
 class View:
-    """One scan, with the model, the likelihood and the optimiser by which poses are compared with it."""
+    """One scan, and what it takes to compare it with poses: the model and its errors, likelihood and optimiser."""
 
     model: GenerativeModel
     likelihood: Likelihood
@@ -90,7 +101,7 @@ class View:
     map_error: float = 0.0  # m, standard deviation beyond what the model states, alike for neighbouring beams
     changed: float = 0.25  # share of surfaces that the map does not show as they are
     map_offset: float = 0.0  # m, mean distance of the real surfaces behind those that the model predicts
-    _last: list[_AtPoses] = field(default_factory=list, init=False, repr=False)
+    _last: list[_PredictedScans] = field(default_factory=list, init=False, repr=False)
 
     def thinned(self, beams: int) -> View:
         """Returns a view with every k-th beam, so that about ``beams`` are left."""
@@ -164,7 +175,7 @@ class View:
         self, poses: Array, extra_sigma: float = 0.0, skip: npt.NDArray[np.bool_] | None = None
     ) -> SurfaceEvidence:
         """Returns the evidence by surfaces at base_link poses (N, 3); beams in ``skip`` (B,) do not count."""
-        at, key = self._at(poses), (extra_sigma, None if skip is None else skip.tobytes())
+        at, key = self._predicted(poses), (extra_sigma, None if skip is None else skip.tobytes())
         if key not in at.evidence:
             at.evidence[key] = SurfaceEvidence.of(
                 self.ranges,
@@ -182,12 +193,12 @@ class View:
 
     def expected(self, pose: Array) -> Expected:
         """The scan that the model predicts at one ``pose`` (3,)."""
-        return self._at(pose[None]).stated
+        return self._predicted(pose[None]).stated
 
-    def _at(self, poses: Array) -> _AtPoses:
-        """The scan as predicted at poses (N, 3).
+    def _predicted(self, poses: Array) -> _PredictedScans:
+        """The scans predicted at poses (N, 3).
 
-        Keeps the last result, because several kinds of evidence are computed at the same poses, or at the first.
+        Keeps the last result, because several kinds of evidence are computed at the same poses, or the first of them.
         """
         if not self._last or not np.array_equal(self._last[0].poses[: len(poses)], poses):
             lasers = se2.compose(poses, self.mount)
@@ -197,7 +208,7 @@ class View:
                 passed = self.ranges > expected.ranges + self.likelihood.deviation(expected.ranges)
             behind = self.model.expect_behind(lasers, self.angles, np.where(passed, expected.ranges, np.inf))
             borders = find_borders(stated, lasers, self.angles)
-            self._last[:] = [_AtPoses(np.array(poses), stated, expected, behind, borders)]
+            self._last[:] = [_PredictedScans(np.array(poses), stated, expected, behind, borders)]
         elif len(poses) < len(self._last[0].poses):
             self._last[:] = [self._last[0].first(len(poses))]
         return self._last[0]
@@ -209,13 +220,13 @@ class View:
         derivatives of each beam.
         """
         lasers = se2.compose(poses, self.mount)
-        expected = self._with_map_error(self.expect(lasers)) if attention is None else self._at(poses).expected
+        expected = self._with_map_error(self.expect(lasers)) if attention is None else self._predicted(poses).expected
         at_laser = self.likelihood.evaluate(self.ranges, self.range_max, expected, extra_sigma, attention)
         return self._at_base(at_laser, poses, lasers)
 
-    def evidence_by_surface(self, pose: Array) -> Evidence:
+    def evidence_of_each_surface(self, pose: Array) -> Evidence:
         """Returns the evidence at one ``pose`` (3,) of each of the N surfaces of the scan that the map shows."""
-        expected, surface = self._at(pose[None]).expected, np.cumsum(self.surfaces.starts)
+        expected, surface = self._predicted(pose[None]).expected, np.cumsum(self.surfaces.starts)
         weights = self.surface_evidence(pose[None]).weights * ~self.surfaces.small
         shown = np.unique(surface[weights[0] > 0])
         first, last = np.searchsorted(surface, shown), np.searchsorted(surface, shown, "right")
@@ -264,15 +275,8 @@ class Prior:
 
     def energy(self, poses: Array) -> Array:
         """Negative log density (N,) of poses (N, 3) in nats, without its constant."""
-        offset = difference(poses, self.mean)
+        offset = se2.difference(poses, self.mean)
         return np.asarray(0.5 * np.einsum("ni,nij,nj->n", offset, self.information, offset))
-
-
-def difference(a: Array, b: Array) -> Array:
-    """Componentwise a - b (N, 3) of poses, with the angle wrapped."""
-    off = a - b
-    off[:, 2] = se2.wrap(off[:, 2])
-    return np.asarray(off)
 
 
 def position_information(curvature: Array) -> Array:
@@ -281,36 +285,17 @@ def position_information(curvature: Array) -> Array:
     return np.asarray(curvature[:2, :2] - across / max(float(curvature[2, 2]), 1e-12))
 
 
-def _steps(poses: Array, evidence: Evidence, prior: Prior | None) -> Array:
+def _newton_steps(poses: Array, evidence: Evidence, prior: Prior | None) -> Array:
     H, slope = evidence.curvature + DAMPING, evidence.xi
     if prior:
         H = H + prior.information
-        slope = slope + np.einsum("nij,nj->ni", prior.information, difference(prior.mean, poses))
+        slope = slope + np.einsum("nij,nj->ni", prior.information, se2.difference(prior.mean, poses))
     return limit_steps(np.linalg.solve(H, slope[..., None])[..., 0], MAX_STEP)
 
 
 def limit_steps(steps: npt.NDArray[np.floating[Any]], largest: Array) -> Array:
     """Shortens steps (..., 3) without changing their direction, so that no component exceeds ``largest`` (3,)."""
     return np.asarray(steps / np.maximum((np.abs(steps) / largest).max(axis=-1, keepdims=True), 1.0))
-
-
-def descend(
-    view: View, poses: Array, prior: Prior | None, schedule: tuple[float, ...] = FOLLOWING_SCHEDULE_M
-) -> tuple[Array, Evidence]:
-    """Finds the minima near ``poses`` (N, 3), with only those beams that end at surfaces of the map.
-
-    This is expectation maximisation: each step minimises F with the states of the beams held constant. ``schedule`` has
-    the deviation in m that is added to every beam's at each step.
-    """
-    poses = np.array(poses, float)
-    for extra_sigma in schedule:
-        evidence = view.evidence(poses, extra_sigma, view.surface_evidence(poses, extra_sigma).weights)
-        step = _steps(poses, evidence, prior)
-        if extra_sigma == 0.0 and (np.abs(step) < SETTLED_STEP).all():
-            return poses, evidence
-        poses = poses + step
-        poses[:, 2] = se2.wrap(poses[:, 2])
-    return poses, view.evidence(poses, 0.0, view.surface_evidence(poses).weights)
 
 
 def polish(view: View, poses: Array) -> tuple[Array, Evidence]:
@@ -323,7 +308,7 @@ def polish(view: View, poses: Array) -> tuple[Array, Evidence]:
     poses = np.array(poses, float)
     evidence = view.evidence(poses)
     for _ in range(MAX_POLISHING_STEPS):
-        step = _steps(poses, evidence, None)
+        step = _newton_steps(poses, evidence, None)
         if (np.abs(step) < SETTLED_STEP).all():
             break
         poses = poses + step

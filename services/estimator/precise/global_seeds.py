@@ -44,8 +44,8 @@ class Seeds:
             part = slice(begin, begin + 500)
             expected = model.expect(lasers[part], directions)
             behind = model.expect_behind(lasers[part], directions, expected.ranges)
-            panoramas[part, 0] = np.where(np.isinf(expected.scale), 0, _steps(expected.ranges))
-            panoramas[part, 1] = _steps(behind)
+            panoramas[part, 0] = np.where(np.isinf(expected.scale), 0, _in_steps(expected.ranges))
+            panoramas[part, 1] = _in_steps(behind)
         return cls(np.asarray(places, float), panoramas)
 
     @property
@@ -84,11 +84,13 @@ def _costs(
     costs = np.empty((len(panoramas) if all_headings else 0, RANKED_HEADINGS), np.uint16)
     words = panoramas.view(np.uint64)
     words.flags.writeable = False  # as those of a file are: numba compiles again for others
-    beam_sums.rank_places(words, bins, _steps(view.ranges[used]), int(_steps(np.array(view.range_max))), least, costs)
+    beam_sums.rank_places(
+        words, bins, _in_steps(view.ranges[used]), int(_in_steps(np.array(view.range_max))), least, costs
+    )
     return least, costs
 
 
-def _steps(ranges: Array) -> npt.NDArray[np.uint8]:
+def _in_steps(ranges: Array) -> npt.NDArray[np.uint8]:
     """Ranges in m as steps of `RANGE_STEP_M`, at least 1."""
     return np.clip(np.round(ranges / RANGE_STEP_M), 1, MAX_RANGE_STEPS).astype(np.uint8)
 

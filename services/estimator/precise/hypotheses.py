@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.geometry import se2
-from services.estimator.precise.gauss_newton import MAX_STEP, Prior, difference, limit_steps, position_information
+from services.estimator.precise.gauss_newton import MAX_STEP, Prior, limit_steps, position_information
 from services.estimator.precise.motion_model import smooth_velocity
 from services.estimator.shared.generative_models import CORNER_ANGLE_RAD
 
@@ -133,12 +133,12 @@ def mode_from_search(
     project_evidence(evidence, k, np.array([[*weakest, 0.0]]) if is_unobserved(ratio, ripple) else np.zeros((0, 3)))
     information = prior.information[k] if prior else np.linalg.inv(unknown)
     inverse = np.linalg.inv(evidence.curvature[k] + information)
-    slope = evidence.xi[k] + (prior.information[k] @ difference(prior.mean[k : k + 1], pose[None])[0] if prior else 0)
+    slope = evidence.xi[k] + (prior.information[k] @ se2.difference(prior.mean[k], pose) if prior else 0)
     pose = pose + limit_steps(inverse @ slope, MAX_STEP)
     pose[2] = se2.wrap(pose[2])
     logdet = float(np.linalg.slogdet(evidence.curvature[k] + information)[1])
     if prior:
-        off = difference(pose[None], prior.mean[k : k + 1])[0]
+        off = se2.difference(pose, prior.mean[k])
         complexity = 0.5 * float(np.trace(information @ inverse) - 3 + off @ information @ off + logdet)
         complexity -= 0.5 * float(np.linalg.slogdet(information)[1])
     else:
@@ -212,7 +212,7 @@ def clip_to_map(modes: list[Mode], bounds: tuple[float, float, float, float]) ->
 
 def same_place(poses: Array, pose: Array) -> npt.NDArray[np.bool_]:
     """Mask (N,) of the poses (N, 3) that are so near to ``pose`` (3,) that both are one hypothesis."""
-    off = np.abs(difference(poses, pose))
+    off = np.abs(se2.difference(poses, pose))
     return np.asarray((off[:, :2] < SAME_POSITION_M).all(axis=1) & (off[:, 2] < SAME_HEADING_RAD))
 
 

@@ -15,23 +15,23 @@ from scipy.spatial import cKDTree
 
 from common.geometry import se2
 from common.geometry.se2 import Array
-from services.estimator.precise.gauss_newton import View, difference, position_information
+from services.estimator.precise.gauss_newton import View, position_information
 from services.estimator.precise.motion_model import MotionCandidate
 from services.estimator.precise.scan_surfaces import MIN_BEAMS
 
 MAX_SCANS = 12  # in the local map
-MIN_DISTANCE_M, MIN_TURN_RAD = 0.25, 0.35  # from the last scan of the local map, before another one is added
-CELL_M = 0.05
+MIN_DISTANCE_M, MIN_TURN_RAD = 0.25, 0.35  # a key scan is taken after a motion of either size
+CELL_M = 0.05  # points within one cell are averaged
 NEIGHBOURS, NEIGHBOUR_RADIUS_M = 10, 0.3  # points from which the normal of a surface is estimated
 # Largest distance to a point's partner, iteration by iteration.
 PARTNER_RADII_M = (0.6, 0.6, 0.4, 0.4, 0.2, 0.2, 0.1, 0.1, 0.1, 0.1)
-CAUCHY_SCALE_M = 0.02
+CAUCHY_SCALE_M = 0.02  # of a point's distance from its line; farther points count ever less
 MATCHED_RADIUS_M = 0.08  # a point this near to one of the local map counts as matched
 SEEN_RADIUS_M = 0.15  # and this near, as on a surface that was seen before; beams far away are this far apart
-MIN_POINTS = 20
+MIN_POINTS = 20  # of a scan, each with a partner in the local map
 MAX_SQUARED_DISTANCE = 4.0  # squared standard deviations of the result from the prior
 PASSED_M = 0.3  # behind a surface, from where a beam counts as having passed through it
-MIN_CHANGED_M, WALKING_SPEED = 0.2, 1.5  # width in m of one thing that may change at once, and m/s
+MIN_CHANGED_M, WALKING_SPEED = 0.2, 1.5  # m, width of one object that may change at once; m/s
 MIN_SHARE = 0.5  # of a scan's points that must match the local map
 CLEAR_SHARE = 0.8  # with a smaller share, matching is repeated from `EXTRA_HEADINGS_RAD`
 EXTRA_HEADINGS_RAD = np.array([-0.3, -0.15, 0.15, 0.3])
@@ -92,10 +92,7 @@ class LocalMap:
 
     def is_key_scan_due(self, local: Array) -> bool:
         """Whether ``local`` (3,) is so far from the last key scan that the scan there becomes another one."""
-        if not self.scans:
-            return True
-        off = se2.between(self.scans[-1].pose, local)
-        return bool(np.hypot(off[0], off[1]) >= MIN_DISTANCE_M or abs(off[2]) >= MIN_TURN_RAD)
+        return not self.scans or is_key_pose(self.scans[-1].pose, local)
 
     def add(self, key: LocalMapScan, pose: Array, covariance: Array) -> None:
         """Adds a key scan, taken at ``pose`` (3,) in map with ``covariance`` (3, 3)."""
@@ -139,15 +136,15 @@ class LocalMap:
         return free
 
     def count_changes(self, last: LocalScan, now: LocalScan, period: float) -> int:
-        """Number of things that vanished or appeared between two scans.
+        """Number of objects that vanished or appeared between two scans.
 
-        One thing is as wide as somebody walking can have uncovered or covered in ``period`` s.
+        One object is as wide as what a walking person can have covered or uncovered in ``period`` s.
         """
         width = MIN_CHANGED_M + WALKING_SPEED * period
         return self._count_passed(last, now, width) + self._count_passed(now, last, width)
 
     def _count_passed(self, seen: LocalScan, by: LocalScan, width: float) -> int:
-        """How many things of ``width`` m another scan passes through, of those that one scan has ``seen``."""
+        """Number of objects of ``width`` m in the scan ``seen`` through which beams of the scan ``by`` pass."""
         points = se2.transform(se2.compose(seen.pose, self.mount), seen.view.points)
         ranges, beam, inside = _beams_towards(by.view, se2.compose(by.pose, self.mount), points)
         passed = inside & (by.view.nearest_of_neighbours[beam] > ranges + PASSED_M)
@@ -222,7 +219,10 @@ class LocalMap:
         return self._normals
 
     def _register(self, start: Array, points: Array, mean: Array, information: Array) -> Match | None:
-        """Registers points (K, 2) m in the laser frame, with a Gaussian prior; None if too few have a partner."""
+        """Registers points (K, 2) m in the laser frame by iteratively reweighted Gauss-Newton, with a Gaussian prior.
+
+        Returns None if too few points have a partner.
+        """
         tree, normals = self._tree_of_points(), self._normals_of_points()
         pose, H = np.array(start), np.eye(3)
         for radius in PARTNER_RADII_M:
@@ -237,7 +237,7 @@ class LocalMap:
             J = np.column_stack([normal, normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]])
             weight = 1 / (1 + (error / CAUCHY_SCALE_M) ** 2)
             H = (J.T * weight) @ J
-            to_prior = difference(mean[None], pose[None])[0]
+            to_prior = se2.difference(mean, pose)
             step = np.linalg.solve(
                 H + CAUCHY_SCALE_M**2 * information,
                 CAUCHY_SCALE_M**2 * information @ to_prior - (J.T * weight) @ error,
@@ -250,6 +250,12 @@ class LocalMap:
         score = ((distance < 2 * MATCHED_RADIUS_M) / (1 + (error / CAUCHY_SCALE_M) ** 2)).mean()
         covariance = np.asarray(CAUCHY_SCALE_M**2 * np.linalg.inv(H + 1e-6 * np.eye(3)), float)
         return Match(pose, covariance, float((distance < MATCHED_RADIUS_M).mean()), float(score), _is_degenerate(H))
+
+
+def is_key_pose(last: Array, pose: Array) -> bool:
+    """Whether ``pose`` (3,) is so far from that of the ``last`` (3,) key scan that another one is taken there."""
+    motion = se2.between(last, pose)
+    return bool(np.hypot(motion[0], motion[1]) >= MIN_DISTANCE_M or abs(motion[2]) >= MIN_TURN_RAD)
 
 
 def _average_in_cells(points: Array) -> Array:

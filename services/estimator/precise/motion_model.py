@@ -66,8 +66,7 @@ class MotionCandidate:
 
     def squared_distance(self, pose: Array) -> float:
         """Squared Mahalanobis distance of ``pose`` (3,) from the mean."""
-        off = pose - self.mean
-        off[2] = se2.wrap(off[2])
+        off = se2.difference(pose, self.mean)
         return float(off @ np.linalg.solve(self.covariance, off))
 
     def excess(self, pose: Array) -> float:
@@ -207,20 +206,19 @@ class FusedMotion:
     surprise: float  # nats, -ln(prior probability times evidence), without the scan's constant
 
 
-def fuse(candidate: MotionCandidate, mode: Array, slope: Array, curvature: Array) -> FusedMotion:
+def fuse(candidate: MotionCandidate, peak: Array, slope: Array, curvature: Array) -> FusedMotion:
     """Updates a candidate by Laplace's approximation of the scan's likelihood.
 
-    The scan's -ln p is approximated by a parabola at ``mode`` (3,), with ``slope`` (3,) minus its gradient there and
+    The scan's -ln p is approximated by a parabola at ``peak`` (3,), with ``slope`` (3,) minus its gradient there and
     ``curvature`` (3, 3) its Hessian.
 
     Along a direction without curvature the parabola is a straight line, and with a wide prior the minimum may be
-    kilometres away. The step is therefore limited to a trust region: `MAX_STEP` beyond ``mode``, and `MAX_EXTRA_STEP`
+    kilometres away. The step is therefore limited to a trust region: `MAX_STEP` beyond ``peak``, and `MAX_EXTRA_STEP`
     beyond what the candidate's covariance makes plausible.
     """
     information = np.linalg.inv(candidate.covariance)
     total = curvature + information
-    off = mode - candidate.mean
-    off[2] = se2.wrap(off[2])
+    off = se2.difference(peak, candidate.mean)
     # Minus the gradient of the parabola at the candidate's mean.
     pull = slope + curvature @ off
     step = np.linalg.solve(total, pull)

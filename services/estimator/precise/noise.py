@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
 
 MIN_SIGMA_M = 0.003
+NORMAL_MAD = 1.4826  # standard deviation of a Gaussian, in median absolute deviations
 
 
 def estimate_noise(ranges: Array, angles: Array) -> float:
@@ -27,4 +28,4 @@ def estimate_noise(ranges: Array, angles: Array) -> float:
     bend = bend[np.isfinite(bend)]
     if not len(bend):
         return MIN_SIGMA_M
-    return max(MIN_SIGMA_M, float(1.4826 * np.median(np.abs(bend)) / np.sqrt(2 + turn**2)))
+    return max(MIN_SIGMA_M, float(NORMAL_MAD * np.median(np.abs(bend)) / np.sqrt(2 + turn**2)))

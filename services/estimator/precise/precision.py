@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from services.estimator.precise.gauss_newton import CORRELATED_M
-from services.estimator.precise.noise import estimate_noise
+from services.estimator.precise.noise import NORMAL_MAD, estimate_noise
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -20,11 +20,10 @@ if TYPE_CHECKING:
     from services.estimator.precise.likelihood import Likelihood
 
 UPDATE_SHARE = 0.1  # weight of the present scan, or key scan, in the averages, at least
-MIN_CHANGED, MAX_CHANGED = 0.02, 0.5
+MIN_CHANGED, MAX_CHANGED = 0.02, 0.5  # limits of the share of changed surfaces
 MAX_NOISE_FACTOR = 4.0  # the noise is never taken for more than this times the stated one, or less than its inverse
 MAX_MAP_ERROR_M = 0.1  # larger errors are not the map's, but changes of the surroundings
-NORMAL_MAD = 1.4826  # standard deviation of a Gaussian, in median absolute deviations
-MIN_LEARNING_BEAMS = 30
+MIN_LEARNING_BEAMS, MIN_LEARNING_SHARE = 30, 0.3  # of a scan; nothing is learned from fewer
 DAMPING = 1e-9  # in m; keeps the inverse finite where a direction is not observed
 
 
@@ -72,7 +71,7 @@ class Precision:
         self.changed += UPDATE_SHARE * (1 - explained - self.changed)
         self.changed = float(np.clip(self.changed, MIN_CHANGED, MAX_CHANGED))
 
-    def learn(self, view: View, pose: Array) -> None:
+    def learn_map_error(self, view: View, pose: Array) -> None:
         """Learns the map's errors from those of the prediction of a key scan at ``pose`` (3,).
 
         Scans at one place show the same errors, so only key scans are used. Two estimates of their variance may be
@@ -86,7 +85,7 @@ class Precision:
         with np.errstate(invalid="ignore", divide="ignore"):
             errors = (view.ranges - surface) / slope
             used = (np.abs(errors) < MAX_MAP_ERROR_M) & np.isfinite(scale)
-        if used.sum() < max(MIN_LEARNING_BEAMS, 0.3 * len(view.ranges)):
+        if used.sum() < max(MIN_LEARNING_BEAMS, MIN_LEARNING_SHARE * len(view.ranges)):
             return
         # `stated` is the variance along the beams.
         errors, slope, stated = errors[used], slope[used], (noise**2 + scale**2)[used]

@@ -45,7 +45,7 @@ class EstimateError:
         surfaces is among those that the map explains, so the fewer these are, the less each is to be trusted.
         """
         to_base = se2.rotation(-float(pose[2]))
-        offsets, widening = _estimate_without_each_surface(view.evidence_by_surface(pose), to_base)
+        offsets, widening = _estimate_without_each_surface(view.evidence_of_each_surface(pose), to_base)
         mistaken = MISTAKEN_SURFACE / max(explained, MISTAKEN_SURFACE)
         return cls(to_base @ covariance @ to_base.T, offsets, widening, mistaken)
 

@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 MAX_SIGMAS = 4.0  # a range farther from its prediction begins another surface
 CORNER_SIGMAS = 2.5  # a range farther from its prediction may lie behind a corner, where the direction is unknown again
-CORNER_PROBABILITY = 0.1  # of this
+CORNER_PROBABILITY = 0.1  # that it does
 MAX_SLOPE = 2.0  # standard deviation of dr / (r d angle) where a surface begins
 CURVATURE = 0.2  # standard deviation of the change of slope per radian of the scan, as a share of 1 / r
 JUMP_M = 0.2  # typical jump of the range from one surface to the next, for half of the jumps
 FAR_M = 10.0  # typical distance over which the other half is spread
 NO_RETURN = 0.05  # probability that a surface begins from which no beam returns
-CHANGES_PER_RAD = 1.0  # how often another thing is seen along a scan, although no other surface seems to begin
-MIN_BEAMS = 3
+CHANGES_PER_RAD = 1.0  # changes to another object along a scan, although no other surface seems to begin
+MIN_BEAMS = 3  # on a surface; fewer are often dust, or mixed pixels
 OUTLIER = 0.01  # share of single beams with arbitrary ranges
 EDGE_M = 0.02  # an edge of the map may be misplaced by this, and by one beam more
 
@@ -42,9 +42,9 @@ class ScanSurfaces:
     density: Array  # (B,) nats, ln p(range | the beams before it)
     starts: npt.NDArray[np.bool_]  # (B,) whether another surface begins at this beam
     ideal: Array  # (B,) nats, ln p(range) if the surface had been known
-    small: npt.NDArray[np.bool_]  # (B,) beams on surfaces of less than `MIN_BEAMS` beams: often dust, or mixed pixels
+    small: npt.NDArray[np.bool_]  # (B,) beams on surfaces of fewer than `MIN_BEAMS` beams
     edges: npt.NDArray[np.int64]  # (B,) beams by which the map may misplace an edge near this one; 0: no edge
-    change: float  # probability that something else is seen from one beam to the next on the same surface
+    change: float  # probability that the next beam on the same surface meets another object
 
     @classmethod
     def of(cls, ranges: Array, angles: Array, likelihood: Likelihood) -> ScanSurfaces:
@@ -92,7 +92,7 @@ def _split(
     starts: npt.NDArray[np.bool_],
     ideal: Array,
 ) -> None:
-    """Fills the fields of `ScanSurfaces`.
+    """Fills density, starts and ideal of `ScanSurfaces`.
 
     A Kalman filter follows u = 1 / r and its derivative u' by the angle; p is their covariance, a the predicted one.
     Along a straight wall u'' = -u exactly.

@@ -73,7 +73,7 @@ class SurfaceEvidence:
         sigma = math.hypot(likelihood.sigma, extra_sigma)
         prior = changed * CHANGED
         prior[0] = 1 - changed
-        _sum(
+        _forward_backward(
             ranges,
             expected.ranges,
             behind,
@@ -163,7 +163,7 @@ def _emit(
 
 
 @jit
-def _sum(
+def _forward_backward(
     ranges: Array,
     expected: Array,
     behind: Array,
@@ -183,7 +183,7 @@ def _sum(
     explained: Array,
     weights: Array,
 ) -> None:
-    """Fills the fields of `SurfaceEvidence`."""
+    """Fills the fields of `SurfaceEvidence` by the forward and the backward algorithm."""
     used = np.flatnonzero(~np.isnan(ranges) & (ranges > -np.inf))
     size, states = len(used), len(prior)
     forward, emitted, keep = np.empty((size, states)), np.empty((size, states)), np.empty((size, states))

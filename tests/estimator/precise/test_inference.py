@@ -13,7 +13,7 @@ from common.geometry import se2
 from common.geometry.ray_casting import MIN_COSINE
 from common.geometry.world import World
 from services.estimator.precise import beam_sums, global_seeds
-from services.estimator.precise.gauss_newton import MAX_STEP, Prior, View, descend, difference
+from services.estimator.precise.gauss_newton import MAX_STEP, Prior, View
 from services.estimator.precise.global_seeds import Seeds, thin_places
 from services.estimator.precise.hypotheses import Mode, constraining_beams, select_distinct, weigh
 from services.estimator.precise.likelihood import Likelihood
@@ -138,7 +138,7 @@ def test_following():
     rng = np.random.default_rng(1)
     ranges = scan(TRUTH, rng)
     ranges[80:115] = np.minimum(ranges[80:115], 0.9) - 0.1
-    poses, evidence = descend(view(ranges), TRUTH[None] + [[0.05, -0.05, 0.03]], None)
+    poses, evidence = view(ranges).descend(TRUTH[None] + [[0.05, -0.05, 0.03]])
     assert np.abs(poses[0] - TRUTH).max() < 0.01
     deviation = np.sqrt(np.diag(np.linalg.inv(evidence.curvature[0])))
     assert (np.abs(poses[0] - TRUTH) < 4 * deviation).all()
@@ -158,7 +158,7 @@ def test_descent(seed):
     rng = np.random.default_rng(seed)
     seen = view(scan(TRUTH, rng))
     starts = TRUTH + rng.normal(0, [0.1, 0.1, 0.05], (8, 3))
-    poses, evidence = descend(seen, starts, None, NEAR_SCHEDULE_M)
+    poses, evidence = seen.descend(starts, None, NEAR_SCHEDULE_M)
     best = int(evidence.accuracy.argmin())
     assert np.hypot(*(poses[best] - TRUTH)[:2]) < 0.02
 
@@ -166,7 +166,7 @@ def test_descent(seed):
 def test_prior_without_evidence():
     nothing = view(np.full(len(ANGLES), -np.inf))
     prior = Prior(TRUTH[None], np.diag([100.0, 100.0, 400.0])[None])
-    poses, _ = descend(nothing, TRUTH[None] + 0.2, prior)
+    poses, _ = nothing.descend(TRUTH[None] + 0.2, prior)
     assert np.abs(poses[0] - TRUTH).max() < 1e-3
 
 
@@ -199,7 +199,7 @@ def test_trust_region(numbers, curvatures, deviations):
     mean, mode, slope = np.array(numbers).reshape(3, 3)
     mean[2] = se2.wrap(mean[2])
     found = fuse(MotionCandidate("x", mean, np.diag(deviations) ** 2, 0.5), mode, slope, np.diag(curvatures))
-    taken, off = (np.abs(difference(pose[None], mean[None])[0]) for pose in (found.mean, mode))
+    taken, off = (np.abs(se2.difference(pose, mean)) for pose in (found.mean, mode))
     assert (taken <= (off + MAX_STEP) * (1 + 1e-6) + 1e-6).all()
     assert (taken <= (3 * np.array(deviations) + 5 * MAX_STEP) * (1 + 1e-6) + 1e-6).all()
 

@@ -26,9 +26,9 @@ def matched():
     return made, pose
 
 
-def test_evidence_by_surface(matched):
+def test_evidence_of_each_surface(matched):
     made, pose = matched
-    by_surface = made.evidence_by_surface(pose)
+    by_surface = made.evidence_of_each_surface(pose)
     weights = made.surface_evidence(pose[None]).weights * ~made.surfaces.small
     together = made.evidence(pose[None], attention=weights)
     assert len(by_surface.xi) > 2
@@ -38,7 +38,7 @@ def test_evidence_by_surface(matched):
 
 def test_pose_without_each_surface(matched):
     made, pose = matched
-    evidence = made.evidence_by_surface(pose)
+    evidence = made.evidence_of_each_surface(pose)
     offsets, widening = _estimate_without_each_surface(evidence, se2.rotation(-float(pose[2])))
 
     def solution(used):

@@ -14,9 +14,10 @@ import numpy.typing as npt
 from pydantic import ConfigDict
 
 from common.geometry import se2
-from services.estimator.precise.gauss_newton import View, difference, polish
+from services.estimator.precise.gauss_newton import View, polish
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.motion_model import MotionNoise
+from services.estimator.precise.precision import robust_excess
 from services.estimator.precise.settings import PreciseSettings
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ EM_STEPS = 30  # of expectation maximisation
 PRIOR_BEAMS = 10.0  # pseudo-count of each kind of beam
 CHI2_MEDIAN = 2.366  # median of chi squared with three degrees of freedom
 MAX_POSITION_ERROR_M = 0.3  # larger errors mean that another place was found; the covariance does not describe them
+MIN_EXPLAINED_RATIO = 0.77  # minimum share of explained beams, relative to the usual one: the default if 97 % are usual
 # Probabilities at which the calibration curve is evaluated.
 PROBABILITIES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 
@@ -55,7 +57,7 @@ class Calibration:
         """Parameters of the estimator; the thresholds of explained beams are relative to the usual share here."""
         default = PreciseSettings()
         return PreciseSettings(
-            min_explained_share=0.77 * self.usual,
+            min_explained_share=MIN_EXPLAINED_RATIO * self.usual,
             max_explained_drop=max(default.max_explained_drop, self.usual - self.unusual),
             inflation=self.inflation,
             floor_position=self.floor_position,
@@ -126,7 +128,7 @@ def _pose_precision(
     """
     errors, covariances = [], []
     for reference, (found, evidence) in zip(references, fitted, strict=True):
-        error = difference(found, reference[None])[0]
+        error = se2.difference(found[0], reference)
         if np.hypot(error[0], error[1]) < MAX_POSITION_ERROR_M:
             inverse = np.linalg.inv(evidence.curvature[0] + np.eye(3))
             errors.append(error + inverse @ evidence.xi[0])
@@ -134,7 +136,7 @@ def _pose_precision(
     error, stated = np.array(errors), np.array(covariances)
 
     def excess_deviation(values: Array, variance: Array) -> float:
-        return float(np.sqrt(max(0.0, (1.4826 * np.median(np.abs(values))) ** 2 - float(np.median(variance)))))
+        return float(np.sqrt(max(0.0, robust_excess(values, variance))))
 
     position = excess_deviation(error[:, :2].ravel(), stated[:, [0, 1], [0, 1]].ravel())
     heading = excess_deviation(error[:, 2], stated[:, 2, 2])
@@ -194,7 +196,7 @@ def learn_motion(stamps: Array, poses: Array, odom: Array | None) -> MotionNoise
     speed = np.hypot(velocity[regular, 0], velocity[regular, 1])
 
     def deviation(values: Array) -> float:
-        return float(np.quantile(values, 0.9) / 1.645)
+        return float(np.quantile(values, 0.9) / 1.645)  # 90 % of a Gaussian are within 1.645 standard deviations
 
     learned = MotionNoise(
         period=usual_period,
@@ -232,4 +234,4 @@ def _non_negative_least_squares(by: Array, square: Array) -> tuple[float, float]
         k = int(found.argmax())
         found = np.zeros(2)
         found[k] = max(0.0, float(by[:, k] @ square / (by[:, k] @ by[:, k])))
-    return float(found[0]) + 1e-6, float(found[1]) + 1e-6
+    return float(found[0]) + 1e-6, float(found[1]) + 1e-6  # no motion is known exactly

@@ -56,12 +56,10 @@ def learn_drive(
     The field is learned twice: first without the held-out scans, which measure its precision, then from all scans.
     """
     sigma = estimate_noise(drive.ranges, drive.angles)
-    numbers = np.arange(len(drive.ranges))
-    is_held_out = numbers % HELD_OUT_EVERY == HELD_OUT_EVERY // 2
-    held_out = drive.part(numbers[is_held_out])
+    others, held_out = hold_out(drive)
     report("first field, without the held-out scans", 0.0)
     trial = _learn_model(
-        drive.part(numbers[~is_held_out]),
+        others,
         recipe,
         simulated,
         lambda done: report("first field, without the held-out scans", 0.4 * done),
@@ -73,8 +71,6 @@ def learn_drive(
     report("calibration", 0.45)
     motion = learn_motion(drive.stamps, drive.poses, drive.odom)
     calibration = calibrate(trial, held_out, motion, sigma)
-    expected = trial.expect(lasers, held_out.angles)
-    both = np.isfinite(held_out.ranges) & np.isfinite(expected.ranges) & np.isfinite(expected.scale)
     final = _learn_model(
         drive, recipe, simulated, lambda done: report("final field", 0.55 + 0.4 * done), replayed=replayed
     )
@@ -84,7 +80,20 @@ def learn_drive(
         visited = np.concatenate([visited, free_places(final, np.unique(simulated.starts, axis=0))])
     places = seed_places(final.field, visited, final.seen)
     report("learned", 1.0)
-    return LearningResult(final, places, calibration, np.abs(held_out.ranges[both] - expected.ranges[both]))
+    return LearningResult(final, places, calibration, range_errors(trial, held_out))
+
+
+def hold_out(drive: ReferenceDrive) -> tuple[ReferenceDrive, ReferenceDrive]:
+    """Returns the scans to learn from, and those held out."""
+    is_held_out = np.arange(len(drive.ranges)) % HELD_OUT_EVERY == HELD_OUT_EVERY // 2
+    return drive.part(~is_held_out), drive.part(is_held_out)
+
+
+def range_errors(model: GenerativeModel, scans: ReferenceDrive) -> Array:
+    """Errors (K,) in m of the ranges that a model predicts, where a surface is expected and was measured."""
+    expected = model.expect(se2.compose(scans.poses, scans.mount), scans.angles)
+    use = np.isfinite(scans.ranges) & np.isfinite(expected.ranges) & np.isfinite(expected.scale)
+    return np.asarray(np.abs(scans.ranges[use] - expected.ranges[use]))
 
 
 def _learn_model(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common.geometry import se2
-from services.estimator.precise.gauss_newton import View, difference, polish
+from services.estimator.precise.gauss_newton import View, polish
 from services.estimator.precise.likelihood import Likelihood
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def evaluate_model(
             view = View(model, likelihood, mount, angles, scan + noise, range_max)
             found, evidence = polish(view, pose[None])
             inverse = np.linalg.inv(evidence.curvature[0] + 1e-6 * np.eye(3))
-            error = difference(found, pose[None])[0] + inverse @ evidence.xi[0]  # with a last step to the minimum
+            error = se2.difference(found[0], pose) + inverse @ evidence.xi[0]  # with a last step to the minimum
             if draw:
                 covariance = inverse @ (evidence.xi_noise_covariance[0] + evidence.xi_model_covariance[0]) @ inverse
                 nees.append(float(error @ np.linalg.pinv(covariance, hermitian=True) @ error) / 3)

@@ -16,6 +16,7 @@ from common.geometry import se2
 from common.robot.motion_distortion import beam_times, correct_beams, evenly_spaced
 from common.robot.scan_geometry import Sweep
 from services.estimator.precise.learning.calibration import ReferenceDrive
+from services.estimator.precise.local_map import is_key_pose
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 
 PLACE_M, HEADINGS = 0.5, 4  # one key scan is kept for each square of this size and each of these headings
 MAX_KEY_SCANS = 4000  # with 622 beams, 10 MB; if there are more, the squares become twice as large
-MIN_DISTANCE_M, MIN_TURN_RAD = 0.25, 0.35  # a key scan is taken after a motion of either size
 MAX_PROTECTION = np.array([0.2, 0.2, np.deg2rad(5)])  # m, m, rad: protection level of a trusted pose
 VERIFIED_AFTER_M = 5.0  # of driving: about a room
 # A version is learned from at least this many key scans, of which this many and this share are new.
@@ -90,7 +90,8 @@ class KeyScanCollector:
                 velocity = step / period
         self._last = stamp, pose
         self._verify()
-        if velocity is not None and _is_trusted(posterior) and self._is_due(pose):
+        is_due = self._last_key is None or is_key_pose(self._last_key, pose)
+        if velocity is not None and _is_trusted(posterior) and is_due:
             self._last_key = pose
             ranges = self._correct_for_motion(observation, velocity).astype(np.float32)
             self._unverified.append(KeyScan(stamp, pose, ranges, self._path))
@@ -128,12 +129,6 @@ class KeyScanCollector:
         while len(self.verified) > MAX_KEY_SCANS:
             self._size *= 2
             self.verified = {key.cell(self._size): key for key in self._in_order()}
-
-    def _is_due(self, pose: Array) -> bool:
-        if self._last_key is None:
-            return True
-        motion = se2.between(self._last_key, pose)
-        return bool(np.hypot(motion[0], motion[1]) >= MIN_DISTANCE_M or abs(motion[2]) >= MIN_TURN_RAD)
 
     def _correct_for_motion(self, observation: Observation, velocity: Array) -> Array:
         """Returns the ranges (B,) in m along the scanner's beams, as if all were measured at the stamp."""

@@ -13,9 +13,10 @@ from services.estimator.precise.field import FieldModel
 from services.estimator.precise.gauss_newton import Prior, View
 from services.estimator.precise.global_seeds import Seeds
 from services.estimator.precise.learning.drive_learning import (
-    HELD_OUT_EVERY,
     free_places,
+    hold_out,
     learn_model,
+    range_errors,
     remove_contradicted,
     replay_model,
 )
@@ -70,17 +71,15 @@ def learn_version(
     sigma = estimate_noise(tracked.ranges, tracked.angles)
     error = _estimate_map_error(original, tracked, sigma)
     replayed = replay_model(original, places, tracked, min(len(places), MAX_REPLAYED_SCANS), recipe.seed)
-    beside, elsewhere = _split_replayed_beams(replayed, tracked, error, recipe.seed)
+    overlapping, elsewhere = _split_replayed_beams(replayed, tracked, error, recipe.seed)
     aligned = tracked
     for _ in range(ALIGNMENTS):
-        aligned = _match_key_scans(_learn(aligned, beside, recipe, 1), aligned, tracked.poses, sigma)
+        aligned = _match_key_scans(_learn(aligned, overlapping, recipe, 1), aligned, tracked.poses, sigma)
     aligned = align_to_map(original, aligned)
     # A trial field, learned without the held-out key scans, shows whether learning is an improvement.
-    numbers = np.arange(len(aligned.poses))
-    is_held_out = numbers % HELD_OUT_EVERY == HELD_OUT_EVERY // 2
-    held_out = aligned.part(is_held_out)
-    trial = _learn(aligned.part(~is_held_out), beside, recipe, EPOCHS)
-    unaligned = tracked.part(is_held_out)
+    others, held_out = hold_out(aligned)
+    trial = _learn(others, overlapping, recipe, EPOCHS)
+    _, unaligned = hold_out(tracked)
     errors, present_errors = (
         range_errors(model, _match_key_scans(model, unaligned, unaligned.poses, sigma)) for model in (trial, present)
     )
@@ -88,7 +87,7 @@ def learn_version(
         return None
     scales = learn_scales(trial.field, held_out.poses, held_out.mount, held_out.angles, held_out.ranges, sigma)
     ripple = measure_ripple(trial.field, se2.compose(held_out.poses, held_out.mount), held_out.angles)
-    final = _learn(aligned, beside.joined(elsewhere), recipe, EPOCHS)
+    final = _learn(aligned, overlapping.joined(elsewhere), recipe, EPOCHS)
     visited = se2.compose(aligned.poses, aligned.mount)[:, :2]
     starts = seed_places(final.field, np.concatenate([visited, free_places(final, places)]), final.seen)
     starts, scales = (values.astype(np.float32).astype(np.float64) for values in (starts, scales))  # as published
@@ -120,13 +119,6 @@ def remove_moving_objects(keys: ReferenceDrive) -> ReferenceDrive:
 def mean_error(errors: Array) -> float:
     """Mean of errors (K,) in m, each clipped at `MAX_ERROR_M`, because larger ones are due to changed surroundings."""
     return float(np.minimum(errors, MAX_ERROR_M).mean()) if len(errors) else MAX_ERROR_M
-
-
-def range_errors(model: GenerativeModel, keys: ReferenceDrive) -> Array:
-    """Errors (K,) in m of the ranges of key scans, where a surface is expected and was measured."""
-    expected = model.expect(se2.compose(keys.poses, keys.mount), keys.angles)
-    use = np.isfinite(keys.ranges) & np.isfinite(expected.ranges) & np.isfinite(expected.scale)
-    return np.asarray(np.abs(keys.ranges[use] - expected.ranges[use]))
 
 
 def _estimate_map_error(model: GenerativeModel, keys: ReferenceDrive, sigma: float) -> float:

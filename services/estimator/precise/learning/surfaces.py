@@ -144,7 +144,10 @@ def _pooled(grid: Array) -> Array:
 
 
 def _distances(surface: np.ndarray, mx: Array, my: Array, nx: Array, ny: Array, own: Array, h: float) -> Floats:
-    """Distances phi at the nodes: near surface elements to their planes, elsewhere to the nearest element."""
+    """Distances phi at the nodes: near surface elements to their planes, elsewhere to the nearest element.
+
+    Elements count by a Gaussian of their distance, with a standard deviation of 0.58 cells.
+    """
     rows, columns = np.nonzero(surface)
     ex, ey, ax, ay = (a[surface] for a in (mx, my, nx, ny))
     total, weight = np.zeros(surface.shape), np.zeros(surface.shape)

@@ -13,13 +13,9 @@ from lab.integrity.maps import grid_of
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.calibration import ReferenceDrive
+from services.estimator.precise.learning.drive_learning import range_errors
 from services.estimator.precise.learning.field_learning import Recipe, learn_field
-from services.estimator.precise.learning.live_learning import (
-    learn_version,
-    mean_error,
-    range_errors,
-    remove_moving_objects,
-)
+from services.estimator.precise.learning.live_learning import learn_version, mean_error, remove_moving_objects
 from services.estimator.precise.learning.map_alignment import align_to_map
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.generative_models import RayCaster
