@@ -116,8 +116,10 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	$(BIN)/presage bench visits --worlds 0 --visits 6 --scans 100 --seed 4711 --out $(RESULTS)/visits --json $(RESULTS)/visits-office.json
 	$(BIN)/python -m lab.benchmarks.live_refinement --worlds office,4712 --seed 4712 --json $(RESULTS)/live-refinement.json
 	$(if $(PEERS),OMP_NUM_THREADS=1 $(BIN)/presage experiment --seed 3611 --out $(RESULTS) peers '$(PEERS)' --trials 10)
-	$(if $(LOGS),$(call measure_log,fr079_exchanged,fr079.npz,--half second,--exchange --every 200))
-	$(if $(LOGS),$(call measure_log,uwb,uwb.npz,--half first,--every 10))
+	$(if $(LOGS),$(BIN)/presage map '$(LOGS)/fr079.npz' --mount 0,0,0 --poses reference --half second --no-learn -o $(RESULTS)/second_half.yaml)
+	$(if $(LOGS),$(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/fr079.npz' --mount 0,0,0 --world $(RESULTS)/second_half.yaml --exchange --every 200 --name fr079_exchanged)
+	$(if $(LOGS),$(BIN)/presage map '$(LOGS)/uwb.npz' --mount 0,0,0 --poses reference --half first --no-learn -o $(RESULTS)/first_half.yaml)
+	$(if $(LOGS),$(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/uwb.npz' --mount 0,0,0 --world $(RESULTS)/first_half.yaml --every 10 --name uwb)
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity --worlds 3 --seed 3114 --model exact --seconds 10
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-long-corridor --worlds 20 --seed 3116 --model exact --seconds 10 --cases long-corridor --estimators precise
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-50 --worlds 20 --seed 3311 --model exact --cases moved-50
@@ -127,12 +129,6 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	mv docs/experiments/accuracy.png docs/accuracy.png
 	cp $(RESULTS)/within_2cm/* docs/experiments/within_2cm/
 	for page in README.md docs/*.md; do $(BIN)/presage experiment --out docs/experiments tables --page $$page || exit 1; done
-
-# A real log: NAME of the result, FILE in $(LOGS), the half on which to learn, and other options.
-define measure_log
-$(BIN)/presage map '$(LOGS)/$2' --mount 0,0,0 --poses reference $3 --no-learn -o $(RESULTS)/$1.yaml \
-  && $(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/$2' --mount 0,0,0 --world $(RESULTS)/$1.yaml $4 --name $1
-endef
 
 screenshots: install ## docs/page.png and docs/page.webp of the live page; needs Chromium
 	$(BIN)/python -m tests.viewer.screenshots $(ARGS)
