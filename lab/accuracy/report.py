@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgba
 from matplotlib.ticker import LogLocator
 from rich.console import Console
 from rich.table import Table
@@ -248,6 +249,6 @@ def _draw_estimator(axes: Axes, rows: list[dict[str, Any]], tasks: list[str], na
     colour, mark = MARKS[name]
     errors_mm = [row["position_error_rms_m"] * 1e3 for row in rows]
     lines = [tasks.index(row["task"]) for row in rows]
-    opacity = [1.0 if row["found"] >= FEW_FOUND * row["of"] else 0.25 for row in rows]
-    axes.scatter(errors_mm, lines, color=colour, alpha=opacity, marker=mark, s=50, zorder=3)
+    colours = [to_rgba(colour, 1.0 if row["found"] >= FEW_FOUND * row["of"] else 0.25) for row in rows]
+    axes.scatter(errors_mm, lines, color=colours, marker=mark, s=50, zorder=3)
     axes.scatter([], [], color=colour, marker=mark, s=50, label=name)
