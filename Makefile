@@ -123,6 +123,8 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity --worlds 3 --seed 3114 --model exact --seconds 10
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-long-corridor --worlds 20 --seed 3116 --model exact --seconds 10 --cases long-corridor --estimators precise
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-50 --worlds 20 --seed 3311 --model exact --cases moved-50
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-100 --worlds 20 --seed 3117 --model exact --seconds 10 --cases moved-100 --estimators precise
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-100-development --worlds 1 --seed 57 --model exact --seconds 10 --cases moved-100 --estimators precise
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-single-scan --worlds 20 --seed 3115 --model exact --cases single-scan-moved-50 --estimators precise
 	for folder in $(RESULTS)/integrity*/; do cp $$folder/integrity.json docs/experiments/$$(basename $$folder).json || exit 1; done
 	cp $(RESULTS)/integrity/integrity.png $(RESULTS)/*.json $(RESULTS)/*.csv $(RESULTS)/*.png $(RESULTS)/*.pdf docs/experiments/

@@ -126,7 +126,7 @@ def searching(loop):
 @pytest.fixture
 def fleet(bus, link, monkeypatch):
     """A function that runs the loop for robots, and returns it and the robots."""
-    models = SimpleNamespace(factory=lambda _: SearchingStub(), describe=lambda _: "none")
+    models = SimpleNamespace(world=ROOM, factory=lambda _: SearchingStub(), describe=lambda _: "none")
     monkeypatch.setattr(multi_robot, "SharedModels", lambda _: models)
     SearchingStub.proceed.clear()
     running = []

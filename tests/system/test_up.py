@@ -133,7 +133,8 @@ def test_up_with_two_robots(up):
             belief = messages.latest["belief"]
             truth = messages.wait_for(Truth, lambda truth, stamp=belief.stamp_ns: truth.stamp_ns >= stamp, 60)
             assert abs(belief.pose.x - truth.pose.x) < 0.3
-            assert bus.alive() == {"estimator", "simulator", "controller"}
+            alive = {"estimator", "simulator", "controller"}
+            assert wait_until(lambda bus=bus, alive=alive: bus.alive() == alive, 60), bus.alive()
     assert running.stop(signal.SIGTERM, 60) == 130
     assert wait_until(lambda: all(map(ended, children)), 10)
 
