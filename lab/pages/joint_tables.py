@@ -14,6 +14,7 @@ PRESETS = {"precise": "presage", "particle-filter": "particle filter, tuned", "a
 # Labels in README, and the tasks of `presage bench accuracy`
 TASKS = {
     "unknown start, 1 scan": "from nothing, 1 scan",
+    "unknown start, 20 scans": "standing, 20 scans",
     "30 % blocked, 20 scans": "30 % blocked, 20 scans",
     "kidnapped, 20 scans": "kidnapped, 20 scans",
     "tracking, no odometry": "tracking, no odometry",
@@ -22,22 +23,34 @@ MOVED = "half of the furniture moved"
 
 
 def real_logs(folder: Path) -> str:
-    """A real log, for each estimator."""
-    summary = read(folder / "real-fr079_exchanged.json")["summary"]
-    odometry, laser, unknown = (
-        [summary[f"{task}, {name}"] for name in PRESETS]
-        for task in ("a: tracking with odometry", "b: tracking without", "c: from nothing")
-    )
-    claims = [f"{claims_of(row)}; {row['wrong_claim_longest_s']:.1f} s" for row in odometry]
-    return markdown(
-        ["", *PRESETS.values()],
-        [
-            ["pose correct, with odometry", *(f"{100 * row['tracked_share']:.1f} %" for row in odometry)],
-            ["pose correct, laser alone", *(f"{100 * row['tracked_share']:.1f} %" for row in laser)],
-            ["state `tracking`, wrong of these; longest (odometry)", *claims],
-            ["unknown start found within 40 scans", *(f"{row['found']} of {row['trials']}" for row in unknown)],
-        ],
-    )
+    """A real log, for each estimator: the second half localised with the first, and the reverse.
+
+    Pairs are with odometry; without.
+    """
+    lines, longest = [], [0.0] * len(PRESETS)
+    for half, name in (("second half", "real-fr079"), ("first half", "real-fr079_exchanged")):
+        summary = read(folder / f"{name}.json")["summary"]
+        odometry, laser, unknown = (
+            [summary[f"{task}, {preset}"] for preset in PRESETS]
+            for task in ("a: tracking with odometry", "b: tracking without", "c: from nothing")
+        )
+        pairs = list(zip(odometry, laser, strict=True))
+        lines += [
+            [
+                f"{half}: pose correct",
+                *("; ".join(f"{row['tracked_share']:.1%}" for row in pair) for pair in pairs),
+            ],
+            [
+                f"{half}: `tracking`, wrong of these",
+                *("; ".join(map(claims_of, pair)) for pair in pairs),
+            ],
+            [f"{half}: unknown start found", *(f"{row['found']} of {row['trials']}" for row in unknown)],
+        ]
+        for k, preset in enumerate(PRESETS):
+            own = [row["wrong_claim_longest_s"] for task, row in summary.items() if task.endswith(f", {preset}")]
+            longest[k] = max(longest[k], *own)
+    lines.append(["longest wrong `tracking`", *(f"{each:.1f} s" for each in longest)])
+    return markdown(["", *PRESETS.values()], lines)
 
 
 def simulation(folder: Path) -> str:
