@@ -377,7 +377,8 @@ def _load(name: str, folder: Path, *, is_floor: bool = False) -> World:
         raise UserError(f"world {path}: cannot be read ({error})") from None
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        raise UserError(f"world {path}: {'.'.join(map(str, first['loc'])) or 'file'}: {first['msg']}") from None
+        where, what = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")
+        raise UserError(f"world {path}: {f'{where}: ' if where else ''}{what}") from None
     except TooLargeError as error:
         raise UserError(f"world {path}: {error}") from None
     except NOT_YAML as error:
@@ -392,7 +393,12 @@ def _load_building(path: Path, data: dict[str, Any]) -> World:
             floors[name] = _load(world, path.parent, is_floor=True)
         except UserError as error:
             raise UserError(f"world {path}: floor {name!r}: {error}") from None
-    return World.model_validate(building.lay_out(file, floors))
+    laid_out = World.model_validate(building.lay_out(file, floors))
+    for lift in laid_out.lifts:
+        for name, (x, y) in lift.items():
+            if laid_out.clearance(laid_out.to_map((x, y), name))[0] <= 0:
+                raise UserError(f"world {path}: the lift at ({x:g}, {y:g}) is not in free space of floor {name!r}")
+    return laid_out
 
 
 def save_world(world: World) -> str:

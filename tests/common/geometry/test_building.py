@@ -144,6 +144,10 @@ def test_ros_maps_and_shipped_worlds_as_floors(tmp_path):
         ({"lifts": [{"ground": [1, 5]}]}, "lifts.0: Dictionary should have at least 2"),
         ({"lifts": [{"ground": [1, 5], "attic": [1, 5]}]}, "unknown floor: there is no floor 'attic'"),
         ({"floors": {"a": "ground.yaml", "b": "ground.yaml"}, "lifts": [{"a": [1, 5], "b": [1, 50]}]}, "floor 'b'"),
+        (
+            {"floors": {"a": "ground.yaml", "b": "hall.yaml"}, "lifts": [{"a": [1, 5], "b": [2, 0]}]},
+            "the lift at (2, 0) is not in free space of floor 'b'",
+        ),
         ({"boundary": [[0, 0], [1, 0], [1, 1]]}, "boundary: Extra inputs"),
     ],
 )
@@ -153,6 +157,7 @@ def test_invalid_buildings(tmp_path, more, message):
     write_map(tmp_path, HUT, name="fine", **{**keys, "resolution": 0.1})
     write_map(tmp_path, HUT, name="turned", **{**keys, "origin": [0, 0, 0.5]})
     (tmp_path / "saved.yaml").write_text(save_world(TOWER))
+    (tmp_path / "hall.yaml").write_text(save_world(HALL))
     path = files(tmp_path, {"ground": ROOM}, **more)
     with pytest.raises(UserError) as error:
         load_world(path)
