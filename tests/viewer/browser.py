@@ -13,6 +13,7 @@ from playwright.sync_api import Browser, Page, sync_playwright
 
 from tests.conftest import WAIT_TIMEOUT_S
 
+POLLING_MS = 50  # the default is each frame drawn, but on a busy machine a browser may draw none for a long time
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 ARGUMENTS = [
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
@@ -67,7 +68,7 @@ class Visit:
     def wait(self, condition: str, seconds: float = WAIT_TIMEOUT_S, argument: Any = None) -> None:
         """Until an expression is true; raises playwright's TimeoutError."""
         body = f"(arg) => {{ const {{ store, view, modes }} = presage; return Boolean({condition}); }}"
-        self.page.wait_for_function(body, arg=argument, timeout=1000 * seconds)
+        self.page.wait_for_function(body, arg=argument, polling=POLLING_MS, timeout=1000 * seconds)
 
     def at(self, x: float, y: float) -> tuple[float, float]:
         """Pixels of the page at which the map shows a place, m."""
@@ -100,5 +101,6 @@ def visit(browser: Browser, address: str, *, width: int = 1100, height: int = 76
     context.add_init_script(KEEP_TOASTS)
     seen = Visit(context.new_page())
     seen.page.goto(address)
-    seen.page.wait_for_function("() => window.presage && presage.store.connected", timeout=1000 * WAIT_TIMEOUT_S)
+    connected = "() => window.presage && presage.store.connected"
+    seen.page.wait_for_function(connected, polling=POLLING_MS, timeout=1000 * WAIT_TIMEOUT_S)
     return seen
