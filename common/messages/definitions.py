@@ -7,7 +7,7 @@ comments beside the fields.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -37,6 +37,7 @@ from common.robot.motion_distortion import beam_times, sweep_time
 
 if TYPE_CHECKING:
     from common.geometry.world import World
+    from common.robot.scanner import Scanner
 
 GOAL_TOLERANCE_M = 0.02  # default of Goal.tolerance
 
@@ -64,6 +65,20 @@ class Scan(Stamped):
     sigma: Distance = 0.0  # m, standard deviation of a range; unknown if this and sigma_relative are 0
     sigma_relative: Annotated[float, Field(ge=0, le=1)] = 0.0  # standard deviation as a share of the range,
     # added to sigma in quadrature
+
+    @classmethod
+    def of_scanner(cls, scanner: Scanner, ranges: npt.ArrayLike, stamp_ns: int, **fields: Any) -> Scan:
+        """A scan with ``ranges`` (B,) m and the beams, limits and mount of a scanner; further fields by name."""
+        return cls(
+            stamp_ns=stamp_ns,
+            angle_min=scanner.angle_min,
+            angle_increment=scanner.angle_increment,
+            range_min=scanner.range_min,
+            range_max=scanner.range_max,
+            ranges=np.asarray(ranges, np.float32),
+            mount=Pose.of(scanner.mount),
+            **fields,
+        )
 
     def angles(self) -> npt.NDArray[np.float64]:
         """(B,) beam directions in laser, rad."""
@@ -202,6 +217,13 @@ class Goal(Stamped):
             raise UserError(f"there is no floor {self.map_id!r}: there is no map with floors")
         pose = Pose.of(world.to_map(self.pose.array(), self.map_id))
         return self.model_copy(update={"pose": pose, "map_id": ""})
+
+    def pose_in_map(self, world: World | None) -> Pose | None:
+        """The goal's pose in map; None if ``world`` has no floor `map_id`, so that the controller refuses the goal."""
+        try:
+            return self.in_map(world).pose
+        except UserError:
+            return None
 
 
 class Drive(Stamped):

@@ -12,7 +12,7 @@ from common.bus.inbox import Inbox, Sample
 from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.world import World
-from common.messages.definitions import Belief, Pose, Scan
+from common.messages.definitions import Belief, Scan
 from common.messages.requests import LocaliseRequest
 from common.messages.topics import BELIEF, HEALTH, LOCALISE, PREDICTION, SCAN
 from common.messages.wire import DecodeError
@@ -134,17 +134,8 @@ class FleetLoad:
     def _payload(self, robot: CirclingRobot, k: int) -> bytes:
         scanner, laser = self.scanner, se2.compose(robot.pose(k, self.rate), self.scanner.mount)
         clean = self.world.ray_distances(laser[None], scanner.angles())[0]
-        return Scan(
-            stamp_ns=self._stamp(k),
-            seq=k,
-            angle_min=scanner.angle_min,
-            angle_increment=scanner.angle_increment,
-            range_min=scanner.range_min,
-            range_max=scanner.range_max,
-            ranges=clean + scanner.sigma * self._rng.standard_normal(len(clean)),
-            mount=Pose.of(scanner.mount),
-            scan_time=1 / self.rate,
-        ).encode()
+        noisy = clean + scanner.sigma * self._rng.standard_normal(len(clean))
+        return Scan.of_scanner(scanner, noisy, self._stamp(k), seq=k, scan_time=1 / self.rate).encode()
 
     def _window(self, count: int, sent: dict[tuple[str, int], int]) -> AnswerStatistics:
         """Matches the received answers to the scans in ``sent``, waiting up to `ANSWER_TIMEOUT_S` for the last ones."""

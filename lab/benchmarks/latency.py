@@ -21,7 +21,7 @@ from common.errors import UserError
 from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.world import load_world
-from common.messages.definitions import CmdVel, Pose, Scan
+from common.messages.definitions import CmdVel, Scan
 from common.messages.topics import CMD_VEL, ODOM, SCAN, TRUTH
 from common.robot.base import Robot
 from common.robot.scanner import SCANNERS, Scanner
@@ -95,7 +95,7 @@ def _measure(
     for number in track(range(WARM_UP_SCANS + scans), "scan to command", console=console, transient=True):
         stamp = int(number / rate * 1e9)
         noisy = clean + scanner.sigma * rng.standard_normal(len(clean))
-        payload = _scan(scanner, noisy, number, stamp, rate).encode()
+        payload = Scan.of_scanner(scanner, noisy, stamp, seq=number, scan_time=1 / rate).encode()
         began = time.perf_counter()
         bus.put(SCAN, payload)
         answered = _wait_for(commands, lambda p, s=stamp: CmdVel.decode(p).stamp_ns == s)
@@ -121,20 +121,6 @@ def _measure(
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
         **provenance(seed=0),
     }
-
-
-def _scan(scanner: Scanner, ranges: Array, number: int, stamp_ns: int, rate: float) -> Scan:
-    return Scan(
-        stamp_ns=stamp_ns,
-        seq=number,
-        angle_min=scanner.angle_min,
-        angle_increment=scanner.angle_increment,
-        range_min=scanner.range_min,
-        range_max=scanner.range_max,
-        ranges=ranges.astype(np.float32),
-        mount=Pose.of(scanner.mount),
-        scan_time=1 / rate,
-    )
 
 
 def _wait_for(inbox: Inbox, wanted: Any) -> bool:

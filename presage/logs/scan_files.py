@@ -15,7 +15,6 @@ from rich.console import Console
 
 from common.errors import UserError
 from common.geometry.se2 import Array
-from common.geometry.world import World
 from common.messages.definitions import CmdVel, Goal, Odom, Scan, Stamped, Truth
 from common.messages.topics import CMD_VEL, GOAL, ODOM, SCAN, TRUTH
 from common.robot.ranges import ranges_for_localisation
@@ -190,7 +189,8 @@ def _read_recording(path: Path) -> Scans:
         elif isinstance(message, CmdVel):
             command = message.twist.array()
         elif isinstance(message, Goal):
-            goal = unknown if message.cancel or message.explore else _goal_pose(message, world)
+            pose = None if message.cancel or message.explore else message.pose_in_map(world)
+            goal = unknown if pose is None else pose.array()
     if recording.warning:  # damage is only found while reading
         print(f"warning: {recording.warning}", file=sys.stderr)
     if not scans:
@@ -213,14 +213,6 @@ def _read_recording(path: Path) -> Scans:
         stamps_ns=np.array([s.stamp_ns for s in scans], np.int64),
         time_increment=first.time_increment,
     )
-
-
-def _goal_pose(goal: Goal, world: World | None) -> Array:
-    """Pose (3,) of a goal in map; NaN if it was refused because its floor is unknown."""
-    try:
-        return goal.in_map(world).pose.array()
-    except UserError:
-        return np.full(3, np.nan)
 
 
 class _StampCounter:

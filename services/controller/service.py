@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from common.errors import UserError
 from common.geometry.world import load_world
 from common.messages.definitions import Belief, CmdVel, Drive, Goal, Map, Plan, Pose, Preference, Scan, Stamped, Status
 from common.messages.requests import PredictReply, PredictRequest, Reply
@@ -121,15 +120,9 @@ class ControllerService(Service):
         if self.navigator.goal_state.goal is not None:
             return  # a new goal has arrived already
         under_way = status.state not in {"idle", "reached"} and not status.refused
-        if under_way and status.goal == self._pose_in_map(goal) and status.goal_seq == goal.seq:
+        if under_way and status.goal == goal.pose_in_map(self.navigator.world) and status.goal_seq == goal.seq:
             self.navigator.on_goal(goal)
             self.log.warning("resuming the goal of the previous controller instance", x=goal.pose.x, y=goal.pose.y)
-
-    def _pose_in_map(self, goal: Goal) -> Pose | None:
-        try:
-            return goal.in_map(self.navigator.world).pose
-        except UserError:
-            return None
 
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
         """Answers a belief by a command with its stamp, and a goal by a status at once."""

@@ -54,6 +54,11 @@ class EstimatorOptions:
     likelihood: Likelihood | None = None  # for precise; defaults to the weights' calibration or the noise
     optimiser: Optimiser | None = None  # for precise; defaults to Gauss-Newton
 
+    @functools.cached_property
+    def loaded_world(self) -> World:
+        """The world itself; raises UserError if its file is missing or invalid."""
+        return self.world if isinstance(self.world, World) else load_world(self.world)
+
     @property
     def world_argument(self) -> str:
         """The world as it would be given on the command line."""
@@ -138,7 +143,7 @@ def prepare_factory(options: EstimatorOptions) -> EstimatorFactory:
     """
     if options.estimator not in get_args(EstimatorPreset):
         raise UserError(f"no estimator {options.estimator!r}: choose one of {', '.join(get_args(EstimatorPreset))}")
-    world = options.world if isinstance(options.world, World) else load_world(options.world)
+    world = options.loaded_world
     check_start(options, world)
     if options.estimator == "paper":
         return _prepare_paper(options, world)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from common.errors import UserError
-from common.geometry.world import World, load_world
+from common.geometry.world import World
 from common.messages.requests import FILE_NAME, ModelReply
 from common.versions import commit, versions
 from services.estimator.factory import EstimatorOptions, ScannerGeometry, field_path
@@ -56,7 +56,7 @@ def model_in_use(options: EstimatorOptions, beams: int | None) -> ModelInUse:
 
     Raises UserError if the model is unknown.
     """
-    world = options.world if isinstance(options.world, World) else load_world(options.world)
+    world = options.loaded_world
     if options.estimator == "precise" and options.model != "exact":
         path = field_path(options, world)
         if options.model != "learned":  # any file; its map is the world in its card

@@ -8,7 +8,7 @@ import numpy as np
 
 from common.errors import UserError
 from common.geometry.pose_text import start_of_text
-from common.geometry.world import World, load_world
+from common.geometry.world import World
 from common.messages.definitions import (
     Belief,
     BeliefHypothesis,
@@ -89,7 +89,7 @@ class SharedModels:
     def __init__(self, settings: EstimatorSettings) -> None:
         """Raises UserError if there are no weights for the world."""
         self.options = estimator_options(settings)
-        self.world = load_world(settings.world)
+        self.world = self.options.loaded_world
         self.factory: EstimatorFactory = prepare_factory(self.options)
         self._described: dict[int | None, ModelInUse | str] = {}
 
@@ -188,12 +188,8 @@ class EstimatorService(Service):
     def _pose_of_goal(self, goal: Goal) -> Array | None:
         """Pose (3,) of a goal in map; None if it has none, or is on an unknown floor."""
         assert self.models is not None  # noqa: S101 - set in open
-        if goal.cancel or goal.explore:
-            return None
-        try:
-            return goal.in_map(self.models.world).pose.array()
-        except UserError:
-            return None  # the controller refuses it
+        pose = None if goal.cancel or goal.explore else goal.pose_in_map(self.models.world)
+        return None if pose is None else pose.array()
 
     def _update_all(self, scans: list[ScanWithOdometry]) -> None:
         for scan, odom in scans:

@@ -206,14 +206,10 @@ class Simulation:
 
     def _scan_message(self, ranges: Array) -> Scan:
         scanner = self.setup.scanner
-        return Scan(
-            stamp_ns=self.stamp_ns,
-            angle_min=scanner.angle_min,
-            angle_increment=scanner.angle_increment,
-            range_min=scanner.range_min,
-            range_max=scanner.range_max,
-            ranges=ranges.astype(np.float32),
-            mount=Pose.of(scanner.mount),
+        return Scan.of_scanner(
+            scanner,
+            ranges,
+            self.stamp_ns,
             scan_time=self.period_ns * 1e-9,
             time_increment=self._time_increment,
             sigma=scanner.sigma,

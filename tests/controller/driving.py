@@ -50,15 +50,7 @@ def scan(stamp_ns, pose, world, scanner=SCANNER, rng=None) -> Scan:
     ranges = world.ray_distances(laser[None], scanner.angles())[0]
     if rng is not None:
         ranges = scanner.add_noise(ranges, rng)
-    return Scan(
-        stamp_ns=stamp_ns,
-        angle_min=scanner.angle_min,
-        angle_increment=scanner.angle_increment,
-        range_min=scanner.range_min,
-        range_max=scanner.range_max,
-        ranges=scanner.limit(ranges).astype(np.float32),
-        mount=Pose.of(scanner.mount),
-    )
+    return Scan.of_scanner(scanner, scanner.limit(ranges), stamp_ns)
 
 
 def session(navigator, pose, drives, world, *, first=0, state="tracking"):
