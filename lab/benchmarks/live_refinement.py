@@ -36,10 +36,10 @@ ROUGH_SEED, DRIVE_SEED, TEST_SEED = 5, 6, 7  # parts of the random seeds: of the
 
 def start_estimator(rough: World, scene: Scene, start: Array) -> PreciseEstimator:
     """An estimator in the rough map, near a pose."""
-    made = prepare_factory(EstimatorOptions(rough, model="exact"))(ScannerGeometry.of(scene.scanner))
-    assert isinstance(made, PreciseEstimator)  # noqa: S101 - for the type checker
-    made.restart(start + START_DEVIATION * scene.rng.standard_normal(3), np.diag(START_DEVIATION**2))
-    return made
+    estimator = prepare_factory(EstimatorOptions(rough, model="exact"))(ScannerGeometry.of(scene.scanner))
+    assert isinstance(estimator, PreciseEstimator)  # noqa: S101 - for the type checker
+    estimator.restart(start + START_DEVIATION * scene.rng.standard_normal(3), np.diag(START_DEVIATION**2))
+    return estimator
 
 
 def drive_and_learn(rough: World, scene: Scene, path: Array) -> tuple[dict[str, Any], ModelVersion | None]:
