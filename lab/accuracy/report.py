@@ -40,12 +40,10 @@ FEW_FOUND = 0.9  # the mark of an estimator that found a smaller share of a task
 LEGEND = f"""Errors are of the position, in mm. *Found*: trials within {FOUND_DISTANCE:g} m and
 {np.rad2deg(FOUND_YAW):g}° of the true pose, with Wilson's 95 % interval, where trials are independent; median, RMS and
 NEES are of these, with bootstrap intervals over trials, or over 5 s of a path. *Wrong*: trials that published
-`tracking` elsewhere. *All*: median/RMS of all trials, found or not. A NEES of 3 means a consistent covariance. The
-bound is the Cramér-Rao bound, RMS. "Both kept": from scan {TWINS_REQUIRED_FROM_SCAN} until a scan distinguishes the two
-rooms, every belief contains a hypothesis at the true pose and one at its twin; wrong counts trials that published
-`tracking` at the wrong place during that time."""
-MILLIMETRES_ABOVE_M = 0.05  # larger errors are printed without decimals
-HEADS = ("estimator", "found (95 %)", "wrong", "median (95 %)", "RMS (95 %)", "all", "NEES", "update (ms)")
+`tracking` elsewhere. A NEES of 3 means a consistent covariance. The bound is the Cramér-Rao bound, RMS. "Both kept":
+from scan {TWINS_REQUIRED_FROM_SCAN} until a scan distinguishes the two rooms, every belief contains a hypothesis at the
+true pose and one at its twin; wrong counts trials that published `tracking` at the wrong place during that time."""
+HEADS = ("estimator", "found (95 %)", "wrong", "median", "RMS (95 %)", "NEES", "update (ms)")
 
 
 def bench_accuracy(
@@ -174,17 +172,12 @@ def _markdown(rows: list[dict[str, Any]], title: str) -> str:
 
 
 def _cells(row: dict[str, Any]) -> list[str]:
-    every = [row.get(f"all_trials_position_error_{what}_m") for what in ("median", "rms")]
-    digits = 0 if any(value is not None and value > MILLIMETRES_ABOVE_M for value in every) else 2
     return [
         row["estimator"],
         _found(row),
         str(row["tracking_but_wrong"]),
-        *(
-            f"{_number(row[f'position_error_{what}_m'], 1e3)}{_interval(row.get(f'position_error_{what}_95_m'))}"
-            for what in ("median", "rms")
-        ),
-        "/".join(_number(value, 1e3, digits) for value in every if value is not None),
+        _number(row["position_error_median_m"], 1e3),
+        f"{_number(row['position_error_rms_m'], 1e3)}{_interval(row.get('position_error_rms_95_m'))}",
         _number(row["nees_mean"]),
         _number(row["update_ms_median"], 1, 1),
     ]
@@ -205,8 +198,8 @@ def cell(row: dict[str, Any]) -> str:
     counts = f"{_found(row)}, {row['tracking_but_wrong']} wrong"
     if row["position_error_median_m"] is None:
         return counts
-    median = f"{_number(row['position_error_median_m'], 1e3)}{_interval(row.get('position_error_median_95_m'))}"
-    return f"{median}/{_number(row['position_error_rms_m'], 1e3)} mm; {counts}"
+    errors = "/".join(_number(row[f"position_error_{name}_m"], 1e3) for name in ("median", "rms"))
+    return f"{errors} mm; {counts}"
 
 
 def _draw(rows: list[dict[str, Any]], file: Path) -> None:

@@ -14,32 +14,15 @@ from common.errors import UserError
 from lab.experiments.results import Result, markdown, millimetres, number
 from lab.integrity.cases import CASES
 from lab.integrity.runner import IntegrityPlan, run
-from lab.integrity.scoring import MAX_WRONG_S, RECOVERY_SCANS
 from presage.plotting.style import BOUND, COLOURS, GOAL, figure_of, legend_below
 from presage.terminal.output import make_folder
 
 ESTIMATORS = ("precise", "particle-filter", "amcl-defaults")
-HEADS = (
-    "case",
-    "estimator",
-    "trials",
-    "tracking",
-    "wrong of these",
-    "longest (s)",
-    f"trials > {MAX_WRONG_S:g} s",
-    "correct",
-    "NEES x, y: mean; median",
-    "NEES",
-    "error median/RMS (mm)",
-    f"found in {RECOVERY_SCANS} scans",
-    "beyond protection",
-    "update median/95 %/max (ms)",
-)
-LEGEND = """*Tracking*: scans reported as `tracking`. *Wrong*: of these, scans with an error above 0.2 m or 5°, with
-Wilson's 95 % interval (too narrow, because scans of one trial depend on each other). *Longest*: wrong stretch; *trials*
-with one of more than a second. *Correct*: scans within 0.2 m and 5°, in any state. *NEES* where `tracking`; 2 and 3 are
-ideal. *Error* of correct scans. *Found*: `tracking` at the right place after a kidnapping. *Beyond protection*: shares
-of scans whose error along x, along y and in yaw exceeds the protection level."""
+HEADS = ("`tracking` %", "wrong of these %; longest", "correct %", "error (mm)", "NEES")  # of each estimator
+LEGEND = """*Tracking*: share of the scans that are reported as `tracking`. *Wrong*: share of these with an error above
+0.2 m or 5°, with Wilson's 95 % interval (too narrow, because scans of one trial depend on each other), or its upper
+bound if none was wrong. *Longest*: wrong stretch. *Correct*: scans within 0.2 m and 5°, in any state. *Error*:
+median/RMS of correct scans. *NEES*: mean of x and y where `tracking`; 2 is ideal. The JSON has more."""
 
 
 def bench_integrity(plan: IntegrityPlan, out: Path, workers: int, console: Console) -> int:
@@ -70,39 +53,41 @@ def _check(plan: IntegrityPlan) -> None:
 
 
 def table(scores: dict[str, dict[str, Any]]) -> str:
-    """The Markdown table, with a row for each case and estimator."""
+    """The Markdown table, with a row for each case and columns for each estimator."""
     cases = list(dict.fromkeys(case for by_case in scores.values() for case in by_case))
     cases = cases[:1] if cases[1:] == ["all"] else cases
-    return markdown(
-        HEADS,
-        [[case, name, *_cells(by_case[case])] for case in cases for name, by_case in scores.items() if case in by_case],
-    )
+    heads = [f"{name}: {HEADS[0]}" if k == 0 else HEADS[k] for name in scores for k in range(len(HEADS))]
+    rows = [[case, *(cell for by_case in scores.values() for cell in _cells(by_case.get(case)))] for case in cases]
+    return markdown(["case", *heads], rows)
 
 
-def _cells(row: dict[str, Any]) -> list[str]:
-    beyond = row["beyond_protection"]
+def _cells(row: dict[str, Any] | None) -> list[str]:
+    if row is None:
+        return [""] * len(HEADS)
     return [
-        str(row["trials"]),
         _percent(row["tracking"]),
-        _percent(row["wrong"], interval=True),
-        f"{row['longest_wrong_s']:.1f}",
-        str(row["trials_wrong_longer"]),
+        _wrong(row),
         _percent(row["correct"]),
-        f"{_short(row['nees_xy'])}; {_short(row['nees_xy_median'])}",
-        _short(row["nees"]),
-        f"{millimetres(row['error_median_m'])}/{millimetres(row['error_rms_m'])}",
-        "" if row["recovered"] is None else f"{row['recovered']['count']}/{row['recovered']['of']}",
-        "" if beyond[0] is None else ", ".join(f"{share:.2g}" for share in beyond),
-        "/".join(f"{value:.1f}" for value in row["update_ms"]),
+        "–"
+        if row["error_rms_m"] is None
+        else "/".join(millimetres(row[f"error_{name}_m"]) for name in ("median", "rms")),
+        _short(row["nees_xy"]),
     ]
 
 
-def _percent(share: dict[str, Any] | None, *, interval: bool = False) -> str:
-    if share is None:
+def _percent(share: dict[str, Any] | None) -> str:
+    return "–" if share is None else f"{100 * share['count'] / share['of']:.3g}"
+
+
+def _wrong(row: dict[str, Any]) -> str:
+    """Share of the `tracking` scans that are wrong, and the longest wrong stretch; an upper bound if there are none."""
+    wrong = row["wrong"]
+    if wrong is None:
         return "–"
-    text = f"{100 * share['count'] / share['of']:.4g} %"
-    low, high = (100 * bound for bound in share["interval_95"])
-    return f"{text} ({low:.3g} to {high:.3g})" if interval else text
+    low, high = (100 * bound for bound in wrong["interval_95"])
+    if not wrong["count"]:
+        return f"0 (≤ {high:.2g})"
+    return f"{_percent(wrong)} ({low:.3g} to {high:.3g}); {row['longest_wrong_s']:.1f} s"
 
 
 def _short(value: float | None) -> str:

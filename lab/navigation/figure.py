@@ -128,19 +128,17 @@ COLUMNS: dict[str, Callable[[dict[str, Any]], str]] = {  # of the table, after t
     "gap (m)": lambda row: number(row["min_clearance_m"]),
     "to people (m)": lambda row: number(row["min_clearance_to_people_m"]),
     "error (mm)": lambda row: f"{millimetres(row['median_error_median_m'])}; {millimetres(row['max_error_max_m'])}",
-    "step (ms)": lambda row: f"{number(row['median_step_mean_ms'], 1)}; {number(row['max_step_max_ms'], 1)}",
 }
 
 
 def table(summary: dict[str, dict[str, Any]]) -> str:
-    """The Markdown table of docs/navigation.md. Pairs are median; maximum, of the step time mean; maximum.
-
-    Brackets are 95 % intervals.
-    """
+    """The Markdown table of docs/navigation.md. Pairs are median; maximum. Brackets are a 95 % interval."""
     people = any(row["min_clearance_to_people_m"] is not None for row in summary.values())
     uncertain = any((row.get("median_longest_untracked_s") or 0) > 0 for row in summary.values())
     measured_left = all("median_left_m" in row for row in summary.values())  # not in results before November 2026
+    contact = any(row["trials_with_contact_moving"] or row["trials_with_contact_standing"] for row in summary.values())
     left_out = {
+        *([] if contact else ["contacts moving; standing"]),
         *([] if measured_left else ["distance left (mm)"]),
         *([] if uncertain else ["longest untracked (s)"]),
         *([] if people else ["to people (m)"]),
@@ -157,10 +155,7 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
 
 
 def _median_and_max(row: Mapping[str, Any], quantity: str, digits: int = 3) -> str:
-    interval = row.get(f"median_{quantity}_95")
-    within = "" if interval is None else f" ({' to '.join(number(each, digits) for each in interval)})"
-    median, most = (number(row.get(f"{statistic}_{quantity}"), digits) for statistic in ("median", "max"))
-    return f"{median}{within}; {most}"
+    return "; ".join(number(row.get(f"{statistic}_{quantity}"), digits) for statistic in ("median", "max"))
 
 
 def _percent(interval: Sequence[float]) -> str:

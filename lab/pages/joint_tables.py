@@ -1,11 +1,11 @@
-"""Tables that are made from more than one result: those of README.md, and the comparison with other programs."""
+"""Tables that are made from several results or from a part of one: those of README.md, results.md and peers.md."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-from lab.accuracy.report import cell
+from lab.accuracy import report
 from lab.experiments.results import markdown, number, read
 from lab.peers.experiment import table_with_others
 from lab.real_logs.experiment import claims_of
@@ -62,11 +62,19 @@ def simulation(folder: Path) -> str:
         best = _best_filter([row for (of_task, _), row in rows.items() if of_task == task])
         variant = best["estimator"].removeprefix("particle-filter").removeprefix("-").replace("-", " ") or "tuned"
         bound = f"{number(1e3 * own['bound_rms_m'], 2)} mm" if own["bound_rms_m"] else ""
-        lines.append([label, cell(own), f"{variant}: {cell(best)}", cell(matcher), bound])
+        lines.append([label, report.cell(own), f"{variant}: {report.cell(best)}", report.cell(matcher), bound])
     moved = read(folder / "integrity-moved-50.json")["summary"]
     own, tuned = (_integrity(moved[name]["moved-50"]) for name in ("precise", "particle-filter"))
     lines.append([MOVED, own, f"tuned: {tuned}", "", ""])
     return markdown(["", "presage", "best particle filter", "scan matcher", "bound (RMS)"], lines)
+
+
+def accuracy(folder: Path) -> str:
+    """The accuracy benchmark: presage, the tuned particle filter, its best variant in each task, and a scan matcher."""
+    rows = read(folder / "accuracy.json")["rows"]
+    best = {task: _best_filter([row for row in rows if row["task"] == task]) for task in {row["task"] for row in rows}}
+    shown = ("precise", "particle-filter", "correlative")
+    return report.table([row for row in rows if row["estimator"] in shown or row is best[row["task"]]])
 
 
 def _best_filter(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -84,4 +92,9 @@ def _integrity(row: dict[str, Any]) -> str:
     return f"{tracking:.1f} % `tracking`, of which {wrong:.1f} % wrong ({low:.2g} to {high:.2g} %)"
 
 
-TABLES = {"readme-real": real_logs, "readme-simulation": simulation, "peers": table_with_others}
+TABLES = {
+    "readme-real": real_logs,
+    "readme-simulation": simulation,
+    "accuracy": accuracy,
+    "peers": table_with_others,
+}

@@ -219,46 +219,34 @@ def _finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-HEADS = (
-    "task, estimator",
-    "knows",
-    "converged (95 % interval)",
-    "error, cm: median (95 % interval) / mean / 95th percentile",
-    "all trials, cm: median / RMS",
-    "heading (°)",
-    "`tracking`, of these wrong",
-    "CPU ms: first / later",
-)
+HEADS = ("converged", "error, cm: median (95 %) / mean / 95th percentile", "CPU ms: first / later")
 
 
 def table(summary: dict[str, dict[str, Any]]) -> str:
-    """The Markdown table of presage's own estimators."""
-    return results.markdown(HEADS, [_cells(name, row) for name, row in summary.items()])
+    """Markdown tables of presage's own estimators, one for each task."""
+    return _tables(summary, [])
 
 
 def table_with_others(folder: Path) -> str:
-    """The Markdown table of docs/peers.md: presage's own estimators, and the other programs as they were measured."""
-    summary = results.read(folder / "peers.json")["summary"]
-    others = results.read(folder / "peers-others.json")["rows"]
-    lines = []
+    """The Markdown tables of docs/peers.md: presage's own estimators, and the other programs as they were measured."""
+    return _tables(results.read(folder / "peers.json")["summary"], results.read(folder / "peers-others.json")["rows"])
+
+
+def _tables(summary: dict[str, dict[str, Any]], others: list[dict[str, Any]]) -> str:
+    tables = []
     for task, title in TASKS.items():
-        lines += [_cells(name, row) for name, row in summary.items() if name.startswith(title)]
+        lines = [_cells(name, row) for name, row in summary.items() if name.startswith(title)]
         lines += [
-            [f"{title}, {row['name']}", row["knows"], row["converged"], row["error_cm"], "", "", "", row["cpu_ms"]]
-            for row in others
-            if row["task"] == task
+            [row["name"], row["converged"], row["error_cm"], row["cpu_ms"]] for row in others if row["task"] == task
         ]
-    return results.markdown(HEADS, lines)
+        tables.append(results.markdown((title, *HEADS), lines))
+    return "\n\n".join(tables)
 
 
 def _cells(name: str, row: dict[str, Any]) -> list[str]:
-    low, high = (100 * bound for bound in row["converged_share_95"])
-    wrong = f"{row['wrong_tracking'] / row['tracking']:.2%}" if row["tracking"] else "–"
-    heading = row["yaw_error_median_rad"]
     return [
-        name,
-        ESTIMATORS[name.partition(", ")[2]].knows,
-        f"{row['converged']}/{row['trials']} ({low:.0f} to {high:.0f} %)",
+        name.partition(", ")[2],
+        f"{row['converged']}/{row['trials']}",
         " / ".join(
             [
                 f"{_centimetres(row['error_median_m'])}{_interval(row['error_median_95_m'])}",
@@ -266,9 +254,6 @@ def _cells(name: str, row: dict[str, Any]) -> list[str]:
                 _centimetres(row["error_p95_m"]),
             ]
         ),
-        f"{_centimetres(row['all_trials_error_median_m'])} / {_centimetres(row['all_trials_error_rms_m'])}",
-        "–" if heading is None else f"{np.rad2deg(heading):.3f}",
-        f"{row['tracking'] / row['scans']:.0%}, {wrong}",
         f"{row['first_update_ms']:.0f} / {row['later_update_ms']:.1f}",
     ]
 

@@ -48,7 +48,7 @@ def test_case(scans):
     assert row["nees_xy"] == pytest.approx((0 + 1 + 9 + 9) / 4)
     assert row["error_median_m"] == 0
     assert row["recovered"] is None
-    assert "50 % (21.5 to 78.5)" in table({"precise": {"unchanged": row}})
+    assert "| 50 (21.5 to 78.5); 2.0 s |" in table({"precise": {"unchanged": row}})
 
 
 def test_robot_outside_the_map(scans):

@@ -326,7 +326,7 @@ def test_small_run(tmp_path):
         for k, v in differential.items() if k not in timing
     }  # fmt: skip
     text = page.fill_tables("<!-- table navigation-maze-beams101 -->\n<!-- end -->", tmp_path)
-    assert "| maze, differential | 1/1 (21 to 100 %) | 0 | 0; 0 |" in text
+    assert "| maze, differential | 1/1 (21 to 100 %) | 0 | 1." in text
 
 
 def test_interrupted_and_killed_runs(process, tmp_path):

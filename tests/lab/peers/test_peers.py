@@ -57,8 +57,8 @@ def test_run(folder, tmp_path):
     }
     (tmp_path / "peers-others.json").write_text(json.dumps(others))
     table = experiment.table_with_others(tmp_path)
-    assert "| a: standing at unknown places, presage, polygons | σ, exact map | 1/1" in table
-    assert "| b: tracking with odometry, Other | – | 1/1 | 1 |" in table
+    assert "| presage, polygons | 1/1" in table
+    assert "| Other | 1/1 | 1 | 2 |" in table
 
 
 def test_drives_for_learning(folder):
