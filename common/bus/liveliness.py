@@ -1,4 +1,4 @@
-"""Liveliness tokens, and the last value of latched topics."""
+"""Zenoh liveliness tokens, which show the running services, and the last value of latched topics."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from common.containers.run_per_robot import robot_names
 from common.runtime.heartbeat import read_beats
-from common.runtime.liveness import Report, find_problem
+from common.runtime.service_monitor import Report, find_problem
 
 CONNECT_TIMEOUT_S = 4.0  # for the router or the live page
 PAGE = ("127.0.0.1", 8080)

@@ -16,8 +16,7 @@ from common.limits import MAX_BEAMS, MAX_COORDINATE_M, MAX_DISTANCE_M
 from common.messages import definitions as messages
 from common.messages import pose, requests
 from common.messages.topics import MAX_BYTES, MAX_REQUEST_BYTES, QUERIES, ROOT, TOPICS, alive_key
-from common.robot import base as robot
-from common.robot import scanner
+from common.robot import robot, scanner
 
 BASES = (messages.Stamped, requests.Reply)  # their fields are listed once
 USUAL_LIMITS = (MAX_COORDINATE_M, MAX_DISTANCE_M)

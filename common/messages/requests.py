@@ -15,7 +15,7 @@ from common.geometry.world import Obstacle, World
 from common.limits import MAX_BEAMS
 from common.messages.pose import Pose
 from common.messages.wire import Bytes, Count, Finite, Floats, Message, Name, NotNegative, Poses, Ranges, Text
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from common.robot.scanner import Scanner
 
 FILE_NAME = r"[A-Za-z0-9_-]{1,64}"  # under which maps and models may be saved

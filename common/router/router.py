@@ -95,7 +95,7 @@ def route(link: Link, log: Logger, received: list[int], metrics: str = "") -> No
         else:
             stack.enter_context(capture_zenoh_log(refusals))
             bus = stack.enter_context(open_bus(link, log_filter=LOG_FILTER))
-            facts["lets_in"] = [member.name for member in link.security.members]
+            facts["members"] = [member.name for member in link.security.members]
         if metrics:
             from common.router.metrics import router_metrics
             from common.runtime.metrics_server import serve_registry

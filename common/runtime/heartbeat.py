@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 
-from common.runtime.liveness import CountTimes, Report
+from common.runtime.service_monitor import CountTimes, Report
 
 
 class Heartbeat:

@@ -87,7 +87,7 @@ METRICS: tuple[MetricDefinition, ...] = (
     ),
     MetricDefinition("presage_uptime_seconds", "gauge", SERVICE_LABELS, "Time since the service's loop was created"),
     MetricDefinition(
-        "presage_pulse_age_seconds",
+        "presage_health_age_seconds",
         "gauge",
         SERVICE_LABELS,
         "Time since the last health message, which a running service sends each second",
@@ -193,7 +193,7 @@ class ServiceMetrics(Collector):
         registry = self.registry = new_registry()
         registry.register(self)
         add_build_info(registry, *self._labels)
-        uptime, health_age = gauge(registry, "presage_uptime_seconds"), gauge(registry, "presage_pulse_age_seconds")
+        uptime, health_age = gauge(registry, "presage_uptime_seconds"), gauge(registry, "presage_health_age_seconds")
         uptime.labels(*self._labels).set_function(lambda: time.monotonic() - counts()["began"])
         health_age.labels(*self._labels).set_function(lambda: time.monotonic() - self._last_health_time)
         self._rate = gauge(registry, "presage_message_rate_hertz")

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from common.errors import UserError
 from common.geometry.pose_text import NUMBER
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from common.robot.self_filter import SelfFilter
 from common.runtime.config import ServiceSettings
 

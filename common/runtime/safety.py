@@ -7,8 +7,8 @@ import numpy as np
 from common.geometry import se2
 from common.geometry.se2 import Array
 from common.messages.definitions import Scan
-from common.robot.base import Robot
 from common.robot.ranges import is_surface
+from common.robot.robot import Robot
 
 REACTION_TIME_S = 2 / 15  # the scan is up to one 15 Hz period old, and the command holds for another
 FOOTPRINT_MARGIN_M = 0.01  # distance around the footprint that must be free

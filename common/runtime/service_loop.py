@@ -20,8 +20,8 @@ from common.messages.requests import ConfigReply, Request
 from common.messages.topics import CONFIG, HEALTH, Query, Topic
 from common.messages.wire import DecodeError
 from common.runtime.heartbeat import Heartbeat
-from common.runtime.liveness import counts_of
 from common.runtime.protocol_check import ProtocolCheck, build_config_reply
+from common.runtime.service_monitor import counts_of
 
 if TYPE_CHECKING:
     from common.runtime.metrics import ServiceMetrics

@@ -13,7 +13,7 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.shapes import Box, Circle, Obstacle
 from common.geometry.world import World
-from common.robot.base import Robot
+from common.robot.robot import Robot
 
 Shape = Literal["box", "disc", "legs"]
 Point = tuple[float, float]

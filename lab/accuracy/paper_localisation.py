@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import track
 
 from common.geometry import se2
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from presage.terminal.output import provenance, write_json
 from services.estimator.paper import weights
 from services.estimator.paper.decoder import use_one_core

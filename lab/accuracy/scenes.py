@@ -12,7 +12,7 @@ import shapely
 from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.world import World
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS, Scanner
 from lab.accuracy.furniture import CATALOGUE, FurniturePiece
 from services.estimator.shared.interface import Observation

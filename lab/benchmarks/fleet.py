@@ -66,7 +66,7 @@ class DeploymentResult:
             per_robot = (self.memory_mb[most] - self.memory_mb[fewest]) / max(1, most - fewest)
         return {
             "estimator": self.estimator,
-            "way": self.deployment,
+            "deployment": self.deployment,
             "robots_served": self.served,
             "at_most_tried": most,
             "memory_per_robot_mb": per_robot,

@@ -41,7 +41,7 @@ def show(rows: list[dict[str, Any]], plan: FleetPlan, console: Console) -> dict[
         highlight=False,
     )
     for row in rows:
-        if row["way"] == DEPLOYMENTS[0]:
+        if row["deployment"] == DEPLOYMENTS[0]:
             console.print(_large_fleet_note(row, plan.rate), highlight=False)
     _warn_of_other_load(rows, console)
     return {name: _compare_deployments(name, rows, console) for name in dict.fromkeys(row["estimator"] for row in rows)}
@@ -68,7 +68,7 @@ def _table(rows: list[dict[str, Any]], plan: FleetPlan) -> Table:
     for row in rows:
         table.add_row(
             row["estimator"],
-            row["way"],
+            row["deployment"],
             f"{row['robots_served']}",
             *(f"{row[name]:.1f}" if row[name] is not None else "" for name in ("p50_ms", "p99_ms")),
             f"{row['cpu_ms_per_scan']:.2f}",
@@ -84,7 +84,7 @@ def _print_searches(rows: list[dict[str, Any]], console: Console) -> None:
     for row in rows:
         if (other := row["while_one_searches"]) is not None and other["p99_ms"] is not None:
             console.print(
-                f"{row['estimator']}, {row['way']}: {other['robots']} robots, one starts a search each second; "
+                f"{row['estimator']}, {row['deployment']}: {other['robots']} robots, one starts a search each second; "
                 f"the others: {100 * other['in_time_share']:.1f} % in time, "
                 f"p50 {other['p50_ms']:.1f}, p99 {other['p99_ms']:.1f} ms",
                 highlight=False,
@@ -105,7 +105,8 @@ def _warn_of_other_load(rows: list[dict[str, Any]], console: Console) -> None:
 def _compare_deployments(estimator: str, rows: list[dict[str, Any]], console: Console) -> dict[str, float | None]:
     """Prints and returns the ratios of one process for all robots to one process per robot."""
     one, each = (
-        next(r for r in rows if r["estimator"] == estimator and r["way"] == deployment) for deployment in DEPLOYMENTS
+        next(r for r in rows if r["estimator"] == estimator and r["deployment"] == deployment)
+        for deployment in DEPLOYMENTS
     )
     ratios = {
         "robots_served": one["robots_served"] / each["robots_served"] if each["robots_served"] else None,

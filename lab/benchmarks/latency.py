@@ -23,7 +23,7 @@ from common.geometry.se2 import Array
 from common.geometry.world import load_world
 from common.messages.definitions import CmdVel, Scan
 from common.messages.topics import CMD_VEL, ODOM, SCAN, TRUTH
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS, Scanner
 from presage.session.running_sessions import credentials_for
 from presage.session.stack import Stack

@@ -17,7 +17,7 @@ from common.geometry.occupancy_grid import FREE, OCCUPIED, UNKNOWN, Cells
 from common.geometry.ros_map_writer import write_map
 from common.geometry.world import World, load_world
 from common.messages.requests import WorldReply
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS
 from presage.terminal.output import check_file, make_folder, provenance, write_json
 from services.controller.policies.free_space import FreeSpace

@@ -10,7 +10,7 @@ import shapely
 from common.errors import UserError
 from common.geometry.se2 import Array
 from common.geometry.world import World
-from common.robot.base import Robot
+from common.robot.robot import Robot
 
 ARRIVAL_DISTANCE = 0.8  # m; closer than this counts as arrived, as in the paper
 MIN_DISTANCE = 12.0  # m, between start and goal

@@ -15,7 +15,7 @@ from common.geometry.coverage import MIN_PASSAGE_M, mapped_share, points_in, rea
 from common.geometry.se2 import Array
 from common.geometry.world import World
 from common.messages.definitions import Belief, Goal, Map, Odom, Pose, Scan, Twist
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS
 from lab.benchmarks.mapping import trajectory_errors
 from services.controller.growing_map import PlannedMap

@@ -16,7 +16,7 @@ import numpy as np
 from rich.console import Console
 
 from common.geometry.world import World, load_world
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from lab.experiments import results
 from lab.experiments.trials import run_trials
 from lab.exploration.drive import explore, measure

@@ -22,7 +22,7 @@ from rich.console import Console
 from common.errors import UserError
 from common.geometry import se2
 from common.messages.definitions import Goal, Pose
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS
 from lab.experiments import results
 from lab.experiments.lockstep import LockstepRun, RunTrace, session

@@ -24,7 +24,7 @@ import shapely
 from common.geometry.se2 import Array
 from common.geometry.world import World
 from common.messages.definitions import GOAL_TOLERANCE_M, Truth
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from lab.experiments.lockstep import RunTrace
 from lab.experiments.start_and_goal import least_time
 from lab.navigation.shortest_path import NavigationTask, length

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from common.errors import UserError
 from common.messages.definitions import GOAL_TOLERANCE_M
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS, Scanner
 from lab.experiments import results
 from lab.experiments.trials import run_trials

@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import dijkstra
 from common.errors import UserError
 from common.geometry.se2 import Array
 from common.geometry.world import World
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from lab.navigation.worlds import RULES, StartGoalRule, world_of
 
 ARC_TOLERANCE = 1e-3  # m, error of the polygons that replace arcs

@@ -19,7 +19,7 @@ from rich.console import Console
 
 from common.errors import UserError
 from common.geometry.se2 import Array
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from lab.accuracy import bound
 from lab.accuracy.scenes import Scene
 from lab.experiments import results

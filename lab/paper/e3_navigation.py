@@ -20,7 +20,7 @@ from rich.console import Console
 from common.errors import UserError
 from common.geometry.se2 import Array
 from common.geometry.world import load_world
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from lab.experiments import results
 from lab.experiments.estimators import PAPER_DESCENT, TEN_STEPS, ExperimentWorld, uses_odometry
 from lab.experiments.lockstep import LockstepRun, RunTrace, session

@@ -23,7 +23,7 @@ from rich.console import Console
 from common.geometry.se2 import Array
 from common.geometry.world import World
 from common.messages.definitions import Belief, Goal, Pose
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from lab.experiments import results
 from lab.experiments.estimators import ExperimentWorld
 from lab.experiments.start_and_goal import ARRIVAL_DISTANCE, StartAndGoal, draw_start_and_goal, least_time

@@ -15,7 +15,7 @@ import shapely
 
 from common.geometry.se2 import Array
 from common.geometry.world import World
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from lab.experiments.start_and_goal import ARRIVAL_DISTANCE, StartAndGoal
 from services.estimator.paper.decoder import PaperModel
 from services.estimator.paper.free_energy import FreeEnergy

@@ -55,7 +55,7 @@ def recover(
 ) -> None:
     """Make a complete recording from the readable parts of an unfinished or damaged one, and report what is missing.
 
-    Every intact chunk is copied, also those after a damaged one. An unfinished source is kept as NAME.mcap.torn.
+    Every intact chunk is copied, also those after a damaged one. An unfinished source is kept as NAME.mcap.incomplete.
 
     Examples: `presage recover recordings/run.mcap.active`; `presage recover damaged.mcap --out whole.mcap`.
     """

@@ -15,7 +15,7 @@ from common.messages.definitions import Health, Scan
 from common.messages.requests import ConfigReply, Request
 from common.messages.topics import CONFIG, TOPICS
 from common.messages.wire import DecodeError
-from common.runtime.liveness import RobotLiveness
+from common.runtime.service_monitor import ServiceMonitor
 from presage.diagnosis.findings import Finding
 from services.recorder.files.message_counts import SequenceNumbers
 
@@ -29,7 +29,7 @@ class BusObservation:
 
     robot: str
     seconds: float
-    liveness: RobotLiveness  # from 0 s to ``seconds``
+    monitor: ServiceMonitor  # from 0 s to ``seconds``
     connect: str = ""  # endpoints for the start commands of missing services; empty for the default
     robots: set[str] = field(default_factory=set)  # all robots with a service at the end
     replies: dict[str, list[ConfigReply]] = field(default_factory=dict)  # by service; several if it runs several times
@@ -67,7 +67,7 @@ def observe_bus(link: Link, seconds: float) -> BusObservation | list[Finding]:
         if not wait_until(bus.linked, ZENOH_TIMEOUT_S):
             problems = [problem for endpoint in link.connect if (problem := check_endpoint(endpoint)) is not None]
             return problems or [_no_zenoh(", ".join(link.connect))]
-        observation = BusObservation(link.robot, seconds, RobotLiveness(link.robot), link.connect_option)
+        observation = BusObservation(link.robot, seconds, ServiceMonitor(link.robot), link.connect_option)
         inbox, answers = Inbox(capacity=200_000), Inbox()
         tokens: set[tuple[str, str]] = set()  # robot and service; filled by zenoh's thread
         bus.watch_robots(lambda robot, service, alive: (tokens.add if alive else tokens.discard)((robot, service)))
@@ -78,7 +78,7 @@ def observe_bus(link: Link, seconds: float) -> BusObservation | list[Finding]:
         query = bus.query_all(CONFIG, Request(), answers, timeout=seconds)
         _receive(inbox, tokens, observation)
         observation.robots = {robot for robot, _ in tokens.copy()}
-        observation.liveness.set_alive(bus.alive(), seconds)
+        observation.monitor.set_alive(bus.alive(), seconds)
         query.wait(1.0)
         _add_replies(answers, observation)
         return observation
@@ -95,7 +95,7 @@ def _receive(inbox: Inbox, tokens: set[tuple[str, str]], observation: BusObserva
     began = time.monotonic()
     while (now := time.monotonic() - began) < observation.seconds:
         alive = {service for robot, service in tokens.copy() if robot == observation.robot}
-        observation.liveness.set_alive(alive, now)
+        observation.monitor.set_alive(alive, now)
         sample = inbox.get(min(observation.seconds - now, 0.5))
         if isinstance(sample, Sample):
             _add_sample(sample, observation, time.monotonic() - began)
@@ -112,11 +112,11 @@ def _add_sample(sample: Sample, observation: BusObservation, now: float) -> None
         # Health messages on the key of another service are ignored.
         if sample.key == sample.topic.key(observation.robot, message.service):
             observation.health.setdefault(message.service, []).append((sample.received_ns, message))
-            observation.liveness.add_health(message, now)
+            observation.monitor.add_health(message, now)
     elif sample.topic.rate:
         if isinstance(message, Scan) and sample.key == sample.topic.key(observation.robot):
             observation.scan = message
-            observation.liveness.add_scan(now)
+            observation.monitor.add_scan(now)
         observation.sequences.setdefault(sample.key, SequenceNumbers()).add(message.seq)
 
 

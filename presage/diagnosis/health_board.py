@@ -8,7 +8,7 @@ from statistics import median
 
 from common.messages.definitions import Health, Scan, Stamped
 from common.messages.topics import BELIEF, CMD_VEL, HEALTH, SCAN, Topic, expected_rate, topic_of
-from common.runtime.liveness import RobotLiveness, ServiceLiveness, start_command
+from common.runtime.service_monitor import ServiceMonitor, ServiceStatus, start_command
 
 LATENCY_WINDOW = 45  # number of messages whose median latency is shown: 3 s
 MIN_RATE_SHARE = 0.8  # share of the nominal rate below which a topic counts as slow
@@ -34,7 +34,7 @@ class TopicRate:
 class ServiceRow:
     """State of one service."""
 
-    service: ServiceLiveness
+    service: ServiceStatus
     state: str  # a word for the user
     published: tuple[TopicRate, ...] = ()
     received: tuple[TopicRate, ...] = ()
@@ -48,7 +48,7 @@ class HealthBoard:
     def __init__(self, robot: str, connect: str = "") -> None:
         """``connect``: endpoints for the start commands of absent services; empty for the default."""
         self.robot, self.connect = robot, connect
-        self.liveness = RobotLiveness(robot)
+        self.monitor = ServiceMonitor(robot)
         self._published: dict[str, dict[int, int]] = {}  # topic: {stamp: ns of wall time}
         self._latencies: dict[str, deque[float]] = {}  # service: ms
         self._scan_time = 0.0  # s, of the last scan
@@ -56,10 +56,10 @@ class HealthBoard:
     def add_message(self, topic: Topic, message: Stamped, published_ns: int, now: float) -> None:
         """Takes a message of a topic in `WATCHED`; ``published_ns`` is wall time."""
         if isinstance(message, Health):
-            self.liveness.add_health(message, now)
+            self.monitor.add_health(message, now)
             return
         if isinstance(message, Scan):
-            self.liveness.add_scan(now)
+            self.monitor.add_scan(now)
             self._scan_time = message.scan_time
         published = self._published.setdefault(topic.name, {})
         first = message.stamp_ns not in published
@@ -74,9 +74,9 @@ class HealthBoard:
 
     def rows(self, now: float) -> list[ServiceRow]:
         """One row for each service: first those that every session has, then the others by name."""
-        return [self._row(service) for service in self.liveness.services(now)]
+        return [self._row(service) for service in self.monitor.services(now)]
 
-    def _row(self, service: ServiceLiveness) -> ServiceRow:
+    def _row(self, service: ServiceStatus) -> ServiceRow:
         if service.state == "absent":
             word = "gone" if service.since is not None else "missing" if service.problem else "not running"
             start = f"start it: {start_command(service.name, self.robot, self.connect)}"

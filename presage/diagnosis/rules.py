@@ -11,8 +11,8 @@ from common.messages.definitions import Health, TopicHealth
 from common.messages.requests import ConfigReply
 from common.messages.topics import CMD_VEL, SCAN, TOPICS, TRUTH, expected_rate, topic_of
 from common.robot.scan_geometry import Sweep
-from common.runtime.liveness import SUBSTITUTES, start_command
 from common.runtime.protocol_check import describe_version_differences, same_protocol
+from common.runtime.service_monitor import SUBSTITUTES, start_command
 from presage.diagnosis.bus_observation import BusObservation
 from presage.diagnosis.findings import Finding
 from presage.diagnosis.health_board import MIN_RATE_SHARE
@@ -34,7 +34,7 @@ def evaluate_observation(observation: BusObservation, own_config: ConfigReply) -
 
 
 def _presence(observation: BusObservation) -> Iterator[Finding]:
-    services = observation.liveness.services(observation.seconds)
+    services = observation.monitor.services(observation.seconds)
     others = observation.robots - {observation.robot}
     if others and all(service.state == "absent" for service in services):
         what = (
@@ -45,7 +45,7 @@ def _presence(observation: BusObservation) -> Iterator[Finding]:
         where, name = _where(observation, service.name), f"{service.name} of {observation.robot!r}"
         if service.state == "absent":
             advice = f"start it with: {start_command(service.name, observation.robot, observation.connect)}"
-            needed = service.name in observation.liveness.missing(observation.seconds)
+            needed = service.name in observation.monitor.missing(observation.seconds)
             yield Finding("missing", False if needed else None, f"{name}: not running", service.name, advice)
         elif service.state == "late":
             advice = "see its log; resume it or restart it"
@@ -99,7 +99,7 @@ def _clocks(observation: BusObservation) -> Iterator[Finding]:
 
 def _rates(observation: BusObservation) -> Iterator[Finding]:
     # A real robot's scanner may have any rate, and there is no ground truth.
-    real_robot = observation.liveness.present(SUBSTITUTES["simulator"], observation.seconds)
+    real_robot = observation.monitor.present(SUBSTITUTES["simulator"], observation.seconds)
     period = observation.scan.scan_time if observation.scan is not None else 0.0
     if real_robot and not period and (scans := observation.arrivals[SCAN.key(observation.robot)]):
         period = observation.seconds / scans  # some drivers do not fill in scan_time

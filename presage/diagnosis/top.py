@@ -89,7 +89,7 @@ class BoardFeed:
         """Updates the boards for ``seconds`` s."""
         deadline = time.monotonic() + seconds
         for robot, board in self.boards.items():
-            board.liveness.set_alive(self.bus.alive(timeout=LIVELINESS_TIMEOUT_S, robot=robot), time.monotonic())
+            board.monitor.set_alive(self.bus.alive(timeout=LIVELINESS_TIMEOUT_S, robot=robot), time.monotonic())
         while True:
             sample = self._inbox.get(max(0.0, deadline - time.monotonic()))
             if isinstance(sample, Sample):
@@ -100,7 +100,7 @@ class BoardFeed:
     def complete(self) -> bool:
         """Whether a health message of every live service has come."""
         now = time.monotonic()
-        services = [each for board in self.boards.values() for each in board.liveness.services(now)]
+        services = [each for board in self.boards.values() for each in board.monitor.services(now)]
         return all(each.reported for each in services if each.state != "absent")
 
     def _take(self, sample: Sample) -> None:

@@ -17,9 +17,9 @@ from common.errors import UserError
 from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.world import World, load_world
-from common.robot.base import Robot
 from common.robot.motion_distortion import beam_times, correct_beams, evenly_spaced
 from common.robot.ranges import is_surface
+from common.robot.robot import Robot
 from common.robot.scan_geometry import Sweep
 from common.robot.scanner import Scanner
 from common.versions import commit, versions

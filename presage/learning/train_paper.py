@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from common.bus.bus import Link
 from common.geometry.world import World, load_world
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from common.robot.scanner import Scanner
 from common.versions import commit, versions
 from presage.learning.simulated_scans import collect, scanner_on_bus

@@ -46,7 +46,7 @@ from common.messages.definitions import (
     Truth,
 )
 from common.messages.topics import Topic
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from presage.recordings import foxglove_numbers as numbers
 from presage.recordings import foxglove_shapes as shapes
 from services.recorder.reader import RawMessage

@@ -17,7 +17,7 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.world import World
 from common.messages.definitions import Belief, Goal, Health, Prediction, Scan, Stamped, Status, Truth
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from presage.recordings.selection import entries, robot_of
 from services.recorder.reader import Recording, read_recording
 

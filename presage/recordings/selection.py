@@ -49,7 +49,7 @@ def with_progress(items: Iterator[Entry], total: int, what: str, console: Consol
 
 
 def stem_of(recording: Path) -> str:
-    """The name of a recording without .mcap, .mcap.active or .mcap.torn."""
+    """The name of a recording without .mcap, .mcap.active or .mcap.incomplete."""
     return recording.name.split(".mcap")[0]
 
 

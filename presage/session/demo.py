@@ -17,7 +17,7 @@ from common.errors import UserError
 from common.geometry.world import World, load_world
 from common.messages.definitions import Belief, Goal, Health, Pose, Status, Truth
 from common.messages.topics import BELIEF, GOAL, HEALTH, STATUS, TRUTH
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from common.versions import commit
 from presage.live.latest_messages import LatestMessages
 from presage.recordings.session_figure import draw_session

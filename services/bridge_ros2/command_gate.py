@@ -11,8 +11,8 @@ import numpy as np
 
 from common.geometry.se2 import Array
 from common.messages.definitions import CmdVel, Scan
-from common.robot.base import Robot
 from common.robot.motion_distortion import correct_scan
+from common.robot.robot import Robot
 from common.runtime import safety
 
 MIN_SPEED = 1e-3  # m/s and rad/s; smaller components become 0

@@ -274,7 +274,7 @@ class BridgeRos2Service(Service):
         if (hypotheses := self._publishers.get(HYPOTHESES_TOPIC)) is not None:
             hypotheses.put(to_ros.hypotheses_message(belief, MAP_FRAME))
         if not to_ros.is_publishable(belief):
-            self.counters["beliefs_not_said"] += 1
+            self.counters["beliefs_not_published"] += 1
             return
         if (pose := self._publishers.get(POSE_TOPIC)) is not None:
             message = to_ros.pose_message(belief, MAP_FRAME)

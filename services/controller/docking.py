@@ -24,7 +24,7 @@ from services.controller.policies.motion_model import braking_speed, turn_rate
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.messages.definitions import Goal
-    from common.robot.base import Robot
+    from common.robot.robot import Robot
 
 LINE_LENGTH_M = 0.6  # of the straight approach, which the robot drives exactly
 LINE_SPEED = 0.2  # m/s

@@ -10,8 +10,8 @@ import numpy as np
 from common.errors import UserError
 from common.geometry import se2
 from common.messages.definitions import Belief, CmdVel, Drive, Exploration, Goal, PolicyEnergy, Scan, Status
-from common.robot.base import Robot
 from common.robot.motion_distortion import correct_scan
+from common.robot.robot import Robot
 from common.runtime import safety
 from services.controller.docking import STANDING_TIME_S, Docking
 from services.controller.explorer import Explorer

@@ -13,7 +13,7 @@ from common.runtime import safety
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
-    from common.robot.base import Robot
+    from common.robot.robot import Robot
 
 
 class VelocityCommand:

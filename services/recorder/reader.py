@@ -20,7 +20,7 @@ from common.geometry.yaml_text import parse_yaml
 from common.messages.definitions import Stamped
 from common.messages.topics import Topic, topic_of
 from common.messages.wire import DecodeError
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from common.robot.scanner import Scanner
 from services.recorder.files.chunks import MAGIC, records_of
 from services.recorder.files.index import messages_in_order, summary_of

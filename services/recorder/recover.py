@@ -27,7 +27,7 @@ from services.recorder.files.index import summary_of
 from services.recorder.files.message_counts import MessageCounts, as_metadata
 from services.recorder.files.writer import PROFILE, UNFINISHED_SUFFIX, claim, is_being_written
 
-TORN_SUFFIX = ".torn"  # appended to the name of an unfinished source file after recovery
+INCOMPLETE_SUFFIX = ".incomplete"  # appended to the name of an unfinished source file after recovery
 # Where reading may resume after damage: the prefix of a chunk, an attachment or metadata shorter than 2^40 bytes.
 LANDMARK = re.compile(rb"[\x06\x09\x0c](?=.{5}\x00\x00\x00)", re.DOTALL)
 
@@ -83,8 +83,8 @@ def recover(
 ) -> RecoveryResult:
     """Writes the readable part of ``source`` to ``path``, which defaults to `target_of`.
 
-    An unfinished source (.mcap.active) is renamed to .mcap.torn. Raises UserError if the source is still being written,
-    if no message can be recovered, or if the target exists.
+    An unfinished source (.mcap.active) is renamed to .mcap.incomplete. Raises UserError if the source is still being
+    written, if no message can be recovered, or if the target exists.
     """
     path = path or target_of(source)
     try:
@@ -100,7 +100,7 @@ def recover(
         file = error.filename or source
         raise UserError(f"{file}: cannot be read or written ({error.strerror}); name another file with --out") from None
     if source.name.endswith(UNFINISHED_SUFFIX):
-        source.rename(source.with_name(source.name.removesuffix(UNFINISHED_SUFFIX) + TORN_SUFFIX))
+        source.rename(source.with_name(source.name.removesuffix(UNFINISHED_SUFFIX) + INCOMPLETE_SUFFIX))
     return found
 
 

@@ -64,7 +64,7 @@ class RecorderService(Service):
             return
         if self.loop.inbox.counter_name(sample.key) != sample.key:  # there are already MAX_KEYS other keys
             self.loop.inbox.dropped[OTHERS] += 1
-            self.counters["turned_away"] += 1
+            self.counters["messages_rejected"] += 1
             return
         self.recording.write(sample)
         self.counters["written"] += 1

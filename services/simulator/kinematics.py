@@ -13,7 +13,7 @@ from services.simulator.physics import SUBSTEP_S
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.geometry.world import Obstacle, World
-    from common.robot.base import Robot
+    from common.robot.robot import Robot
 
 
 class Kinematics:

@@ -15,7 +15,7 @@ import pybullet
 from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.world import Obstacle, World
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from services.simulator.physics import SUBSTEP_S
 
 URDF_RADIUS_M = 0.27  # of the footprint in robot.urdf

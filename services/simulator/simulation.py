@@ -14,8 +14,8 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.world import Obstacle, World
 from common.messages.definitions import Odom, Pose, Scan, Truth, Twist
-from common.robot.base import Robot
 from common.robot.motion_distortion import beam_times, correct_scan
+from common.robot.robot import Robot
 from common.robot.scanner import Scanner
 from common.runtime import safety
 from services.simulator.actuator import Actuator

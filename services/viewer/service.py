@@ -20,8 +20,8 @@ from common.bus.inbox import Sample
 from common.messages.definitions import Health, Status
 from common.messages.topics import SCAN, TOPICS, Topic
 from common.messages.wire import DecodeError
-from common.runtime.liveness import RobotLiveness, start_command
 from common.runtime.service import Service
+from common.runtime.service_monitor import ServiceMonitor, start_command
 from common.versions import versions
 from services.viewer.control import RobotControl, RobotLookup
 from services.viewer.playback import Playback
@@ -43,7 +43,7 @@ class FollowedRobot:
     """A robot whose messages are subscribed."""
 
     view: RobotView
-    liveness: RobotLiveness
+    monitor: ServiceMonitor
     unread: dict[Topic, Sample] = field(default_factory=dict)  # newest of each topic, not decoded yet
     watched_at: float = field(default_factory=time.monotonic)  # monotonic time at which a visitor last watched, s
     unsubscribe: list[Callable[[], None]] = field(default_factory=list)
@@ -116,7 +116,7 @@ class ViewerService(Service):
         if followed is None or sample.topic not in SHOWN_TOPICS:
             return
         if sample.topic is SCAN:
-            followed.liveness.add_scan(time.monotonic())
+            followed.monitor.add_scan(time.monotonic())
         if robot in self.hub.watched or sample.topic in ALWAYS_READ_TOPICS:
             self._read(robot, followed, sample)
         else:
@@ -130,7 +130,7 @@ class ViewerService(Service):
             return
         now = time.monotonic()
         if isinstance(message, Health):
-            followed.liveness.add_health(message, now)
+            followed.monitor.add_health(message, now)
             return
         view = followed.view
         self._show(robot, view, view.add(sample.topic, message, now, sample.published_ns))
@@ -241,12 +241,12 @@ class ViewerService(Service):
             self.log.error(self.note)
 
     def _services(self, robot: str, followed: FollowedRobot) -> str:
-        now, linked, liveness = time.monotonic(), self.loop.bus.linked(), followed.liveness
-        liveness.set_alive(self.roster.services(robot), now)
-        missing = [*([] if linked else ["router"]), *liveness.missing(now)]
+        now, linked, monitor = time.monotonic(), self.loop.bus.linked(), followed.monitor
+        monitor.set_alive(self.roster.services(robot), now)
+        missing = [*([] if linked else ["router"]), *monitor.missing(now)]
         message = {
             "type": "services",
-            "services": rows_of(liveness, now),
+            "services": rows_of(monitor, now),
             "missing": [{"name": name, "start": start_command(name, robot, self._connect)} for name in missing],
             "linked": linked,
         }
@@ -256,7 +256,7 @@ class ViewerService(Service):
         """Subscribes to the robot's topics, unless that was done before."""
         if robot not in self.robots:
             live = "replay" not in self.roster.services(robot)
-            followed = self.robots[robot] = FollowedRobot(RobotView(robot, live=live), RobotLiveness(robot))
+            followed = self.robots[robot] = FollowedRobot(RobotView(robot, live=live), ServiceMonitor(robot))
             for topic in TOPICS:
                 # A replay publishes the messages of one step at once. All are kept, because the newest messages
                 # of different topics may have different stamps.

@@ -47,7 +47,7 @@ class VisitorSession:
             ends = await asyncio.gather(*tasks, return_exceptions=True)
         for end in ends:
             if isinstance(end, TooSlowError):
-                self._counters["sent_away"] += 1
+                self._counters["visitors_disconnected"] += 1
                 with suppress(asyncio.TimeoutError, WebSocketDisconnect, ClientDisconnected, RuntimeError):
                     await asyncio.wait_for(self._websocket.close(CLOSE_CODE_TOO_SLOW, "too slow"), 1.0)
             elif isinstance(end, Exception) and not isinstance(end, WebSocketDisconnect | ClientDisconnected):
@@ -77,7 +77,7 @@ class VisitorSession:
         try:
             self._queue.put_nowait((number, action))
         except asyncio.QueueFull:
-            self._counters["turned_away"] += 1
+            self._counters["requests_rejected"] += 1
             self._answer(number, ActionResult(ok=False, reason="too many requests are waiting; try again later"))
 
     async def _work(self) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from common.messages.definitions import CmdVel, Scan, Twist
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from services.bridge_ros2.command_gate import STOP_REPEAT_S, CommandGate
 
 MS = 10**6

@@ -110,7 +110,7 @@ def beside(module_processes, router):
 def test_published_beliefs(beside):
     for number, state in enumerate(("localising", "ambiguous", "lost"), 1):
         beside.believe(state)
-        beside.counts("beliefs_not_said", number)  # one by one, because a busy bridge only takes the newest of several
+        beside.counts("beliefs_not_published", number)  # one by one, as a busy bridge only takes the newest
     assert not beside.heard["amcl_pose"]
     assert not beside.heard["tf"]
     beside.believe("tracking")

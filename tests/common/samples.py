@@ -17,7 +17,7 @@ from common.geometry.world import Box, Circle, Obstacle, World
 from common.messages.definitions import Belief, BeliefHypothesis, Preference
 from common.messages.topics import QUERIES, TOPICS
 from common.messages.wire import Binary, Message
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from common.robot.scanner import Scanner
 
 WORLD = World(

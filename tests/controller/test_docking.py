@@ -7,7 +7,7 @@ import pytest
 
 from common.geometry import se2
 from common.messages.definitions import CmdVel
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from services.controller.docking import LINE_LENGTH_M
 from services.controller.navigator import Navigator
 from services.controller.policies.planner import GeodesicPolicy

@@ -7,7 +7,7 @@ import numpy as np
 from common.geometry import se2
 from common.geometry.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from common.messages.definitions import Drive, Map, Twist
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from services.controller.goal_state import Phase
 from services.controller.growing_map import PlannedMap
 from services.controller.navigator import Navigator

@@ -6,7 +6,7 @@ import numpy as np
 
 from common.geometry.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from common.messages.definitions import Map
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from services.controller.growing_map import PlannedMap
 from services.controller.policies.free_space import FreeSpace
 from services.controller.policies.planner import GeodesicPolicy

@@ -7,7 +7,7 @@ import pytest
 
 from common.messages.definitions import Status
 from common.messages.topics import GOAL, STATUS
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from services.controller.navigator import Navigator
 from services.controller.policies.planner import GeodesicPolicy
 from services.controller.service import ControllerService

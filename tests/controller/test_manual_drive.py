@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.messages.definitions import Drive, Twist
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from services.controller.manual_drive import ManualDrive
 from services.controller.navigator import Navigator
 from tests.controller.driving import PERIOD_NS, PERIOD_S, box, goal, room, scan, session

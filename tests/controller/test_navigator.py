@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from services.controller.navigator import Navigator
 from services.controller.policies.planner import GeodesicPolicy
 from tests.controller.driving import PERIOD_NS, PERIOD_S, belief, box, goal, path_length, room, session

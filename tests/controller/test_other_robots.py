@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from common.messages.definitions import CmdVel, Twist
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from common.robot.self_filter import SelfFilter
 from services.bridge_ros2.command_gate import CommandGate
 from services.controller.policies.free_space import FreeSpace

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from common.geometry import se2
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from common.robot.scan_geometry import ALL_ROUND, Sector, Sweep
 from common.robot.scanner import SCANNERS
 from services.controller.policies.free_space import FreeSpace

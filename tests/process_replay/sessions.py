@@ -49,7 +49,7 @@ from common.messages.topics import (
     TELEPORT,
     WORLD,
 )
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS
 from common.runtime.service import Loop
 from services.controller.service import ControllerService

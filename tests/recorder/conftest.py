@@ -12,7 +12,7 @@ from common.bus.inbox import Inbox
 from common.messages.definitions import Health, Odom, Pose, TopicHealth, Twist
 from common.messages.requests import RecordReply, RecordRequest, WorldReply
 from common.messages.topics import HEALTH, ODOM, RECORDING, WORLD
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from common.runtime.service import Loop, Service
 from services.recorder.settings import RecorderSettings
 from tests.conftest import Running

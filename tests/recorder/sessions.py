@@ -23,7 +23,7 @@ from common.messages.definitions import (
 )
 from common.messages.requests import WorldReply
 from common.messages.topics import BELIEF, GOAL, HEALTH, PREDICTION, SCAN, STATUS, TRUTH, Topic
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS
 from services.recorder.files.writer import RecordingWriter
 from services.recorder.recording import write_description

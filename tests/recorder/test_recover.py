@@ -75,7 +75,7 @@ def test_unfinished_file(tmp_path):
     (tmp_path / "run.mcap.recovering").write_bytes(b"of an interrupted recovery")
     found = recover(active)
     assert found.path == tmp_path / "run.mcap"
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["run.mcap", "run.mcap.torn"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["run.mcap", "run.mcap.incomplete"]
     recording = read_recording(found.path)
     assert recording.complete
     assert messages_in(found.path) == SENT

@@ -191,14 +191,14 @@ def test_invented_keys(recorder, recorder_health, bus, logs):
     assert bus.wait_matching(HEALTH, 10, service="me")
     numbers = itertools.count()
 
-    def turned_away(health, _):
+    def messages_rejected(health, _):
         for _ in range(200):  # again after each report, because some are lost on a busy machine
             bus.put(HEALTH, b"", service=f"x{next(numbers)}")
-        return health.counters.get("turned_away", 0) >= 200
+        return health.counters.get("messages_rejected", 0) >= 200
 
     for number in range(MAX_KEYS):
         bus.put(HEALTH, b"", service=f"y{number}")
-    recorder_health(turned_away)
+    recorder_health(messages_rejected)
     assert running.stop() == 0
     recording = read_recording(only_file(logs))
     assert len(recording.counts()) <= MAX_KEYS

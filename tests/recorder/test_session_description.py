@@ -16,7 +16,7 @@ from common.geometry.world import World
 from common.log import logger
 from common.messages.requests import ConfigReply, ModelReply, WorldReply
 from common.messages.topics import CONFIG, MODEL, WORLD
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from services.recorder import session_description
 from services.recorder.session_description import AttachmentRecord, DescriptionCollector, MetadataRecord, records_of
 from tests.recorder.sessions import SCANNER

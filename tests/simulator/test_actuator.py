@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from services.simulator.actuator import Actuator
 
 DT, FORWARDS = 0.01, np.array([0.1, 0.0, 0.0])

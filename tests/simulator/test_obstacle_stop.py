@@ -7,7 +7,7 @@ import pytest
 
 from common.geometry import se2
 from common.messages.definitions import Twist
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from tests.simulator.driving import FORWARD, SCANNER, contacts, drive, speed
 
 CASES = {"corridor": "holonomic", "maze": "differential", "office": "holonomic"}

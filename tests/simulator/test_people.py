@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from common.errors import UserError
 from common.geometry.world import Obstacle, World
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from services.simulator.people import (
     LOOK_AHEAD_M,
     MIN_START_DISTANCE_M,

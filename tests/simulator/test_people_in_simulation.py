@@ -8,7 +8,7 @@ import pytest
 from common.geometry import se2
 from common.geometry.world import Obstacle, World
 from common.messages.definitions import Twist
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from services.simulator.people import PERSON_RADIUS_M
 from tests.simulator.driving import ALLEY, FORWARD, SCANNER, contacts, drive, measurements, speed
 

@@ -11,7 +11,7 @@ from common.errors import UserError
 from common.geometry import se2
 from common.geometry.world import Obstacle
 from common.messages.definitions import Twist
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from services.simulator.odometry import Odometer, OdometryNoise
 from tests.simulator.driving import FORWARD, HALL, contacts, drive, measurements, speed
 

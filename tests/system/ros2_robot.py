@@ -20,7 +20,7 @@ from typing_extensions import Self
 
 from common.geometry.world import load_world
 from common.messages.definitions import Twist
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS
 from services.simulator.simulation import Simulation, SimulationSetup
 from tests.bridge_ros2.independent import (

@@ -21,7 +21,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from common.geometry.occupancy_grid import OccupancyGrid
 from common.geometry.world import World, load_world
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from tests.common.geometry.maps import building, rooms
 from tests.viewer.stub_session import DT, SCANNER, SCENES, WORLDS, Session, pulses
 

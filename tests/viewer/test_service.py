@@ -19,7 +19,7 @@ from common.geometry.world import load_world
 from common.messages.definitions import Health
 from common.messages.requests import Reply, WorldReply
 from common.messages.topics import HEALTH, PAUSE, PREFERENCE, SCAN, TOPICS, TRUTH, WORLD
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS
 from services.viewer.state.robot_view import SHOWN_TOPICS
 from tests.conftest import WAIT_TIMEOUT_S, received_messages

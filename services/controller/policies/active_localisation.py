@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.messages.definitions import Belief, Scan
     from common.messages.requests import PredictReply
-    from common.robot.base import Robot
+    from common.robot.robot import Robot
     from common.robot.scan_geometry import Sector
     from services.controller.policies.geodesic_field import CostField, FreeSpaceGraph
 

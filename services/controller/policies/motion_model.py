@@ -16,7 +16,7 @@ from common.geometry import se2
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.messages.definitions import Scan
-    from common.robot.base import Robot
+    from common.robot.robot import Robot
 
 HOLD_S = 0.4  # how long most policies hold their action; the next scan leads to a new decision
 STEP_S = 1 / 15  # time step of predicted motion: the scan period of the shipped scanner

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from common.geometry.world import World
     from common.messages.definitions import Belief, Scan
     from common.messages.requests import PredictReply
-    from common.robot.base import Robot
+    from common.robot.robot import Robot
 
 OBSTACLE_GAP_M = 0.06  # between footprint and unmapped obstacles: the scanner's noise, and half a cell
 REPLAN_PERIOD_NS = 400_000_000  # minimum time between two plans when obstacles near the path change

@@ -18,7 +18,7 @@ from services.controller.policies.geodesic_field import MAX_WALL_COST, WALL_COST
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
-    from common.robot.base import Robot
+    from common.robot.robot import Robot
     from services.controller.policies.scan_information import ScanInformation
 
 HEADING_FADE_M = 0.3  # closer to the attractor, the cost of turning towards it fades out

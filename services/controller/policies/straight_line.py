@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.geometry.world import World
     from common.messages.definitions import Belief, Scan
-    from common.robot.base import Robot
+    from common.robot.robot import Robot
 
 
 class StraightLinePolicy:

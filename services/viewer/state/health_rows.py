@@ -5,17 +5,17 @@ from __future__ import annotations
 from typing import Any
 
 from common.messages.definitions import TopicHealth
-from common.runtime.liveness import RobotLiveness, ServiceLiveness
+from common.runtime.service_monitor import ServiceMonitor, ServiceStatus
 
 Row = dict[str, Any]
 
 
-def rows_of(liveness: RobotLiveness, now: float) -> list[Row]:
+def rows_of(monitor: ServiceMonitor, now: float) -> list[Row]:
     """One row for each service that is connected, or was a short time ago."""
-    return [_row(each) for each in liveness.services(now) if each.since is not None]
+    return [_row(each) for each in monitor.services(now) if each.since is not None]
 
 
-def _row(service: ServiceLiveness) -> Row:
+def _row(service: ServiceStatus) -> Row:
     health = service.health
     return {
         "name": service.name,

@@ -17,7 +17,7 @@ from common.containers.healthcheck import find_fault
 from common.messages.definitions import Scan
 from common.messages.topics import SCAN
 from common.runtime.heartbeat import Heartbeat, read_beats
-from common.runtime.liveness import Report
+from common.runtime.service_monitor import Report
 
 ROOT = Path(__file__).resolve().parents[3]
 SMALL = Path(__file__).parents[1] / "small_service.py"

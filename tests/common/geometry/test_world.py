@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from common.errors import UserError
 from common.geometry.world import World, known_worlds, load_world, save_world
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from tests.common.geometry.maps import ROOM
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from common.errors import UserError
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from common.runtime.config import load_settings
 from common.runtime.robot_settings import RobotSettings
 from services.bridge_ros2.settings import BridgeRos2Settings

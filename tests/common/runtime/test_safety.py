@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.messages.definitions import Pose, Scan
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from common.runtime import safety
 
 ROBOT = Robot()

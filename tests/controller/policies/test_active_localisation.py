@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from common.messages.definitions import BeliefHypothesis, Pose
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from services.controller.policies.active_localisation import ActiveLocaliser
 from services.controller.policies.free_space import FreeSpace
 from services.controller.policies.geodesic_field import FreeSpaceGraph

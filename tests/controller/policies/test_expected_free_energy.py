@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.sparse.csgraph import dijkstra
 
 from common.geometry import se2
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS
 from services.controller.policies import expected_free_energy as efe
 from services.controller.policies.active_localisation import CandidateMotions, VisitedPlaces, drive_energy

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.geometry import se2
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from common.robot.scan_geometry import Sector
 from common.runtime import safety
 from services.controller.policies.motion_model import (

@@ -9,7 +9,7 @@ import pytest
 
 from common.geometry.occupancy_grid import FREE, UNKNOWN, OccupancyGrid
 from common.geometry.world import Obstacle, World
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from services.controller.policies.planner import GeodesicPolicy
 from services.controller.policies.straight_line import StraightLinePolicy
 from tests.common.geometry.maps import rooms

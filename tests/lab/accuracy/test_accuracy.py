@@ -11,7 +11,7 @@ from rich.console import Console
 from common.errors import UserError
 from common.geometry import se2
 from common.geometry.world import load_world
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from lab.accuracy import bound, tasks
 from lab.accuracy.report import _markdown, bench_accuracy, cell, scanners_of
 from lab.accuracy.runner import AccuracyJob, _row

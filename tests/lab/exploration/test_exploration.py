@@ -7,7 +7,7 @@ import pytest
 
 from common.geometry.coverage import reachable_area
 from common.geometry.world import World
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from lab.exploration.drive import explore, measure
 from lab.exploration.experiment import EXPLORERS, summarise, table
 from lab.exploration.nearest_frontier import nearest_frontier

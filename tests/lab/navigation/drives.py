@@ -43,7 +43,7 @@ from common.messages.topics import (
     STATUS,
     TRUTH,
 )
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from services.recorder.files.writer import RecordingWriter
 from services.recorder.recording import write_description
 from tests.recorder.sessions import SCANNER, WORLD

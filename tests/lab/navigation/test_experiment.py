@@ -19,7 +19,7 @@ from common.bus.bus import wait_until
 from common.errors import UserError
 from common.geometry.world import Box, Obstacle, World, load_world, save_world
 from common.messages.definitions import Belief, Health, Pose, Status, Truth, Twist
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from lab.experiments.lockstep import LockstepRun, RunTrace, _append, _is_final
 from lab.experiments.start_and_goal import StartAndGoal
 from lab.navigation import drive as driven

@@ -12,7 +12,7 @@ from rich.console import Console
 from common.errors import UserError
 from common.geometry.world import World, load_world
 from common.messages.definitions import Belief, Pose, Truth, Twist
-from common.robot.base import Robot
+from common.robot.robot import Robot
 from lab.experiments.estimators import ExperimentWorld
 from lab.experiments.lockstep import RunTrace, _is_next
 from lab.experiments.start_and_goal import (

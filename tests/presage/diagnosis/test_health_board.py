@@ -10,7 +10,7 @@ from rich.console import Console
 
 from common.messages.definitions import Belief, CmdVel, Health, Pose, Scan, TopicHealth, Twist
 from common.messages.topics import BELIEF, CMD_VEL, HEALTH, SCAN
-from common.runtime.liveness import REPORT_TIMEOUT_S
+from common.runtime.service_monitor import REPORT_TIMEOUT_S
 from presage.diagnosis.health_board import LATENCY_WINDOW, HealthBoard
 from presage.diagnosis.top import tables
 
@@ -47,14 +47,14 @@ def text(board, now=0.0) -> str:
 
 def test_states():
     board = HealthBoard("r2", "tcp/10.0.0.1:7447")
-    board.liveness.set_alive({"simulator", "replay"}, 0.0)
+    board.monitor.set_alive({"simulator", "replay"}, 0.0)
     board.add_message(HEALTH, health("controller", note="n"), 0, 0.0)
     words = {row.service.name: row.state for row in board.rows(1.0)}
     assert words == {
         "simulator": "starting", "estimator": "not running", "controller": "alive", "recorder": "not running",
         "viewer": "not running", "replay": "alive",
     }  # fmt: skip
-    board.liveness.set_alive({"simulator"}, 9.0)
+    board.monitor.set_alive({"simulator"}, 9.0)
     words = {row.service.name: row.state for row in board.rows(9.0)}
     assert (words["simulator"], words["estimator"], words["controller"]) == ("silent", "missing", "gone")
     start = "start it: python -m services.estimator --robot r2 --connect tcp/10.0.0.1:7447"
@@ -69,7 +69,7 @@ def test_rates_and_counts(board):
         TopicHealth(key="presage/robot/health/estimator", published=9, rate=1.0),
         TopicHealth(key="others", received=9, dropped=4),
     ]
-    board.liveness.set_alive({"estimator"}, 0.0)
+    board.monitor.set_alive({"estimator"}, 0.0)
     board.add_message(HEALTH, health("estimator", *topics, counters={"failed": 5}), 0, 1.0)
     found = row(board, "estimator", 1.0)
     assert [(rate.topic, rate.hz, rate.slow) for rate in found.published] == [("belief", 10.0, True)]

@@ -9,8 +9,8 @@ import pytest
 
 from common.messages.definitions import Health, Pose, Scan, TopicHealth
 from common.messages.topics import BELIEF, CMD_VEL, SCAN, TOPICS, TRUTH
-from common.runtime.liveness import REPORT_TIMEOUT_S, RESULT_TIMEOUT_S, RobotLiveness
 from common.runtime.protocol_check import build_config_reply
+from common.runtime.service_monitor import REPORT_TIMEOUT_S, RESULT_TIMEOUT_S, ServiceMonitor
 from presage.diagnosis.bus_observation import BusObservation, check_endpoint
 from presage.diagnosis.rules import MAX_CLOCK_DIFFERENCE_S, evaluate_observation
 from services.recorder.files.message_counts import SequenceNumbers
@@ -27,13 +27,13 @@ def health(service: str, at: int, *, delay: float = 0.001, note: str = "", count
 
 def observed(alive=NAMES, *, seconds=3.0, reporting=NAMES) -> BusObservation:
     """A session in which nothing is wrong besides the services that are not alive or not reporting."""
-    seen = BusObservation("robot", seconds, RobotLiveness("robot"), robots={"robot"})
-    seen.liveness.set_alive(alive, 0.0)
+    seen = BusObservation("robot", seconds, ServiceMonitor("robot"), robots={"robot"})
+    seen.monitor.set_alive(alive, 0.0)
     seen.arrivals = Counter({t.key("robot"): int(t.rate * seconds) for t in TOPICS if t.rate and not t.per_service})
     for name in {*alive} & {*reporting}:
         seen.replies[name] = [build_config_reply(name, "{}", 5.0)]
         seen.health[name] = [health(name, n * SECOND, received=100 + 15 * n) for n in (1, 2, 3)]
-        seen.liveness.add_health(seen.health[name][0][1], seconds)
+        seen.monitor.add_health(seen.health[name][0][1], seconds)
     numbers = seen.sequences[SCAN.key("robot")] = SequenceNumbers()
     for number in (7, 8, 9, 0, 1, 2):  # its publisher was restarted
         numbers.add(number)
@@ -76,7 +76,7 @@ def test_presence(seen, codes):
 def test_missing_results():
     seen, later = observed(), RESULT_TIMEOUT_S + 4
     for name in NAMES:
-        seen.liveness.add_health(seen.health[name][-1][1], later)
+        seen.monitor.add_health(seen.health[name][-1][1], later)
     seen.seconds, seen.arrivals = later, Counter({key: 3 * count for key, count in seen.arrivals.items()})
     simulator, estimator = findings(seen, "no_result")
     assert "simulator of 'robot': no scan was published for" in simulator.what
@@ -84,7 +84,7 @@ def test_missing_results():
 
 
 def test_other_robots_are_named():
-    seen = BusObservation("robot", 3.0, RobotLiveness("robot"), robots={"two"})
+    seen = BusObservation("robot", 3.0, ServiceMonitor("robot"), robots={"two"})
     (finding,) = findings(seen, "no_such_robot")
     assert "two" in finding.what
 

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from common.messages.definitions import Health, TopicHealth
-from common.runtime.liveness import RobotLiveness
+from common.runtime.service_monitor import ServiceMonitor
 from services.viewer.state.health_rows import rows_of
 from services.viewer.state.roster import Roster
 
 
 def test_rows():
-    liveness = RobotLiveness("robot")
+    monitor = ServiceMonitor("robot")
     topics = [
         TopicHealth(key="presage/robot/scan", received=10, rate=9.0, dropped=2),
         TopicHealth(key="presage/robot/belief", published=10, rate=8.0, undecodable=1),
     ]
-    liveness.add_health(Health(stamp_ns=1, service="estimator", uptime=1.0, note="n", topics=topics), 100.0)
-    liveness.set_alive({"simulator"}, 100.4)
-    simulator, estimator = rows_of(liveness, 100.5)
+    monitor.add_health(Health(stamp_ns=1, service="estimator", uptime=1.0, note="n", topics=topics), 100.0)
+    monitor.set_alive({"simulator"}, 100.4)
+    simulator, estimator = rows_of(monitor, 100.5)
     assert estimator == {
         "name": "estimator", "state": "alive", "alive": True, "age_s": 0.5, "note": "n", "uptime_s": 1.0,
         "rates": [
@@ -27,7 +27,7 @@ def test_rows():
     assert simulator == {
         "name": "simulator", "state": "alive", "alive": True, "age_s": None, "note": "", "uptime_s": None, "rates": [],
     }  # fmt: skip
-    simulator, estimator = rows_of(liveness, 110.0)
+    simulator, estimator = rows_of(monitor, 110.0)
     assert (simulator["state"], estimator["state"], estimator["alive"]) == ("late", "absent", False)
 
 

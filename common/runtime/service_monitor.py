@@ -1,6 +1,6 @@
-"""Tracks which services of a robot are alive, since when, and what is wrong with them.
+"""Watches which services of a robot are alive, since when, and what is wrong with them.
 
-`presage top`, `presage doctor`, the page and the health checks of containers all use this model and only show its
+`presage top`, `presage doctor`, the page and the health checks of containers all use it and only show its
 results. It imports only the standard library, so that a health check starts in 20 ms. Times are s of a monotonic clock.
 """
 
@@ -53,7 +53,7 @@ class Report:
 
 
 @dataclass(frozen=True)
-class ServiceLiveness:
+class ServiceStatus:
     """The state of one service. A late service is connected but does not report."""
 
     name: str
@@ -153,7 +153,7 @@ class _Service:
         return self.has_token or now - self.report.time <= REPORT_TIMEOUT_S
 
 
-class RobotLiveness:
+class ServiceMonitor:
     """The services of one robot, from their liveliness tokens and health messages."""
 
     def __init__(self, robot: str) -> None:
@@ -187,7 +187,7 @@ class RobotLiveness:
         """Stores the arrival of a scan. While scans arrive, as from a robot's own driver, no simulator is needed."""
         self._scan_at = now
 
-    def services(self, now: float) -> list[ServiceLiveness]:
+    def services(self, now: float) -> list[ServiceStatus]:
         """First the services that a session usually has, present or not, then the others by name."""
         usual = [*REQUIRED_SERVICES, *OPTIONAL_SERVICES]
         return [self._state(name, now) for name in (*usual, *sorted(self._services.keys() - set(usual)))]
@@ -215,17 +215,17 @@ class RobotLiveness:
         has_scans = name == "simulator" and now - self._scan_at <= INPUT_TIMEOUT_S
         return name in REQUIRED_SERVICES and not replaced and not has_scans
 
-    def _state(self, name: str, now: float) -> ServiceLiveness:
+    def _state(self, name: str, now: float) -> ServiceStatus:
         service = self._services.get(name)
         if service is None:
-            return ServiceLiveness(name, "absent", "not running" if self._is_needed(name, now) else "")
+            return ServiceStatus(name, "absent", "not running" if self._is_needed(name, now) else "")
         # The token of a replay is all that is known about it.
         health, report = service.health, Report(now, idle=True) if name == REPLAY else service.report
         age = now - report.time if health is not None else None
         if not service.present(now):
             since = max(service.token_at, service.report.time)
-            return ServiceLiveness(name, "absent", f"gone for {now - since:.0f} s", since, health, age)
+            return ServiceStatus(name, "absent", f"gone for {now - since:.0f} s", since, health, age)
         problem = find_problem(name, self.robot, report, now, default_time=service.began)
         if now - report.time > REPORT_TIMEOUT_S:
-            return ServiceLiveness(name, "late", problem, report.time + REPORT_TIMEOUT_S, health, age)
-        return ServiceLiveness(name, "alive", problem, service.began, health, age)
+            return ServiceStatus(name, "late", problem, report.time + REPORT_TIMEOUT_S, health, age)
+        return ServiceStatus(name, "alive", problem, service.began, health, age)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from common.messages.definitions import Health, TopicHealth
-from common.runtime.liveness import (
+from common.runtime.service_monitor import (
     FORGET_AFTER_S,
     INPUT_TIMEOUT_S,
     MAX_SERVICES,
@@ -13,7 +13,7 @@ from common.runtime.liveness import (
     REQUIRED_SERVICES,
     RESULT_TIMEOUT_S,
     Report,
-    RobotLiveness,
+    ServiceMonitor,
     find_problem,
     start_command,
 )
@@ -30,12 +30,12 @@ def health(service, uptime=9.0, note="", idle=False, **counts) -> Health:
     return Health(stamp_ns=0, service=service, uptime=uptime, note=note, idle=idle, topics=rows)
 
 
-def states(liveness, now) -> dict[str, str]:
-    return {each.name: each.state for each in liveness.services(now) if each.since is not None}
+def states(monitor, now) -> dict[str, str]:
+    return {each.name: each.state for each in monitor.services(now) if each.since is not None}
 
 
-def service(liveness, name, now):
-    return next(each for each in liveness.services(now) if each.name == name)
+def service(monitor, name, now):
+    return next(each for each in monitor.services(now) if each.name == name)
 
 
 def report(age=0.5, *, linked=True, idle=False, **ages) -> Report:
@@ -78,25 +78,25 @@ def test_problems(name, reported, problem):
 
 
 def test_states_over_time():
-    liveness = RobotLiveness("robot")
-    liveness.set_alive({"controller"}, 10.0)
-    assert states(liveness, 10.0 + REPORT_TIMEOUT_S) == {"controller": "alive"}
-    assert states(liveness, 10.1 + REPORT_TIMEOUT_S) == {"controller": "late"}
-    liveness.add_health(health("controller", note="n"), 20.0)
-    found = service(liveness, "controller", 20.4)
+    monitor = ServiceMonitor("robot")
+    monitor.set_alive({"controller"}, 10.0)
+    assert states(monitor, 10.0 + REPORT_TIMEOUT_S) == {"controller": "alive"}
+    assert states(monitor, 10.1 + REPORT_TIMEOUT_S) == {"controller": "late"}
+    monitor.add_health(health("controller", note="n"), 20.0)
+    found = service(monitor, "controller", 20.4)
     assert (found.state, found.since, found.text, found.reported) == ("alive", 10.0, "n", True)
     assert found.age == pytest.approx(0.4)
-    late = service(liveness, "controller", 21.0 + REPORT_TIMEOUT_S)
+    late = service(monitor, "controller", 21.0 + REPORT_TIMEOUT_S)
     assert (late.state, late.since) == ("late", 20.0 + REPORT_TIMEOUT_S)
     assert late.text == f"{late.problem} (n)"
-    liveness.set_alive(set(), 21.0)
-    assert states(liveness, 21.0) == {"controller": "alive"}  # its token may be missing for a moment
-    gone = service(liveness, "controller", 30.0)
+    monitor.set_alive(set(), 21.0)
+    assert states(monitor, 21.0) == {"controller": "alive"}  # its token may be missing for a moment
+    gone = service(monitor, "controller", 30.0)
     assert (gone.state, gone.since, gone.problem) == ("absent", 20.0, "gone for 10 s")
-    liveness.add_health(health("controller"), 31.0)
-    assert service(liveness, "controller", 31.0).since == 31.0  # a new life
-    liveness.set_alive(set(), 31.1 + FORGET_AFTER_S)
-    assert states(liveness, 31.1 + FORGET_AFTER_S) == {}
+    monitor.add_health(health("controller"), 31.0)
+    assert service(monitor, "controller", 31.0).since == 31.0  # a new life
+    monitor.set_alive(set(), 31.1 + FORGET_AFTER_S)
+    assert states(monitor, 31.1 + FORGET_AFTER_S) == {}
 
 
 @pytest.mark.parametrize(
@@ -110,39 +110,39 @@ def test_states_over_time():
     ],
 )
 def test_missing_services(alive, scans, missing):
-    liveness = RobotLiveness("robot")
+    monitor = ServiceMonitor("robot")
     if scans:
-        liveness.add_scan(NOW)
-    liveness.set_alive(alive, NOW)
-    assert liveness.missing(NOW + INPUT_TIMEOUT_S) == missing
-    liveness.set_alive(alive, NOW + 9)
-    absent = {each.name for each in liveness.services(NOW + 9) if each.problem and each.state == "absent"}
+        monitor.add_scan(NOW)
+    monitor.set_alive(alive, NOW)
+    assert monitor.missing(NOW + INPUT_TIMEOUT_S) == missing
+    monitor.set_alive(alive, NOW + 9)
+    absent = {each.name for each in monitor.services(NOW + 9) if each.problem and each.state == "absent"}
     assert absent == {*missing, *(["simulator"] if scans else [])}
     if "replay" in alive:  # it sends no health messages
-        assert service(liveness, "replay", NOW + 9).state == "alive"
-        assert service(liveness, "replay", NOW + 9).reported
+        assert service(monitor, "replay", NOW + 9).state == "alive"
+        assert service(monitor, "replay", NOW + 9).reported
 
 
 def test_results_that_stop():
-    liveness = RobotLiveness("robot")
+    monitor = ServiceMonitor("robot")
     for second in range(20):  # beliefs end after 10 s
         counts = {"scan__received": 15 * second + 1, "belief__published": min(15 * second, 150)}
-        liveness.add_health(health("estimator", 9.0 + second, **counts), NOW + second)
+        monitor.add_health(health("estimator", 9.0 + second, **counts), NOW + second)
         expected = "" if second <= 10 + RESULT_TIMEOUT_S else f"no belief was published for {second - 10} s"
-        assert service(liveness, "estimator", NOW + second).problem == expected
-    liveness.add_health(health("estimator", 1.0, scan__received=15), NOW + 20)  # restarted: has time to begin
-    assert service(liveness, "estimator", NOW + 20).problem == ""
-    liveness.add_health(health("simulator", idle=True), NOW)
-    assert service(liveness, "simulator", NOW + 1).problem == ""
+        assert service(monitor, "estimator", NOW + second).problem == expected
+    monitor.add_health(health("estimator", 1.0, scan__received=15), NOW + 20)  # restarted: has time to begin
+    assert service(monitor, "estimator", NOW + 20).problem == ""
+    monitor.add_health(health("simulator", idle=True), NOW)
+    assert service(monitor, "simulator", NOW + 1).problem == ""
 
 
 def test_invented_services_are_limited():
-    liveness = RobotLiveness("robot")
+    monitor = ServiceMonitor("robot")
     for number in range(1000):
-        liveness.add_health(health(f"s{number}"), NOW)
-    liveness.set_alive(REQUIRED_SERVICES, NOW)
-    assert len(states(liveness, NOW)) <= MAX_SERVICES + len(REQUIRED_SERVICES)
-    assert set(REQUIRED_SERVICES) <= states(liveness, NOW).keys()
+        monitor.add_health(health(f"s{number}"), NOW)
+    monitor.set_alive(REQUIRED_SERVICES, NOW)
+    assert len(states(monitor, NOW)) <= MAX_SERVICES + len(REQUIRED_SERVICES)
+    assert set(REQUIRED_SERVICES) <= states(monitor, NOW).keys()
 
 
 @pytest.mark.parametrize(
