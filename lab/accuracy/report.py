@@ -195,7 +195,7 @@ def _interval(bounds: list[float] | None) -> str:
 
 def cell(row: dict[str, Any]) -> str:
     """Errors and counts of one task, for the Markdown table of README; `LEGEND` explains them."""
-    counts = f"{_found(row)}, {row['tracking_but_wrong']} wrong"
+    counts = f"{row['found']}/{row['of']}, {row['tracking_but_wrong']} wrong"
     if row["position_error_median_m"] is None:
         return counts
     errors = "/".join(_number(row[f"position_error_{name}_m"], 1e3) for name in ("median", "rms"))
