@@ -12,10 +12,47 @@ class UserError(Exception):
     """An error that the user can correct: shown as one line, without a traceback; the process ends with status 2."""
 
 
+# Texts in plain words for pydantic's types of errors; the others have pydantic's message.
+_PROBLEMS = {
+    "missing": "missing",
+    "extra_forbidden": "unknown key",
+    "string_type": "expected text, not {input}",
+    "list_type": "expected a list, not {input}",
+    "tuple_type": "expected a list, not {input}",
+    "dict_type": "expected keys with values, not {input}",
+    "float_type": "expected a number, not {input}",
+    "float_parsing": "expected a number, not {input}",
+    "model_type": "expected keys with values, such as {{x: 1, y: 2}}, not {input}",
+    "model_attributes_type": "expected keys with values, such as {{x: 1, y: 2}}, not {input}",
+    "too_short": "too few entries: at least {min_length} are needed, not {actual_length}",
+    "too_long": "too many entries: at most {max_length} are allowed, not {actual_length}",
+}
+NAME_PATTERN = r"^[\w.-]+$"  # of names in files
+
+
 def first_fault(error: ValidationError) -> str:
-    """The first error of a validation, as ``field.path: problem``."""
+    """The first error of a validation in plain words, as ``field.path: problem``."""
+    return ": ".join(filter(None, [_location(error.errors(include_url=False)[0]["loc"]), first_problem(error)]))
+
+
+def first_problem(error: ValidationError) -> str:
+    """The problem of the first error of a validation in plain words."""
     first = error.errors(include_url=False)[0]
-    problem = str(first["msg"])
-    if first["type"] in ("model_type", "model_attributes_type"):  # pydantic's message names an internal class
-        problem = f"expected keys with values, such as {{x: 1, y: 2}}, not {str(first['input'])[:40]!r}"
-    return ": ".join(filter(None, [".".join(map(str, first["loc"])), problem]))
+    context = first.get("ctx", {})
+    value = repr(str(first["input"])[:40])
+    if first["type"] in _PROBLEMS:
+        return _PROBLEMS[first["type"]].format(input=value, **context)
+    if context.get("pattern") == NAME_PATTERN:
+        return f"only letters, digits, '.', '-' and '_' may be in a name, not {value}"
+    return str(first["msg"]).removeprefix("Value error, ")
+
+
+def _location(parts: tuple[int | str, ...]) -> str:
+    """The place of an error, such as ``lifts, entry 1, ground``."""
+    text, separator = "", ""
+    for part in parts:
+        if isinstance(part, int) and not isinstance(part, bool):
+            text, separator = f"{text}, entry {part + 1}", ", "
+        elif part != "[key]":  # pydantic's mark of a key that is itself wrong
+            text, separator = f"{text}{separator}{part}", "."
+    return text

@@ -9,9 +9,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, ValidationError
 
-from common.errors import UserError
+from common.errors import UserError, first_fault
 from common.geometry.floors import Floor, FloorName, Lift, moved, no_floor
 from common.geometry.occupancy_grid import MAX_CELLS, UNKNOWN, OccupancyGrid
 from common.geometry.shapes import Degrees, Obstacle, WorldName, WorldPart
@@ -24,6 +24,13 @@ if TYPE_CHECKING:
 
 GAP_M = 2.0  # between floors; their walls stop all beams
 GRID_GAP_M = 30.0  # between ROS maps, which beams may leave through unknown cells; longer than a beam
+
+EXAMPLES = {
+    "floors": "floors: {ground: ground.yaml, first: first.yaml}",
+    "lifts": "lifts: [{ground: [9, 1], first: [1, 1]}]",
+    "start": "start: {floor: ground, x: 1.5, y: 1.5}",
+    "name": "name: tower",
+}
 
 
 class FloorStart(WorldPart):
@@ -45,8 +52,25 @@ class BuildingFile(WorldPart):
 
 
 def is_building(data: object) -> bool:
-    """Whether the contents of a YAML file are a building; a saved world has a list of floors."""
-    return isinstance(data, dict) and isinstance(data.get("floors"), dict)
+    """Whether the contents of a YAML file are a building, or meant to be one, and not a saved world with floors."""
+    if not isinstance(data, dict) or "floors" not in data:
+        return False
+    floors = data["floors"]
+    return not (isinstance(floors, list) and all(isinstance(floor, dict) and "offset" in floor for floor in floors))
+
+
+def read_building(data: dict[str, Any]) -> BuildingFile:
+    """The building in the contents of a YAML file; raises UserError if they are invalid."""
+    try:
+        return BuildingFile.model_validate(data)
+    except ValidationError as error:
+        key = error.errors(include_url=False)[0]["loc"][0]
+        if key in EXAMPLES:
+            raise UserError(f"{first_fault(error)}; an example is {EXAMPLES[key]}") from None
+        raise UserError(
+            f"{first_fault(error)}; the keys of a building are {', '.join(BuildingFile.model_fields)}, and walls and "
+            "obstacles belong in the files of its floors"
+        ) from None
 
 
 def lay_out(building: BuildingFile, worlds: Mapping[str, World]) -> dict[str, Any]:
@@ -54,21 +78,27 @@ def lay_out(building: BuildingFile, worlds: Mapping[str, World]) -> dict[str, An
     first = next(iter(worlds.values()))
     for name, world in worlds.items():
         if world.floors:
-            raise UserError(f"building {building.name!r}: floor {name!r} is itself a building")
+            raise UserError(f"floor {name!r} is itself a building")
         if (world.grid is None) != (first.grid is None):
-            raise UserError(f"building {building.name!r}: floor {name!r}: floors are either all ROS maps, or none is")
+            raise UserError(f"floor {name!r}: floors are either all ROS maps, or none is")
     fields: dict[str, Any] = {}
     if first.grid is None:
         offsets = _side_by_side(worlds)
     else:
-        fields["grid"], offsets = _paste(building, {name: world.grid for name, world in worlds.items() if world.grid})
+        fields["grid"], offsets = _paste({name: world.grid for name, world in worlds.items() if world.grid})
+    floors = {
+        name: Floor(name=name, offset=offsets[name], boundary=moved(world.boundary, offsets[name]).tolist())
+        for name, world in worlds.items()
+    }
     start = building.start
     if start is None and first.start is not None:
         start = FloorStart(floor=next(iter(worlds)), **first.start.model_dump())
-    if start is not None and start.floor not in worlds:
-        raise UserError(f"building {building.name!r}: start: {no_floor(start.floor, worlds)}")
     if start is not None:
-        x, y = moved((start.x, start.y), offsets[start.floor]).tolist()
+        floor, place = floors.get(start.floor), (start.x, start.y)
+        error = no_floor(start.floor, worlds) if floor is None else floor.placement_error(place)
+        if floor is None or error is not None:
+            raise UserError(f"start: {error}")
+        x, y = floor.to_map(place).tolist()
         fields["start"] = {"x": x, "y": y, "yaw_deg": start.yaw_deg}
     return {
         "name": building.name,
@@ -76,10 +106,7 @@ def lay_out(building: BuildingFile, worlds: Mapping[str, World]) -> dict[str, An
         "obstacles": [
             _obstacle(obstacle, name, offsets[name]) for name, world in worlds.items() for obstacle in world.obstacles
         ],
-        "floors": [
-            Floor(name=name, offset=offsets[name], boundary=moved(world.boundary, offsets[name]).tolist())
-            for name, world in worlds.items()
-        ],
+        "floors": list(floors.values()),
         "lifts": building.lifts,
     }
 
@@ -95,20 +122,18 @@ def _side_by_side(worlds: Mapping[str, World]) -> dict[str, tuple[float, float]]
     return offsets
 
 
-def _paste(
-    building: BuildingFile, grids: Mapping[str, OccupancyGrid]
-) -> tuple[OccupancyGrid, dict[str, tuple[float, float]]]:
+def _paste(grids: Mapping[str, OccupancyGrid]) -> tuple[OccupancyGrid, dict[str, tuple[float, float]]]:
     """One grid with the cells of all floors and unknown cells between them, and the floors' offsets in m by name."""
     first = next(iter(grids.values()))
     size = first.resolution
     for name, grid in grids.items():
         if not np.isclose(grid.resolution, size, rtol=1e-6, atol=0):
             raise UserError(
-                f"building {building.name!r}: floor {name!r}: the resolution is {grid.resolution:g} m, that of "
-                f"floor {next(iter(grids))!r} {size:g} m; they must be equal"
+                f"floor {name!r}: the resolution is {grid.resolution:g} m, that of floor {next(iter(grids))!r} "
+                f"{size:g} m; they must be equal"
             )
         if grid.origin[2]:
-            raise UserError(f"building {building.name!r}: floor {name!r}: its map is rotated; the yaw must be 0")
+            raise UserError(f"floor {name!r}: its map is rotated; the yaw must be 0")
     gap = round(GRID_GAP_M / size)
     columns = np.cumsum([0, *(grid.width + gap for grid in grids.values())])  # in which the floors begin
     rows = [round((grid.origin[1] - first.origin[1]) / size) for grid in grids.values()]
@@ -116,7 +141,7 @@ def _paste(
     height = max(row + grid.height for row, grid in zip(rows, grids.values(), strict=True)) - low
     width = int(columns[-1]) - gap
     if width * height > MAX_CELLS:
-        raise UserError(f"building {building.name!r}: {width} x {height} cells are more than {MAX_CELLS}")
+        raise UserError(f"the floors side by side are {width} x {height} cells, which is more than {MAX_CELLS}")
     values = np.full((height, width), UNKNOWN, np.uint8)
     x, y = first.origin[:2]
     offsets = {}

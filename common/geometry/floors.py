@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
+from common.errors import NAME_PATTERN
 from common.geometry.shapes import Point, Ring, WorldPart, check_ring
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 
     from common.geometry.se2 import Array
 
-FloorName = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[\w.-]+$")]
+FloorName = Annotated[str, Field(min_length=1, max_length=100, pattern=NAME_PATTERN, coerce_numbers_to_str=True)]
 Lift = Annotated[dict[FloorName, Point], Field(min_length=2, max_length=100)]
 # its place in m on each floor that it stops at, in the floor's frame
 
@@ -51,6 +52,25 @@ class Floor(WorldPart):
         """Inverse of `to_map`."""
         return moved(places, (-self.offset[0], -self.offset[1]))
 
+    def placement_error(self, places: npt.ArrayLike) -> str | None:
+        """The reason why points (N, 2) or poses (N, 3) in the floor's frame are not all on it, or None if they are."""
+        edges = self.from_map(np.reshape(self.bounds, (2, 2)))
+        for x, y, *_ in np.atleast_2d(places).tolist():
+            # A place off this floor may be on the next one in map.
+            if not ((edges[0] <= (x, y)) & ((x, y) <= edges[1])).all():
+                (x0, y0), (x1, y1) = (np.round(edges, 2) + 0.0).tolist()
+                where = f"which reaches from ({x0:g}, {y0:g}) to ({x1:g}, {y1:g}) m"
+                return f"({x:g}, {y:g}) is not on floor {self.name!r}, {where}"
+        return None
+
+
+def place_text(floors: Iterable[Floor], place: npt.ArrayLike, decimals: int = 2) -> str:
+    """A point (2,) or pose (3,) in map for messages to users: on a floor, its name and coordinates in its frame."""
+    floor = next((floor for floor in floors if floor.contains(place)), None)
+    position = np.asarray(place, float) if floor is None else floor.from_map(place)
+    x, y = np.round(position, decimals)[:2] + 0.0  # no -0.00
+    return f"({x:.{decimals}f}, {y:.{decimals}f})" + ("" if floor is None else f" on floor {floor.name!r}")
+
 
 def no_floor(name: str, floors: Iterable[str]) -> str:
     """The message for an unknown floor ``name``."""
@@ -62,12 +82,12 @@ def check_floors(floors: list[Floor], lifts: list[dict[str, tuple[float, float]]
     known = {floor.name: floor for floor in floors}
     if len(known) < len(floors):
         raise ValueError("two floors have the same name")
-    for lift in lifts:
+    for number, lift in enumerate(lifts, 1):
         for name, place in lift.items():
             if name not in known:
-                raise ValueError(f"a lift stops at an unknown floor: {no_floor(name, known)}")
-            if not known[name].contains(known[name].to_map(place)):
-                raise ValueError(f"a lift is not on floor {name!r}: ({place[0]:g}, {place[1]:g}) is outside")
+                raise ValueError(f"lift {number}: {no_floor(name, known)}")
+            if (error := known[name].placement_error(place)) is not None:
+                raise ValueError(f"lift {number}: {error}")
 
 
 def bounds_of(points: npt.ArrayLike) -> tuple[float, float, float, float]:

@@ -6,7 +6,6 @@ percentages between free and occupied; `cells` describes how they become free, o
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -14,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from common.errors import UserError
+from common.errors import UserError, first_fault
 from common.geometry.occupancy_grid import FREE, MAX_CELLS, OCCUPIED, UNKNOWN, OccupancyGrid
 from common.limits import Angle, Coordinate
 
@@ -74,13 +73,11 @@ def read_map(path: Path, data: dict[str, Any]) -> dict[str, Any]:
     try:
         map_file = MapFile.model_validate(data)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise UserError(f"map {path}: {'.'.join(map(str, first['loc'])) or 'file'}: {first['msg']}") from None
+        raise UserError(f"map {path}: {first_fault(error)}") from None
     image = path.parent / map_file.image
     colours, alpha = _pixels(image)
     grid = OccupancyGrid.of(cells(map_file, colours, alpha)[::-1], map_file.resolution, map_file.origin)
-    name = re.sub(r"[^\w.-]+", "-", path.resolve().stem)
-    return {"name": name, **{key: data[key] for key in WORLD_KEYS if key in data}, "grid": grid}
+    return {**{key: data[key] for key in WORLD_KEYS if key in data}, "grid": grid}
 
 
 def cells(map_file: MapFile, colours: Array, alpha: Array | None) -> Cells:

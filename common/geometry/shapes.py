@@ -8,6 +8,7 @@ import numpy as np
 import shapely
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from common.errors import NAME_PATTERN
 from common.limits import Coordinate, PositiveDistance
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 
 CIRCLE_SEGMENTS = 64  # per quarter circle in free space; the error is 0.04 mm at a radius of 0.5 m
 
-WorldName = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[\w.-]+$")]
+WorldName = Annotated[str, Field(min_length=1, max_length=200, pattern=NAME_PATTERN)]
 Degrees = Annotated[float, Field(allow_inf_nan=False, ge=-1e5, le=1e5)]
 Point = tuple[Coordinate, Coordinate]
 Ring = Annotated[list[Point], Field(min_length=3, max_length=10_000)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,9 +13,9 @@ import shapely
 import yaml
 from pydantic import Field, ValidationError, model_validator
 
-from common.errors import UserError
+from common.errors import UserError, first_fault
 from common.geometry import building, ros_map
-from common.geometry.floors import Floor, Lift, bounds_of, check_floors, corners_of, no_floor
+from common.geometry.floors import Floor, Lift, bounds_of, check_floors, corners_of, no_floor, place_text
 from common.geometry.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from common.geometry.shapes import Box, Circle, Degrees, Obstacle, Ring, WorldName, WorldPart, check_ring
 from common.geometry.yaml_text import TooLargeError, parse_yaml
@@ -120,9 +121,13 @@ class World(WorldPart):
     def to_map(self, places: npt.ArrayLike, floor: str) -> Array:
         """Points (..., 2) or poses (..., 3) in the frame of a floor, in map; if its name is empty, they are in map.
 
-        Raises UserError if there is no floor of that name.
+        Raises UserError if there is no floor of that name, or a place is off the floor.
         """
-        return self.floor(floor).to_map(places) if floor else np.asarray(places, float)
+        if not floor:
+            return np.asarray(places, float)
+        if (error := self.floor(floor).placement_error(places)) is not None:
+            raise UserError(error)
+        return self.floor(floor).to_map(places)
 
     @functools.cached_property
     def segments(self) -> Array:
@@ -213,7 +218,8 @@ class World(WorldPart):
             return None
         clearance = float(self.clearance(place[:2])[0])
         what = "is inside a wall or outside" if clearance < 0 else f"is {clearance:.2f} m from a wall of"
-        return f"({place[0]:.2f}, {place[1]:.2f}) {what} {self.name!r}; the robot needs {radius:g} m around it"
+        where = place_text(self.floors, place)
+        return f"{where} {what} {self.name!r}; the robot needs {radius:g} m around it"
 
     def clearances(self, x: Array, y: Array) -> Array:
         """(len(y), len(x)) `clearance` in m at the nodes x, y of a lattice in map, ascending."""
@@ -359,12 +365,7 @@ def _load(name: str, folder: Path, *, is_floor: bool = False) -> World:
     """`load_world` of a file relative to ``folder``; a floor must not be a building, which might contain itself."""
     path = FOLDER / f"{name}.yaml" if name in known_worlds() else folder / name
     try:
-        data: Any = parse_yaml(path.read_text(encoding="utf-8"))
-        if building.is_building(data):
-            if is_floor:
-                raise UserError("a floor cannot be a building with floors of its own")
-            return _load_building(path, data)
-        return World.model_validate(ros_map.read_map(path, data) if ros_map.is_map(data) else data)
+        return _world_of(path, parse_yaml(path.read_text(encoding="utf-8")), is_floor=is_floor)
     except (FileNotFoundError, NotADirectoryError):
         raise UserError(f"no world {str(path)!r}: give a file or one of {', '.join(known_worlds())}") from None
     except UnicodeDecodeError:
@@ -376,28 +377,41 @@ def _load(name: str, folder: Path, *, is_floor: bool = False) -> World:
     except OSError as error:
         raise UserError(f"world {path}: cannot be read ({error})") from None
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where, what = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")
-        raise UserError(f"world {path}: {f'{where}: ' if where else ''}{what}") from None
+        raise UserError(f"world {path}: {first_fault(error)}") from None
     except TooLargeError as error:
         raise UserError(f"world {path}: {error}") from None
     except NOT_YAML as error:
         raise UserError(f"world {path}: not valid YAML ({' '.join(str(error).split())})") from None
 
 
-def _load_building(path: Path, data: dict[str, Any]) -> World:
-    file = building.BuildingFile.model_validate(data)
+def _world_of(path: Path, data: Any, *, is_floor: bool) -> World:
+    """The world in the ``data`` of a file; raises UserError or ValidationError if they are invalid."""
+    if isinstance(data, dict):
+        data.setdefault("name", re.sub(r"[^\w.-]+", "-", path.resolve().stem))
+    if not building.is_building(data):
+        return World.model_validate(ros_map.read_map(path, data) if ros_map.is_map(data) else data)
+    if is_floor:
+        raise UserError("a floor cannot be a building with floors of its own")
+    try:
+        return _load_building(path.parent, data)
+    except UserError as error:
+        raise UserError(f"world {path}: {error}") from None
+
+
+def _load_building(folder: Path, data: dict[str, Any]) -> World:
+    """The building in ``data``, whose files are relative to ``folder``; raises UserError if it is invalid."""
+    file = building.read_building(data)
     floors = {}
     for name, world in file.floors.items():
         try:
-            floors[name] = _load(world, path.parent, is_floor=True)
+            floors[name] = _load(world, folder, is_floor=True)
         except UserError as error:
-            raise UserError(f"world {path}: floor {name!r}: {error}") from None
+            raise UserError(f"floor {name!r}: {error}") from None
     laid_out = World.model_validate(building.lay_out(file, floors))
-    for lift in laid_out.lifts:
+    for number, lift in enumerate(laid_out.lifts, 1):
         for name, (x, y) in lift.items():
             if laid_out.clearance(laid_out.to_map((x, y), name))[0] <= 0:
-                raise UserError(f"world {path}: the lift at ({x:g}, {y:g}) is not in free space of floor {name!r}")
+                raise UserError(f"lift {number}: ({x:g}, {y:g}) is not in free space of floor {name!r}")
     return laid_out
 
 

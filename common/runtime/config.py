@@ -30,7 +30,7 @@ from pydantic_settings import (
 
 from common.bus.bus import DEFAULT_ENDPOINT, Link
 from common.bus.security import Credentials, read_credentials
-from common.errors import UserError, first_fault
+from common.errors import UserError, first_fault, first_problem
 
 _file_values: ContextVar[dict[str, Any]] = ContextVar("_file_values")
 S = TypeVar("S", bound="ServiceSettings")
@@ -173,7 +173,7 @@ def load_settings(cls: type[S], argv: list[str] | None = None) -> S:
         first = error.errors(include_url=False)[0]
         name = ".".join(map(str, first["loc"])) or "settings"
         variable = f"PRESAGE_{cls.service.upper()}_{name.upper()}" if name in cls.private else f"PRESAGE_{name.upper()}"
-        problem = first["msg"]
+        problem = first_problem(error)
         if first["type"] == "string_pattern_mismatch" and name in cls.model_fields:
             problem = f"{first['input']!r} is not valid; expected: {cls.model_fields[name].description}"
         raise UserError(

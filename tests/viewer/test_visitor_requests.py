@@ -59,7 +59,7 @@ def test_obstacle():
         ("{}", "unknown action; the actions are: watch, goal"),
         ('{"do": ["goal"]}', "unknown action"),
         ('{"do": "explode"}', "unknown action"),
-        ('{"do": "goal", "x": 1}', "y: Field required"),
+        ('{"do": "goal", "x": 1}', "y: missing"),
         ('{"do": "goal", "x": "1", "y": 2}', "x: "),
         ('{"do": "goal", "x": true, "y": 2}', "x: "),
         ('{"do": "goal", "x": NaN, "y": 2}', "x: "),

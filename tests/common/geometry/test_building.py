@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from common.errors import UserError
 from common.geometry.building import GAP_M, GRID_GAP_M
+from common.geometry.floors import place_text
 from common.geometry.occupancy_grid import OccupancyGrid
 from common.geometry.rasterisation import rasterise
 from common.geometry.world import World, load_world, save_world
@@ -139,16 +140,36 @@ def test_ros_maps_and_shipped_worlds_as_floors(tmp_path):
             "floor 'b': the resolution is 0.1 m, that of floor 'a' 0.5 m",
         ),
         ({"floors": {"a": "map.yaml", "b": "turned.yaml"}}, "floor 'b': its map is rotated"),
-        ({"floors": {}}, "floors: Dictionary should have at least 1 item"),
+        ({"floors": {}}, "floors: too few entries: at least 1 are needed, not 0; an example is floors: {ground: "),
+        ({"floors": None}, "floors: expected keys with values, not 'None'; an example is floors: {ground: "),
+        ({"floors": "ground.yaml"}, "floors: expected keys with values, not 'ground.yaml'; an example"),
+        ({"floors": ["ground.yaml"]}, "floors: expected keys with values, not \"['ground.yaml']\"; an example"),
+        ({"floors": [{"ground": "ground.yaml"}]}, "floors: expected keys with values, not"),
+        ({"floors": {"ground": {"x": 1}}}, "floors.ground: expected text, not \"{'x': 1}\"; an example"),
+        ({"floors": {"ground floor": "ground.yaml"}}, "floors.ground floor: only letters, digits, '.', '-' and '_'"),
+        ({"start": {"x": 1, "y": 1}}, "start.floor: missing; an example is start: {floor: ground, x"),
         ({"start": {"floor": "attic", "x": 1, "y": 1}}, "start: there is no floor 'attic': choose one of ground"),
-        ({"lifts": [{"ground": [1, 5]}]}, "lifts.0: Dictionary should have at least 2"),
-        ({"lifts": [{"ground": [1, 5], "attic": [1, 5]}]}, "unknown floor: there is no floor 'attic'"),
-        ({"floors": {"a": "ground.yaml", "b": "ground.yaml"}, "lifts": [{"a": [1, 5], "b": [1, 50]}]}, "floor 'b'"),
+        (
+            {"start": {"floor": "ground", "x": 11, "y": 1}},
+            "start: (11, 1) is not on floor 'ground', which reaches from (0, 0) to (8, 6) m",
+        ),
+        ({"lifts": {"ground": [1, 5], "first": [1, 5]}}, "lifts: expected a list, not"),
+        (
+            {"lifts": [{"ground": [1, 5]}]},
+            "lifts, entry 1: too few entries: at least 2 are needed, not 1; an example is lifts: [{ground: [9, 1],",
+        ),
+        ({"lifts": [{"ground": [1, 5, 0], "b": [1, 5]}]}, "lifts, entry 1, ground: too many entries: at most 2 are"),
+        ({"lifts": [{"ground": ["x", 5], "b": [1, 5]}]}, "lifts, entry 1, ground, entry 1: expected a number, not 'x'"),
+        ({"lifts": [{"ground": [1, 5], "attic": [1, 5]}]}, "lift 1: there is no floor 'attic': choose one of ground"),
+        (
+            {"floors": {"a": "ground.yaml", "b": "ground.yaml"}, "lifts": [{"a": [1, 5], "b": [1, 50]}]},
+            "lift 1: (1, 50) is not on floor 'b'",
+        ),
         (
             {"floors": {"a": "ground.yaml", "b": "hall.yaml"}, "lifts": [{"a": [1, 5], "b": [2, 0]}]},
-            "the lift at (2, 0) is not in free space of floor 'b'",
+            "lift 1: (2, 0) is not in free space of floor 'b'",
         ),
-        ({"boundary": [[0, 0], [1, 0], [1, 1]]}, "boundary: Extra inputs"),
+        ({"boundary": [[0, 0], [1, 0], [1, 1]]}, "boundary: unknown key; the keys of a building are name, floors, "),
     ],
 )
 def test_invalid_buildings(tmp_path, more, message):
@@ -162,7 +183,29 @@ def test_invalid_buildings(tmp_path, more, message):
     with pytest.raises(UserError) as error:
         load_world(path)
     assert message in str(error.value)
-    assert "tower" in str(error.value)
+    assert str(error.value).startswith(f"world {path}: ")
+
+
+def test_numbered_floors_and_no_name(tmp_path):
+    (tmp_path / "room.yaml").write_text(save_world(ROOM))
+    (tmp_path / "tower.yaml").write_text("{floors: {0: room.yaml, 1: room.yaml}, lifts: [{0: [1, 5], 1: [1, 5]}]}")
+    tower = load_world(str(tmp_path / "tower.yaml"))
+    assert (tower.name, [floor.name for floor in tower.floors]) == ("tower", ["0", "1"])
+
+
+def test_place_text():
+    assert place_text(TOWER.floors, TOWER.to_map((-3.004, 0.5, 2), "first")) == "(-3.00, 0.50) on floor 'first'"
+    assert place_text(TOWER.floors, TOWER.to_map((-1e-9, 0.5), "first"), decimals=1) == "(0.0, 0.5) on floor 'first'"
+    assert place_text(TOWER.floors, (9, 1)) == "(9.00, 1.00)"
+    assert "(-3.90, 0.00) on floor 'first' is 0.10 m" in TOWER.placement_error(TOWER.to_map((-3.9, 0), "first"), 0.2)
+
+
+@pytest.mark.parametrize("places", [[9, 1], [9, 1, 0.5], [[1, 1], [9, 1]]])
+def test_place_beside_its_floor(places):
+    with pytest.raises(
+        UserError, match=r"\(9, 1\) is not on floor 'ground', which reaches from \(0, 0\) to \(8, 6\) m"
+    ):
+        TOWER.to_map(places, "ground")
 
 
 def test_unknown_floor():

@@ -115,12 +115,12 @@ def test_keys_of_map_yaml(tmp_path):
         ({"image": "cut.png"}, "cut.png: cannot be read"),
         ({"image": "huge.png"}, "5000 x 4000 pixels are more than 16000000"),
         ({"image": "pipe.pgm"}, r"map image .*pipe.pgm: not a file but a folder, a pipe or a device"),
-        ({}, "image: Field required"),
+        ({}, "image: missing"),
         ({"image": "map.pgm", "mode": "quaternary"}, "mode: .*'trinary', 'scale' or 'raw'"),
-        ({"image": "map.pgm", "origin": [0, float("nan"), 0]}, "origin.1: .*finite"),
+        ({"image": "map.pgm", "origin": [0, float("nan"), 0]}, "origin, entry 2: .*finite"),
         ({"image": "map.pgm", "resolution": 0}, "resolution: .*greater than 0"),
         ({"image": "map.pgm", "free_thresh": 0.7}, "free_thresh 0.7 must be below occupied_thresh 0.65"),
-        ({"image": "map.pgm", "start": {"x": 1}}, "start.y: Field required"),
+        ({"image": "map.pgm", "start": {"x": 1}}, "start.y: missing"),
     ],
 )
 def test_invalid_maps(tmp_path, keys, message):

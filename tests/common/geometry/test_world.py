@@ -74,19 +74,26 @@ def test_saved_world(tmp_path):
     assert load_world(str(tmp_path / "w.yaml")) == ROOM
 
 
+def test_name_defaults_to_that_of_the_file(tmp_path):
+    path = tmp_path / "my room.yaml"
+    path.write_text("boundary: [[0, 0], [1, 0], [1, 1]]")
+    assert load_world(str(path)).name == "my-room"
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("name: [", "not valid YAML"),
         ("[" * 200_000, "bad.yaml: more than 100 levels"),
         ("obstacles:\n" + "- {}\n" * 600_000, "bad.yaml: more than 1000000 values"),
-        ("name: x", "boundary: Field required"),
+        ("name: x", "boundary: missing"),
         ("{name: x, boundary: [[0, 0], [1, 1]]}", "at least 3"),
         ("{name: x, boundary: [[0, 0], [2, 2], [2, 0], [0, 2]]}", "not simple"),
         ("{name: x, boundary: [[0, 0], [1, 0], [.nan, 1]]}", "finite"),
         ("{name: x, boundary: [[0, 0], [1, 0], [1, 1]], obstacles: [{}]}", "exactly one of"),
-        ("{name: x, boundary: [[0, 0], [1, 0], [1, 1]], walls: 3}", "walls"),
-        ("{name: ../x, boundary: [[0, 0], [1, 0], [1, 1]]}", "name"),
+        ("{name: x, boundary: [[0, 0], [1, 0], [1, x]]}", "boundary, entry 3, entry 2: expected a number, not 'x'"),
+        ("{name: x, boundary: [[0, 0], [1, 0], [1, 1]], walls: 3}", "walls: unknown key"),
+        ("{name: ../x, boundary: [[0, 0], [1, 0], [1, 1]]}", "name: only letters, digits"),
         ("3", "file"),
         ("{name: x, since: 2020-13-45}", "month"),
     ],
