@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from common.geometry.se2 import Array
     from common.geometry.world import World
 
@@ -32,10 +34,11 @@ class LiftRide:
         return f"driving to the lift to floor {self.floor!r}"
 
 
-def plan_ride(world: World, place: Array, goal: Array) -> LiftRide | str | None:
+def plan_ride(world: World, place: Array, goal: Array, refusal: Callable[[Array], str | None]) -> LiftRide | str | None:
     """The lift with the shortest way, in straight lines, from a ``place`` (2,) to a goal (2,) on another floor.
 
-    Returns None on the same floor, and the reason to refuse the goal if there is no lift.
+    ``refusal`` returns the reason why a lift (2,) cannot be reached from here, or None if it can. Returns None if the
+    goal is on the same floor, and the reason to refuse it if no lift leads there.
     """
     here, there = world.floor_at(place), world.floor_at(goal)
     if here is None or there is None or here.name == there.name:
@@ -50,4 +53,10 @@ def plan_ride(world: World, place: Array, goal: Array) -> LiftRide | str | None:
             f"goal refused: it is on floor {there.name!r}, the robot is on floor {here.name!r}, and no lift "
             "connects them"
         )
-    return LiftRide(min(ways, key=lambda way: way[0])[1], there.name)
+    ways.sort(key=lambda way: way[0])
+    problems = []
+    for _, enter in ways:
+        if (problem := refusal(enter)) is None:
+            return LiftRide(enter, there.name)
+        problems.append(problem.removeprefix("goal refused: "))
+    return f"goal refused: the lift to floor {there.name!r} cannot be reached: {problems[0]}"

@@ -151,10 +151,7 @@ class Navigator:
         destination = goal.pose.array()[:2] if self._docking is None else self._docking.line()[0]
         self._ride, self._floor = None, self._present_floor()
         if self.goal_state.active and self.world is not None and self._pose is not None and self._floor is not None:
-            ride = plan_ride(self.world, self._pose, destination)
-            if isinstance(ride, LiftRide) and (problem := self.policy.refusal(ride.place)) is not None:
-                problem = problem.removeprefix("goal refused: ")
-                ride = f"goal refused: the lift to floor {ride.floor!r} cannot be reached: {problem}"
+            ride = plan_ride(self.world, self._pose, destination, self.policy.refusal)
             if isinstance(ride, str):
                 self.goal_state.refuse(ride)
             elif ride is not None:

@@ -47,6 +47,28 @@ def test_goal_in_the_frame_of_a_floor(make):
 
 
 @pytest.mark.parametrize(
+    ("place", "message"),
+    [
+        ((4.9, 1), "(4.90, 1.00) on floor 'first' in tower is 0.10 m from a wall"),
+        ((-3, 1), "(-3, 1) is not on floor 'first', which reaches from (0, 0) to (5, 4) m"),
+    ],
+)
+def test_refusal_in_the_frame_of_a_floor(make, place, message):
+    navigator = make(TOWER)
+    for pose in (FIRST.to_map([1, 1, 0]), START):  # also from another floor
+        session(navigator, pose, [None], TOWER)
+        navigator.on_goal(goal(*place, map_id="first"))
+        assert message in navigator.status(0).reason
+
+
+def test_nearest_place_in_the_frame_of_a_floor():
+    navigator = Navigator(world=TOWER, chosen_policy=GeodesicPolicy(Robot(), TOWER))
+    session(navigator, FIRST.to_map([1, 1, 0]), [None], TOWER)
+    navigator.on_goal(goal(4.9, 1, map_id="first"))
+    assert "the nearest place that can be reached is (4.65, 0.95) on floor 'first'" in navigator.status(0).reason
+
+
+@pytest.mark.parametrize(
     ("world", "message"),
     [
         (TOWER, "there is no floor 'attic': choose one of ground, first"),
@@ -129,19 +151,22 @@ def test_no_lift_and_carried_by_hand(make):
     assert "no lift connects them" in status.reason
 
 
-def test_goal_in_a_wall_of_another_floor(make):
-    navigator = make(TOWER)
-    session(navigator, START, [None], TOWER)
-    navigator.on_goal(goal(4.9, 1, map_id="first"))
-    assert "is 0.10 m from a wall" in navigator.status(0).reason
-
-
 def test_lift_that_cannot_be_reached(make):
     narrow = building([{"ground": (0.1, 2), "first": (4, 3)}], **FLOORS)
     navigator = make(narrow)
     session(navigator, START, [None], narrow)
     navigator.on_goal(goal(4, 1, map_id="first"))
-    assert "the lift to floor 'first' cannot be reached: (0.10, 2.00) in tower is 0.10 m" in navigator.status(0).reason
+    message = "the lift to floor 'first' cannot be reached: (0.10, 2.00) on floor 'ground' in tower is 0.10 m"
+    assert message in navigator.status(0).reason
+
+
+def test_farther_lift_if_the_nearer_one_cannot_be_reached(make):
+    two = building([{"ground": (0.1, 2), "first": (4, 3)}, *LIFTS], **FLOORS)
+    navigator = make(two)
+    session(navigator, START, [None], two)
+    navigator.on_goal(goal(4, 1, map_id="first"))
+    _, _, pose = session(navigator, START, [None] * 150, two, first=1)[-1]
+    assert np.hypot(*(pose[:2] - [5, 2])) <= 0.1
 
 
 def test_docking_on_another_floor():

@@ -217,7 +217,8 @@ class ActiveLocaliser:
             self._field = (target, self.graph.cost_field(target, self.min_point_distance + PLACE_SPACING_M))
         field = self._field[1]
         path = field.path(pose[:2]) if field is not None else np.zeros((0, 2))
-        reason = f"{count} places are possible: going to ({target[0]:.1f}, {target[1]:.1f}) to tell them apart"
+        where = self.graph.free.place_text(target, decimals=1)
+        reason = f"{count} places are possible: going to {where} to tell them apart"
         if field is None or not len(path):
             self._place = None
             return Decision(reason="no way to where places could be told apart", state="blocked")

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from common.geometry.floors import place_text
 from common.geometry.occupancy_grid import OCCUPIED, UNKNOWN
 
 if TYPE_CHECKING:
+    from common.geometry.floors import Floor
     from common.geometry.occupancy_grid import OccupancyGrid
     from common.geometry.se2 import Array
     from common.geometry.world import World
@@ -84,13 +86,15 @@ class FreeSpace:
     grid: Grid
     clearance: Array  # (rows, columns) m from a cell's centre to the nearest wall; negative inside walls
     unknown: npt.NDArray[np.bool_]  # (rows, columns) whether nothing is known about a cell
+    floors: tuple[Floor, ...] = ()  # of the building
 
     @classmethod
     def of(cls, world: World, resolution: float = RESOLUTION_M) -> FreeSpace:
         """Free space of a world; clearances are exact at the cell centres."""
         grid = Grid.over(world, resolution)
         centres = grid.centres().reshape(*grid.shape, 2)
-        return cls(grid, world.clearances(centres[0, :, 0], centres[:, 0, 1]), np.zeros(grid.shape, bool))
+        clearance = world.clearances(centres[0, :, 0], centres[:, 0, 1])
+        return cls(grid, clearance, np.zeros(grid.shape, bool), tuple(world.floors))
 
     @classmethod
     def of_map(cls, cells: OccupancyGrid) -> FreeSpace:
@@ -110,6 +114,10 @@ class FreeSpace:
         centres = grid.centres().reshape(*shape, 2)
         clearance = cells.shapes.lattice_distances(OCCUPIED, centres[0, :, 0], centres[:, 0, 1], MAX_CLEARANCE_M)
         return cls(grid, clearance, ~known)
+
+    def place_text(self, place: Array, decimals: int = 2) -> str:
+        """A point (2,) in map for messages to users, on a floor in its frame."""
+        return place_text(self.floors, place, decimals)
 
     def clearance_at(self, points: Array) -> Array:
         """Interpolated distance (...,) m from points (..., 2) m in map to the nearest wall."""

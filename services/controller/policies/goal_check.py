@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from common.geometry.floors import place_text
+
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.geometry.world import World
@@ -13,7 +15,8 @@ def wall_refusal(world: World, goal: Array, radius: float) -> str | None:
     """The reason why a robot of ``radius`` m cannot stand at a goal (2,) m, or None if it can."""
     if world.has_room(goal, radius):
         return None
-    return refusal_text(world.name, goal, near_wall(float(world.clearance(goal)[0])))
+    where = place_text(world.floors, goal)
+    return refusal_text(world.name, where, near_wall(float(world.clearance(goal)[0])))
 
 
 def near_wall(clearance: float) -> str:
@@ -21,6 +24,6 @@ def near_wall(clearance: float) -> str:
     return "is inside something, or off the map" if clearance < 0 else f"is {clearance:.2f} m from a wall"
 
 
-def refusal_text(world: str, goal: Array, problem: str) -> str:
-    """The reason in `Status` for refusing a goal (2,) m in the world of that name."""
-    return f"goal refused: ({goal[0]:.2f}, {goal[1]:.2f}) in {world} {problem}"
+def refusal_text(world: str, goal: str, problem: str) -> str:
+    """The reason in `Status` for refusing a goal, as in `place_text`, in the world of that name."""
+    return f"goal refused: {goal} in {world} {problem}"

@@ -87,16 +87,16 @@ class GeodesicPolicy:
             cell = self.graph.nearest_free(goal, self.robot.radius, map_only=True)
             if cell is not None and self._component in (None, self.graph.component[cell]):
                 return None
-            refusal = refusal_text(self._map_name, goal, "cannot be reached from here")
+            refusal = self._refusal_text(goal, "cannot be reached from here")
         nearest = self.graph.nearest_free(goal, component=self._component, map_only=True)
         if nearest is None:
             return refusal
-        x, y = self.free.grid.centres([nearest])[0]
-        return f"{refusal}; the nearest place that can be reached is ({x:.2f}, {y:.2f})"
+        where = self.free.place_text(self.free.grid.centres([nearest])[0])
+        return f"{refusal}; the nearest place that can be reached is {where}"
 
-    @property
-    def _map_name(self) -> str:
-        return "the map so far" if self.world is None else self.world.name
+    def _refusal_text(self, goal: Array, problem: str) -> str:
+        map_name = "the map so far" if self.world is None else self.world.name
+        return refusal_text(map_name, self.free.place_text(goal), problem)
 
     def _wall_refusal(self, goal: Array) -> str | None:
         """The reason why the robot cannot stand at a goal (2,) m, or None if it can."""
@@ -105,7 +105,7 @@ class GeodesicPolicy:
         clearance = float(self.free.clearance_at(goal)) if self.free.grid.inside(goal) else -1.0
         if clearance >= self.robot.radius:
             return None
-        return refusal_text(self._map_name, goal, near_wall(clearance))
+        return self._refusal_text(goal, near_wall(clearance))
 
     def use_map(self, graph: FreeSpaceGraph, *, jumped: bool) -> None:
         """Plans in a new version of the mapper's map; if places ``jumped`` in it, forgets the obstacles seen so far."""
@@ -315,7 +315,7 @@ class GeodesicPolicy:
             reason = f"{distance:.2f} m from the goal, {self._hindrance(pose, surroundings, standing=True)}"
             return Decision(reason=reason, state="blocked", path=path) if arrived else None
         problem = f"is too near to a wall: stopped {distance:.2f} m from it"
-        reason = refusal_text(self._map_name, self._goal, problem)
+        reason = self._refusal_text(self._goal, problem)
         return Decision(reason=reason, state="blocked", path=path, refused=True) if arrived or stuck else None
 
     def _back_off(self, pose: Array, velocity: Array, surroundings: Surroundings, path: Array) -> Decision:
@@ -343,24 +343,22 @@ class GeodesicPolicy:
         verb = "waiting" if standing else "slowing"
         if not len(surroundings.points):
             return f"{verb}: a wall is near"
-        nearest, position = _nearest_point(pose, surroundings)
+        nearest, position = self._nearest_point(pose, surroundings)
         # Anything seen for less than a second may be a person, or a box that was just moved.
         what = "something that may move" if surroundings.moving[nearest] else "something that is not in the map"
         return f"{verb}: {what}, {np.hypot(*surroundings.points[nearest]):.1f} m away at {position}"
 
     def _no_path(self, pose: Array, surroundings: Surroundings) -> str:
         """Status text for when obstacles leave no path."""
-        place = f" at {_nearest_point(pose, surroundings)[1]}" if len(surroundings.points) else ""
+        place = f" at {self._nearest_point(pose, surroundings)[1]}" if len(surroundings.points) else ""
         return f"no way around something that is not in the map{place}: waiting until it clears"
+
+    def _nearest_point(self, pose: Array, surroundings: Surroundings) -> tuple[int, str]:
+        """Index of the obstacle point nearest to the robot, and its position as text. Requires at least one."""
+        nearest = int(np.argmin(np.hypot(*surroundings.points.T)))
+        return nearest, self.free.place_text(se2.transform(pose, surroundings.points[nearest]), decimals=1)
 
 
 def _covariance(belief: Belief) -> Array:
     """Covariance (3, 3) of x, y, yaw of a belief; zero if the estimator states none."""
     return np.zeros((3, 3)) if belief.covariance is None else np.asarray(belief.covariance, float)
-
-
-def _nearest_point(pose: Array, surroundings: Surroundings) -> tuple[int, str]:
-    """Index of the obstacle point nearest to the robot, and its position in map as text. Requires at least one."""
-    nearest = int(np.argmin(np.hypot(*surroundings.points.T)))
-    x, y = se2.transform(pose, surroundings.points[nearest])
-    return nearest, f"({x:.1f}, {y:.1f})"
