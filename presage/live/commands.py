@@ -28,6 +28,7 @@ from common.messages.requests import (
 from common.messages.topics import GOAL, LOCALISE, QUERIES, SAVE_MAP, SAVE_MODEL, STATUS, TELEPORT, TOPICS, Topic
 from common.messages.wire import DecodeError, Message
 from presage.live.latest_messages import LatestMessages, session_bus
+from presage.terminal.progress import status_line
 
 # By the stamps of the messages. A person who blocks the robot usually moves on sooner.
 BLOCKED_TIMEOUT_S = 30.0
@@ -67,18 +68,20 @@ def send_goal(link: Link, goal: Goal, console: Console, *, wait: bool) -> int:
         if status.state == "blocked":
             raise UserError(status.reason)
         console.print(f"going to {_place(goal.pose, goal.map_id)}")
-        return _follow(messages, goal, console) if wait else 0
+        try:
+            return _follow(messages, goal, console) if wait else 0
+        except KeyboardInterrupt:
+            console.print("the robot keeps its goal; `presage goal --cancel` stops it")
+            raise
 
 
 def _follow(messages: LatestMessages, goal: Goal, console: Console) -> int:
     """Waits until the goal is reached (returns 0), or refused or blocked for too long (returns 1)."""
     least_distance, blocked_ns, previous_ns = np.inf, 0, None
-    with console.status("navigating") as line:
+    with status_line("navigating", console) as show:
         while (status := _next_status(messages, console)) is not None:
             if status.goal_seq != goal.seq:
                 raise UserError("the goal was replaced by another" if status.goal else "the goal was cancelled")
-            to_go = f"{status.distance:.2f} m to go" if status.distance is not None else ""
-            line.update(f"{status.state} {to_go} {status.reason}")
             if status.distance is not None and status.distance < least_distance - MIN_PROGRESS_M:
                 least_distance, blocked_ns = status.distance, 0
             if previous_ns is not None and status.state == "blocked":
@@ -87,6 +90,9 @@ def _follow(messages: LatestMessages, goal: Goal, console: Console) -> int:
             if status.state == "reached" or status.refused or blocked_ns > BLOCKED_TIMEOUT_S * 1e9:
                 console.print(f"{status.state}: {status.reason}")
                 return 0 if status.state == "reached" else 1
+            to_go = f"{status.distance:.2f} m to go" if status.distance is not None else ""
+            text = ", ".join(filter(None, (status.state, to_go, status.reason)))
+            show(text, f"{status.state} {status.reason}".rstrip())
     raise UserError(f"the controller has published no status for {STATUS_TIMEOUT_S:g} s")
 
 

@@ -11,6 +11,7 @@ from common.errors import UserError
 from common.messages.definitions import Exploration, Goal, Pose, Status
 from common.messages.topics import GOAL, STATUS
 from presage.live.latest_messages import LatestMessages, session_bus
+from presage.terminal.progress import status_line
 
 ANSWER_TIMEOUT_S = 3.0
 STATUS_TIMEOUT_S = 30.0  # long enough to restart the mapper meanwhile
@@ -37,7 +38,7 @@ def _follow(messages: LatestMessages, seq: int, console: Console) -> int:
     if status is None:
         raise UserError("the controller did not begin to explore within 3 s: `presage doctor` finds the cause")
     began_ns = status.stamp_ns
-    with console.status("exploring") as line:
+    with status_line("exploring", console) as show:
         while status is not None:
             progress = _progress(status, seq)
             if progress is None:
@@ -45,7 +46,8 @@ def _follow(messages: LatestMessages, seq: int, console: Console) -> int:
                     status.reason if status.refused else "the exploration was cancelled, or another one began"
                 )
             so_far = f"{progress.area:.0f} m² mapped, {progress.path:.1f} m driven"
-            line.update(f"{progress.phase}: {so_far}; {status.state} {status.reason}")
+            state = f"{status.state} {status.reason}"
+            show(f"{progress.phase}: {so_far}; {state}", f"{progress.phase} {state}")
             if progress.phase == "finished":
                 seconds = (status.stamp_ns - began_ns) * 1e-9
                 console.print(f"finished: {so_far} in {seconds:.0f} s; the robot is back where it began")

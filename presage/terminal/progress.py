@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import re
 import time
-from collections.abc import Generator, Iterable
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import TypeVar
 
 from rich.console import Console
 from rich.progress import Progress
 
 LINE_INTERVAL_S = 10.0
+CHANGE_INTERVAL_S = 2.0
 Item = TypeVar("Item")
 
 
@@ -20,6 +22,35 @@ def working(what: str, console: Console) -> AbstractContextManager[object]:
         return console.status(what)
     console.print(what, highlight=False, soft_wrap=True)
     return nullcontext()
+
+
+@contextmanager
+def status_line(
+    status: str, console: Console, *, interval_s: float = CHANGE_INTERVAL_S
+) -> Iterator[Callable[[str, str], None]]:
+    """Yields a function that shows a text: in one line on a terminal; elsewhere in a new line when its status changes.
+
+    The function takes the text and its status. Numbers in the status are no change. ``status`` is the first one, which
+    is shown on a terminal only. Lines come at intervals of at least ``interval_s``.
+    """
+    if console.is_terminal:
+        with console.status(status) as line:
+            yield lambda text, _: line.update(text)
+        return
+    shown, last_line_s = _without_numbers(status), -interval_s
+
+    def show(text: str, status: str) -> None:
+        nonlocal shown, last_line_s
+        words, now_s = _without_numbers(status), time.monotonic()
+        if words != shown and now_s - last_line_s >= interval_s:
+            shown, last_line_s = words, now_s
+            console.print(text, highlight=False, soft_wrap=True)
+
+    yield show
+
+
+def _without_numbers(text: str) -> str:
+    return re.sub(r"\d[\d.]*", "", text)
 
 
 def progress(
