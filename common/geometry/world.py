@@ -290,18 +290,21 @@ class World(WorldPart):
     def start_pose(self, clearance: float) -> Array:
         """(3,) the world's start pose; if it has none, the position with ``clearance`` m that is nearest to the centre.
 
+        In a building, this is the centre of the first floor.
         Raises UserError if there is no such position.
         """
         if self.start is not None:
             return np.array([self.start.x, self.start.y, np.deg2rad(self.start.yaw_deg)])
+        x0, y0, x1, y1 = self.floors[0].bounds if self.floors else self.bounds
+        centre = np.array([(x0 + x1) / 2, (y0 + y1) / 2])
         if self.grid is not None:
             shapes = self.grid.shapes
             places = shapes.points_in_cells(shapes.cells_with_clearance(clearance), 0.5)
             places = places[self._limit_by_obstacles(places, np.full(len(places), np.inf)) >= clearance]
             if not len(places):
                 raise self._no_room(clearance)
-            return np.array([*places[np.argmin(np.hypot(*(places - self.center()).T))], 0.0])
-        nearest = shapely.shortest_line(self._room(clearance), shapely.Point(self.center()))
+            return np.array([*places[np.argmin(np.hypot(*(places - centre).T))], 0.0])
+        nearest = shapely.shortest_line(self._room(clearance), shapely.Point(centre))
         return np.array([*shapely.get_coordinates(nearest)[0], 0.0])
 
     def _room(self, clearance: float) -> shapely.Geometry:

@@ -98,6 +98,8 @@ def test_rasterised_building_is_closed():
 def test_start():
     assert building(first=HALL, ground=ROOM).start == HALL.start
     assert building(ground=ROOM, first=HALL).start is None
+    for tower in (building(ground=ROOM, first=HALL, second=HALL), MAPPED):  # near the middle of the first floor
+        assert tower.floor_at(tower.start_pose(0.1)) == tower.floors[0]
     there = building(ground=ROOM, first=HALL, start={"floor": "first", "x": 1, "y": -1, "yaw_deg": 9})
     np.testing.assert_allclose(there.floor("first").from_map(there.start_pose(0.1)), [1, -1, np.deg2rad(9)])
 
