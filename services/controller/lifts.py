@@ -51,7 +51,7 @@ def plan_ride(world: World, place: Array, goal: Array, refusal: Callable[[Array]
     if not ways:
         return (
             f"goal refused: it is on floor {there.name!r}, the robot is on floor {here.name!r}, and no lift "
-            "connects them"
+            "stops at both"
         )
     ways.sort(key=lambda way: way[0])
     problems = []

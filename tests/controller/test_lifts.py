@@ -135,7 +135,7 @@ def test_no_lift(make):
     navigator.on_goal(goal(4, 1, map_id="first"))
     ((command, status, _),) = session(navigator, START, [None], STAIRS, first=1)
     assert (status.refused, command.twist.array().any()) == (True, False)
-    assert "it is on floor 'first', the robot is on floor 'ground', and no lift connects them" in status.reason
+    assert "it is on floor 'first', the robot is on floor 'ground', and no lift stops at both" in status.reason
 
 
 def test_no_lift_and_carried_by_hand(make):
@@ -148,7 +148,7 @@ def test_no_lift_and_carried_by_hand(make):
     assert log[-1][1].state == "reached"
     navigator.on_goal(goal(4, 1, map_id="ground"))
     ((_, status, _),) = session(navigator, log[-1][2], [None], STAIRS, first=222)
-    assert "no lift connects them" in status.reason
+    assert "no lift stops at both" in status.reason
 
 
 def test_lift_that_cannot_be_reached(make):
