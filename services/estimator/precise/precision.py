@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 UPDATE_SHARE = 0.1  # weight of the present scan, or key scan, in the averages, at least
 MIN_CHANGED, MAX_CHANGED = 0.02, 0.5  # limits of the share of changed surfaces
-MAX_NOISE_FACTOR = 4.0  # the noise is never taken for more than this times the stated one, or less than its inverse
+MAX_NOISE_FACTOR = 4.0  # scans with more than this times the stated noise, or less than its inverse, show no smooth walls
 MAX_MAP_ERROR_M = 0.1  # larger errors are not the map's, but changes of the surroundings
 MIN_LEARNING_BEAMS, MIN_LEARNING_SHARE = 30, 0.3  # of a scan; nothing is learned from fewer
 DAMPING = 1e-9  # in m; keeps the inverse finite where a direction is not observed
@@ -38,6 +38,7 @@ class Precision:
     offset_variance: float = 0.0  # m²
     excess: float = 0.0  # m², variance of the errors beyond the scanner's noise and what the model states
     scans: int = 0  # key scans from which the map's errors were learned
+    noise_scans: int = 0  # scans from which the noise was learned
 
     @classmethod
     def of_map(cls, cell: float) -> Precision:
@@ -57,8 +58,9 @@ class Precision:
         """The likelihood with the noise learned from the scans so far and from this one, (B,) m along (B,) rad."""
         if not stated.relative and len(ranges) >= MIN_LEARNING_BEAMS:
             factor = estimate_noise(ranges[None], angles) / stated.sigma
-            factor = float(np.clip(factor, 1 / MAX_NOISE_FACTOR, MAX_NOISE_FACTOR))
-            self.noise_factor += UPDATE_SHARE * (factor - self.noise_factor)
+            if 1 / MAX_NOISE_FACTOR < factor < MAX_NOISE_FACTOR:
+                self.noise_scans += 1
+                self.noise_factor += _share(self.noise_scans) * (factor - self.noise_factor)
         return replace(stated, sigma=self.noise_factor * stated.sigma)
 
     def forget_cells(self) -> None:
@@ -102,8 +104,7 @@ class Precision:
         mean_square = float(np.average(errors**2 - stated_across, weights=lengths))
         excess = max(mean_square, robust_excess(errors * slope, stated))
         self.scans += 1
-        share = max(UPDATE_SHARE, 1 / (self.scans + 1))  # what was known before counts as one more scan
-        self.excess += share * (excess - self.excess)
+        self.excess += _share(self.scans) * (excess - self.excess)
 
     def _learn_offset(self, errors: Array, stated: Array, jacobian: Array, lengths: Array) -> Array:
         """Learns the offset from the errors (K,) in m across surfaces, of variance ``stated`` (K,) without the map's.
@@ -123,6 +124,11 @@ class Precision:
         self.offset = float(np.clip(self.offset + gain * fitted[3], 0.0, self.cell))
         self.offset_variance *= 1 - gain
         return remaining
+
+
+def _share(scans: int) -> float:
+    """Weight of the last of so many scans; what was known before counts as one more scan."""
+    return max(UPDATE_SHARE, 1 / (scans + 1))
 
 
 def robust_excess(errors: Array, stated: Array) -> float:
