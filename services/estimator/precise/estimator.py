@@ -10,8 +10,8 @@ import numpy as np
 from common.geometry import se2
 from services.estimator.precise.gauss_newton import COARSE_SIGMA_M, GaussNewton, Optimiser, Prior, View, moved_back
 from services.estimator.precise.hypotheses import (
-    CLUTTER_PERSISTENCE,
-    CLUTTER_PROBABILITY,
+    FIRST_SURROUNDINGS,
+    NEXT_SURROUNDINGS,
     Mode,
     UnknownPlace,
     clip_to_map,
@@ -280,7 +280,7 @@ class PreciseEstimator:
         # Recent scans mislead where people move all around the robot, the map where much has changed.
         both = np.stack([match.poses[0], poses[0]])
         map_evidence, local_evidence = _log_at_poses(
-            view, both, view.surfaces.small, np.full(2, self.modes[0].clutter)
+            view, both, view.surfaces.small, np.tile(self.modes[0].surroundings, (2, 1))
         )[0]
         return match if map_evidence + np.log(WRONG_MATCH) > local_evidence else by_local_map
 
@@ -382,9 +382,14 @@ class PreciseEstimator:
         if log_change <= self._log_change + log_of_one:
             self._search_interval = 1
 
-        present, clutter = _log_at_poses(view, poses, old, np.array([mode.clutter for mode in modes]))
+        present, surroundings = _log_at_poses(view, poses, old, np.array([mode.surroundings for mode in modes]))
         modes = [
-            replace(mode, explained=states.explained[k], present=present[k] + log_change, present_clutter=clutter[k])
+            replace(
+                mode,
+                explained=states.explained[k],
+                present=present[k] + log_change,
+                present_surroundings=surroundings[k],
+            )
             for k, mode in enumerate(modes)
         ]
         self._local_pose, self._old_beams, self._log_change = local, old, log_change
@@ -397,6 +402,8 @@ class PreciseEstimator:
         # Either the surroundings have changed, or the robot was carried off and all surfaces are new.
         self._unknown_place.present = max(_log_anywhere(view, old) + log_change, _log_anywhere(view, small))
         self._set_hypotheses(modes)
+        if not np.array_equal(self.modes[0].pose, modes[0].pose):  # another hypothesis is the best now
+            self._local_map.place(local, self.modes[0].pose)
 
     def _log_mismatch(self, before: Mode, after: Mode) -> float:
         """Evidence in nats that a scan was matched at the wrong pose, among those probable ``before`` it.
@@ -428,7 +435,7 @@ class PreciseEstimator:
         key = LocalMapScan(self._local_pose, view, self._old_beams, mapped, self._log_change, log_unknown)
         self._local_map.add(key, best.pose, best.noise_covariance)
         self.modes = [
-            replace(mode, log_evidence=mode.log_weight, present=0.0, clutter=mode.present_clutter)
+            replace(mode, log_evidence=mode.log_weight, present=0.0, surroundings=mode.present_surroundings)
             for mode in self.modes
         ]
 
@@ -513,13 +520,13 @@ class PreciseEstimator:
         if not found:
             self._unknown_place.exclude_mapped_places()
             return
-        stayed, clutter = self._log_stayed(found, view)
+        stayed, surroundings = self._log_stayed(found, view)
         present = np.array([mode.present for mode in found])
         carried = self._unknown_place.log_evidence + present - _log_ideal(view, view.surfaces.small)
         evidence = np.array([mode.log_evidence for mode in found]) + np.maximum(stayed, carried)
-        clutter = np.where(stayed > carried, clutter, CLUTTER_PROBABILITY)
+        surroundings[carried >= stayed] = FIRST_SURROUNDINGS
         added = [
-            replace(mode, log_evidence=evidence[k], present=0.0, present_clutter=clutter[k])
+            replace(mode, log_evidence=evidence[k], present=0.0, present_surroundings=surroundings[k])
             for k, mode in enumerate(found)
         ]
         best = int(np.argmax(evidence))
@@ -534,22 +541,23 @@ class PreciseEstimator:
     def _log_stayed(self, found: list[Mode], view: View) -> tuple[Array, Array]:
         """Evidence (N,) in nats that the robot has been at each of the hypotheses since one of the key scans.
 
-        That is the key scan since which the evidence is greatest. Also returns the probability (N,) that the present
-        scan is clutter then.
+        That is the key scan since which the evidence is greatest. Also returns the probabilities (N, 3) of the
+        surroundings of the present scan then.
         """
         poses = np.array([mode.pose for mode in found])
         stayed = np.full((1, len(found)), -np.inf)  # a row for each key scan so far, after a first one for none
-        clutter = np.full_like(stayed, CLUTTER_PROBABILITY)
+        first = np.tile(FIRST_SURROUNDINGS, (1, len(found), 1))
+        surroundings = first
         for key in self._local_map.scans:
             stayed = np.vstack([stayed, np.full(len(found), key.log_unknown)])
-            clutter = np.vstack([clutter, np.full(len(found), CLUTTER_PROBABILITY)])
+            surroundings = np.vstack([surroundings, first])
             at_key = se2.compose(poses, se2.between(self._local_pose, key.pose))
-            gain, clutter = _log_at_poses(key.view, at_key, key.seen, clutter)
+            gain, surroundings = _log_at_poses(key.view, at_key, key.seen, surroundings)
             stayed += gain + key.log_change
-        gain, clutter = _log_at_poses(view, poses, self._old_beams, clutter)
+        gain, surroundings = _log_at_poses(view, poses, self._old_beams, surroundings)
         stayed += gain + self._log_change
         best, each = stayed.argmax(axis=0), np.arange(len(found))
-        return stayed[best, each], clutter[best, each]
+        return stayed[best, each], surroundings[best, each]
 
     def _finish_scan(self, view: View, observation: Observation) -> Posterior:
         """Stores what the next scan needs, and returns the posterior."""
@@ -631,19 +639,18 @@ def _log_anywhere(view: View, skip: npt.NDArray[np.bool_]) -> float:
     return float((view.surfaces.density - view.surfaces.ideal)[~skip].sum())
 
 
-def _log_at_poses(view: View, poses: Array, skip: npt.NDArray[np.bool_], clutter: Array) -> tuple[Array, Array]:
+def _log_at_poses(view: View, poses: Array, skip: npt.NDArray[np.bool_], surroundings: Array) -> tuple[Array, Array]:
     """Log likelihoods (..., N) in nats, minus `_log_ideal`, at ``poses`` (N, 3) in the map.
 
-    Each is a mixture: the scan may also be clutter, which is equally likely at all poses. ``clutter`` (..., N) is the
-    probability that the key scan before was clutter. Also returns the probability (..., N) that this scan is.
+    Each is a mixture: the scan may also be clutter or in a room that the map lacks, and is equally likely at all poses
+    then. ``surroundings`` (..., N, 3) are the probabilities at the key scan before. Also returns those of this scan.
     """
     mapped = view.surface_evidence(poses, skip=skip).log_likelihood - _log_ideal(view, skip)
-    # Clutter begins so often that `CLUTTER_PROBABILITY` is its share of all key scans.
-    begins = CLUTTER_PROBABILITY * (1 - CLUTTER_PERSISTENCE) / (1 - CLUTTER_PROBABILITY)
-    prior = CLUTTER_PERSISTENCE * clutter + begins * (1 - clutter)
-    of_clutter = np.log(prior) + _log_anywhere(view, skip)
-    total = np.logaddexp(np.log1p(-prior) + mapped, of_clutter)
-    return total, np.exp(of_clutter - total)
+    anywhere = np.full_like(mapped, _log_anywhere(view, skip))
+    with np.errstate(divide="ignore"):
+        logs = np.log(surroundings @ NEXT_SURROUNDINGS) + np.stack([mapped, anywhere, anywhere], axis=-1)
+    total = np.logaddexp.reduce(logs, axis=-1)
+    return total, np.exp(logs - total[..., None])
 
 
 def _prior_of(candidates: list[MotionCandidate]) -> Prior:

@@ -27,8 +27,10 @@ SAME_POSITION_M, SAME_HEADING_RAD = 0.1, 0.1  # hypotheses nearer to one another
 MIN_INFORMATION_RATIO, RIPPLE_FACTOR = 1e-4, 7.0
 WEAK_PRIOR = np.eye(3)  # 1/m², 1/rad²: keeps the covariance finite along unobserved directions
 MIN_WEIGHT = 1e-9  # hypotheses with less weight are dropped
-CLUTTER_PROBABILITY = 0.3  # that all that is new in a key scan is clutter
-CLUTTER_PERSISTENCE = 0.5  # the same if the key scan before was clutter: a whole room may be unlike its map
+# What is new in a key scan is as the map predicts it, is clutter, or is in a room that the map lacks. Probabilities at
+# the first key scan, and of each (column) after a key scan of each (row): clutter is soon passed, a room is not.
+FIRST_SURROUNDINGS = np.array([0.7, 0.3, 0.0])
+NEXT_SURROUNDINGS = np.array([[0.784, 0.214, 0.002], [0.498, 0.5, 0.002], [0.014, 0.006, 0.98]])
 
 
 @dataclass(frozen=True)
@@ -45,8 +47,8 @@ class Mode:
     explained: float = 0.0  # share of the last scan's beams that end at surfaces of the map
     log_evidence: float = 0.0  # nats, of the key scans and the prior; unnormalised
     present: float = 0.0  # nats, log likelihood of the present scan
-    clutter: float = CLUTTER_PROBABILITY  # probability that all that was new in the last key scan was clutter
-    present_clutter: float = CLUTTER_PROBABILITY  # the same of the present scan
+    surroundings: Array = field(default_factory=lambda: FIRST_SURROUNDINGS)  # (3,) probabilities at the last key scan
+    present_surroundings: Array = field(default_factory=lambda: FIRST_SURROUNDINGS)  # (3,) at the present scan
     velocity: Array | None = None  # (3,) in base_link; None while unknown
     drift: Array = field(default_factory=lambda: np.zeros((3, 3)))  # covariance of the pose with the drift
     weight: float = 1.0
@@ -190,7 +192,7 @@ def update_mode(mode: Mode, fused: FusedMotion, evidence: Evidence, k: int, peri
         xi=evidence.xi[k],
         curvature=evidence.curvature[k],
         log_evidence=mode.log_evidence,
-        clutter=mode.clutter,
+        surroundings=mode.surroundings,
         velocity=velocity,
         drift=inverse @ prior_information @ fused.candidate.drift,
         unobserved_scans=mode.unobserved_scans + 1 if unobserved else 0,

@@ -90,6 +90,10 @@ class LocalMap:
         """A pose (3,) in map, in the local frame."""
         return se2.between(self.frame, pose)
 
+    def place(self, local: Array, pose: Array) -> None:
+        """Moves the local frame so that ``local`` (3,) is at ``pose`` (3,) in map."""
+        self.frame = se2.compose(pose, se2.inverse(local))
+
     def is_key_scan_due(self, local: Array) -> bool:
         """Whether ``local`` (3,) is so far from the last key scan that the scan there becomes another one."""
         return not self.scans or is_key_pose(self.scans[-1].pose, local)
@@ -97,7 +101,7 @@ class LocalMap:
     def add(self, key: LocalMapScan, pose: Array, covariance: Array) -> None:
         """Adds a key scan, taken at ``pose`` (3,) in map with ``covariance`` (3, 3)."""
         self.scans.append(key)
-        self.frame = se2.compose(pose, se2.inverse(key.pose))
+        self.place(key.pose, pose)
         self.covariance = covariance + np.diag(DRIFT_PER_SCAN**2)
         self._tree = self._unmapped = None
 

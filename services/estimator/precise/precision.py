@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
 UPDATE_SHARE = 0.1  # weight of the present scan, or key scan, in the averages, at least
 MIN_CHANGED, MAX_CHANGED = 0.02, 0.5  # limits of the share of changed surfaces
-MAX_NOISE_FACTOR = 4.0  # scans with more than this times the stated noise, or less than its inverse, show no smooth walls
+MAX_NOISE_FACTOR = (
+    4.0  # scans with more than this times the stated noise, or less than its inverse, show no smooth walls
+)
 MAX_MAP_ERROR_M = 0.1  # larger errors are not the map's, but changes of the surroundings
 MIN_LEARNING_BEAMS, MIN_LEARNING_SHARE = 30, 0.3  # of a scan; nothing is learned from fewer
 DAMPING = 1e-9  # in m; keeps the inverse finite where a direction is not observed
