@@ -75,36 +75,36 @@ class RayCaster:
         lasers, angles = np.array(lasers, float).reshape(-1, 3), np.asarray(angles, float)
         ranges, jacobian = cast_rays_with_jacobian(self.world, lasers, angles)
         # A laser cannot be inside an object, so an object of the map around it must have been removed.
-        for k in np.flatnonzero(self.world.surface_distance(lasers[:, :2]) < 0):
-            rays = _advanced(lasers[k], angles, ranges[k] + PASSED_M)
-            further, derivatives = cast_rays_with_jacobian(self.world, rays, np.zeros(1))
-            ranges[k] += PASSED_M + further[:, 0]
-            jacobian[k] = derivatives[:, 0]
-            hits = np.isfinite(further[:, 0])
-            jacobian[k, hits, 2] *= ranges[k, hits] / np.maximum(further[hits, 0], PASSED_M)
+        inside = self.world.surface_distance(lasers[:, :2]) < 0
+        if inside.any():
+            rays = _advanced(lasers[inside, None], angles, ranges[inside] + PASSED_M)
+            further, derivatives = cast_rays_with_jacobian(self.world, rays.reshape(-1, 3), np.zeros(1))
+            further, derivatives = further.reshape(rays.shape[:2]), derivatives.reshape(rays.shape)
+            ranges[inside] += PASSED_M + further
+            hits = np.isfinite(further)
+            derivatives[hits, 2] *= ranges[inside][hits] / np.maximum(further[hits], PASSED_M)
+            jacobian[inside] = derivatives
         return Expected(ranges, np.full(ranges.shape, EXACT_SCALE_M), jacobian)
 
     def expect_behind(self, lasers: Array, angles: Array, ranges: Array) -> Array:
         """Ranges to the next surface; see GenerativeModel."""
         lasers, angles = np.asarray(lasers, float).reshape(-1, 3), np.asarray(angles, float)
         behind = np.array(ranges, float)
-        for k, row in enumerate(behind):
-            hit = np.flatnonzero(np.isfinite(row))
-            start = row[hit] + PASSED_M
-            inside = _advanced(lasers[k], angles[hit], start)
-            # Continue from the far side of the object that was hit. Rays do not hit a circle from inside.
-            x, y, radius = self.world.circles.T
-            in_circle = (np.hypot(inside[:, :1] - x, inside[:, 1:2] - y) < radius).any(axis=1)
-            start += np.where(in_circle, 0.0, cast_rays(self.world, inside, np.zeros(1))[:, 0] + PASSED_M)
-            outside = _advanced(lasers[k], angles[hit], start)
-            row[hit] = start + cast_rays(self.world, outside, np.zeros(1))[:, 0]
+        pose, beam = np.nonzero(np.isfinite(behind))
+        lasers, angles, start = lasers[pose], angles[beam], behind[pose, beam] + PASSED_M
+        rays = _advanced(lasers, angles, start)
+        # Continue from the far side of the object that was hit. Rays do not hit a circle from inside.
+        in_circle = np.zeros(len(rays), bool)
+        for x, y, radius in self.world.circles:
+            in_circle |= np.hypot(rays[:, 0] - x, rays[:, 1] - y) < radius
+        start += np.where(in_circle, 0.0, cast_rays(self.world, rays, np.zeros(1))[:, 0] + PASSED_M)
+        behind[pose, beam] = start + cast_rays(self.world, _advanced(lasers, angles, start), np.zeros(1))[:, 0]
         return behind
 
 
-def _advanced(laser: Array, angles: Array, distances: Array) -> Array:
-    """Poses (B,3) of beams from a laser pose (3,), each ``distances`` (B,) m along its own direction."""
-    rays = np.tile(laser, (len(angles), 1))
-    rays[:, 2] += angles
+def _advanced(lasers: Array, angles: Array, distances: Array) -> Array:
+    """Poses (..., 3) of beams from laser poses (..., 3), each ``distances`` (...) m along its own direction."""
+    heading = lasers[..., 2] + angles
     ahead = np.where(np.isfinite(distances), distances, 0.0)
-    rays[:, :2] += ahead[:, None] * np.stack([np.cos(rays[:, 2]), np.sin(rays[:, 2])], axis=-1)
-    return rays
+    x, y = lasers[..., 0] + ahead * np.cos(heading), lasers[..., 1] + ahead * np.sin(heading)
+    return np.stack([x, y, heading], axis=-1)
