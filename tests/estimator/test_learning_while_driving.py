@@ -70,8 +70,8 @@ def test_kidnapping_while_learning():
     office = load_world("office")
     scene = Scene.of(office, 180, 5000)
     before, after = (
-        scene.path(25.0, start=np.array([2.0, 3.9, 0.0])),
-        scene.path(25.0, start=np.array([13.0, 4.0, 1.0])),
+        scene.path(20.0, start=np.array([2.0, 3.9, 0.0])),
+        scene.path(16.0, start=np.array([13.0, 4.0, 1.0])),
     )
     path, rate = np.concatenate([before, after]), scene.scanner.rate
     estimator = prepare_factory(EstimatorOptions(office, model="exact"))(ScannerGeometry.of(scene.scanner))

@@ -67,9 +67,9 @@ def test_search_with_many_beams(monkeypatch):
 
 def test_error_and_bound():
     made, scene = estimator(ROOM)
-    outcome = tasks.standing(made, scene, 40, iter)
+    outcome = tasks.standing(made, scene, 20, iter)
     one, many = outcome["from nothing, 1 scan"], outcome["standing, 20 scans"]
-    assert one.found >= 38  # some of the poses see bare walls only, which fit as well after half a turn
+    assert one.found >= 19  # some of the poses see bare walls only, which fit as well after half a turn
     rms = [np.sqrt(np.mean(np.square(np.array(o.errors)[:, :2]).sum(1))) for o in (one, many)]
     limit = [np.sqrt(np.mean(np.square(o.bounds))) for o in (one, many)]
     assert 0.7 * limit[0] < rms[0] < 1.4 * limit[0]  # less would be an error of the test
@@ -81,7 +81,7 @@ def test_covariance():
     made, scene = estimator(ROOM)
     outcome = tasks.TaskOutcome()
     for pose in scene.poses(100):
-        made.restart(pose, np.diag([1.0, 1.0, 1.0]))
+        made.restart(pose, np.diag([0.05**2] * 3))  # far wider than the covariance of a scan
         outcome.add(feed(made, scene, pose, 1)[0], pose, None)
     assert len(outcome.nees) >= 99
     assert np.mean(outcome.nees) == pytest.approx(3, abs=3.3 * np.sqrt(6 / 100))
@@ -105,7 +105,10 @@ def test_kidnapping():
 
 def test_blocked_beams():
     made, scene = estimator(ROOM)
-    outcome = tasks.blocked(made, scene, 10, iter)["30 % blocked, 1 scan"]
+    outcome, poses = tasks.TaskOutcome(), scene.poses(10)
+    for pose, clean in zip(poses, scene.clean(poses), strict=True):
+        made.restart()
+        outcome.add(made.update(scene.observe(scene.blocked(clean, 0.3), 0.0)), pose, None)
     assert outcome.found >= 9
     assert np.median(np.hypot(*np.array(outcome.errors)[:, :2].T)) < 0.01
 
@@ -131,7 +134,7 @@ def test_driving_in_a_featureless_hall(learned):
     for seed in (0, 3):
         made, scene = estimator(HALL, 360, seed=seed)
         if learned:
-            geometry = ScannerGeometry(scene.scanner.angles(), np.array(scene.scanner.mount), 25.0)
+            geometry = ScannerGeometry(scene.scanner.angles()[::4], np.array(scene.scanner.mount), 25.0)
             field = field or quick_field(HALL, geometry, np.random.default_rng(0), 3000)
             made.model = field
         made.restart(start, np.diag([1e-4, 1e-4, 1e-4]))
