@@ -21,7 +21,7 @@ CONTEXT = multiprocessing.get_context("forkserver")
 # Of presage only what it imports: its console reads the environment, which is another one in each child.
 CONTEXT.set_forkserver_preload([
     "common.router", "rich.live", "rich.progress", "services.controller.service", "services.estimator.service",
-    "services.recorder.service", "services.simulator.service", "services.viewer.service", "typer",
+    "services.recorder.service", "services.simulator.service", "services.viewer.service", "tests.preloaded", "typer",
 ])  # fmt: skip
 
 
