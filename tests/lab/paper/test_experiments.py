@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,24 +21,9 @@ from lab.paper import alpha_sweep as step_size
 from lab.paper import e1_localisation as localisation
 from lab.paper import e2_crossing as crossing
 from lab.paper.suite import FinishedExperiments
+from tests.lab.paper.counting import Count, count
 
 QUIET = Console(quiet=True)
-
-
-@dataclass(frozen=True)
-class Count:
-    index: int
-    folder: str
-    fails_at: int = -1
-
-
-def count(job):
-    """A trial that records its execution in a file, and may fail."""
-    if job.index == job.fails_at and not (Path(job.folder) / "mended").exists():
-        raise ValueError("as asked")
-    with (Path(job.folder) / "ran").open("a") as file:
-        file.write(f"{job.index}\n")
-    return {"square": job.index**2}
 
 
 def jobs(folder, **more):
