@@ -10,7 +10,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from common.errors import UserError, first_fault
-from common.geometry.pose_text import pose_of_text
+from common.geometry.pose_text import parse_pose
 from common.geometry.shapes import Degrees
 from common.limits import Coordinate
 from common.robot.scanner import SCANNERS, Scanner
@@ -61,7 +61,10 @@ class _ScannerFile(BaseModel):
 
 
 def load_scanner(name: str) -> Scanner:
-    """The known scanner of that name, or the one described in that YAML file; raises UserError if there is none."""
+    """The known scanner called ``name``, or the one described in the YAML file ``name``.
+
+    Raises UserError if there is neither, or if the file is invalid.
+    """
     if name in SCANNERS:
         return SCANNERS[name]
     path = Path(name)
@@ -80,10 +83,10 @@ def load_scanner(name: str) -> Scanner:
         raise UserError(f"scanner {path}: not valid YAML ({' '.join(str(error).split())})") from None
 
 
-def chosen_scanner(
+def build_scanner(
     name: str, beams: int | None = None, noise: float | None = None, mount: str = "", *, upside_down: bool | None = None
 ) -> Scanner:
-    """A known scanner, or that of a file, with some properties replaced; raises UserError for invalid ones.
+    """`load_scanner` with some properties replaced; raises UserError for invalid ones.
 
     ``noise`` is the standard deviation of a range in m; ``mount`` is x,y[,yaw_deg] in base_link, in m and degrees.
     Empty text or None keeps the scanner's own value.
@@ -93,10 +96,10 @@ def chosen_scanner(
     if noise is not None:
         changes |= {"sigma": noise, "sigma_relative": 0.0}
     if mount:
-        changes["mount"] = tuple(map(float, pose_of_text(mount, "--mount")))
+        changes["mount"] = tuple(parse_pose(mount, "--mount").tolist())
     if upside_down is not None:
         changes["upside_down"] = upside_down
     try:
-        return Scanner.model_validate({**scanner.model_dump(), **changes}) if changes else scanner
+        return Scanner.model_validate({**scanner.model_dump(), **changes})
     except ValidationError as error:
-        raise UserError(f"{scanner.name} with --noise {noise}: {first_fault(error)}") from None
+        raise UserError(f"scanner {scanner.name}: {first_fault(error)}") from None

@@ -8,12 +8,12 @@ import numpy as np
 from pydantic import Field
 
 from common.errors import UserError
-from common.geometry.pose_text import NUMBER
+from common.geometry.pose_text import NUMBER_PATTERN
 from common.robot.robot import Robot
 from common.robot.self_filter import SelfFilter
 from common.runtime.config import ServiceSettings
 
-ANGLE_BOUNDS_PATTERN = rf"{NUMBER}:{NUMBER}"
+ANGLE_BOUNDS_PATTERN = rf"{NUMBER_PATTERN}:{NUMBER_PATTERN}"
 MAX_STOPPING_TIME_S = 10.0  # beyond this, the scanner sees obstacles too late to brake for them
 
 

@@ -7,7 +7,7 @@ The base class connects, receives, sends health once a second, and ends at Ctrl-
 from typing import Any
 
 from common.geometry import se2
-from common.geometry.pose_text import pose_of_text
+from common.geometry.pose_text import parse_pose
 from common.messages.definitions import Belief, Pose
 from common.messages.topics import BELIEF, ODOM, SCAN, Topic
 from common.runtime.config import ServiceSettings
@@ -29,7 +29,7 @@ class MyEstimator(Service):
 
     def open(self) -> None:
         """Reads the settings."""
-        self.start, self.first, self.odom = pose_of_text(self.settings.start, "--start"), None, None
+        self.start, self.first, self.odom = parse_pose(self.settings.start, "--start"), None, None
 
     def on_message(self, topic: Topic, message: Any) -> None:
         """Stores odometry, and answers scans."""

@@ -15,7 +15,7 @@ from rich.table import Table
 from common.errors import UserError
 from common.geometry.world import load_world
 from common.robot.scanner import Scanner
-from common.robot.scanner_options import chosen_scanner
+from common.robot.scanner_options import build_scanner
 from lab.accuracy.compared_estimators import COMPARED_ESTIMATORS
 from lab.accuracy.runner import TASKS, AccuracyJob, run_all
 from lab.accuracy.tasks import FOUND_DISTANCE, FOUND_YAW, TWINS_REQUIRED_FROM_SCAN
@@ -111,7 +111,7 @@ def scanners_of(names: str, beams: str) -> list[Scanner]:
     scanners = []
     for name in names.split(","):
         name_counts: list[int | None] = [*counts] or [622 if name == "tim571" else None]
-        scanners += [chosen_scanner(name, count) for count in name_counts]
+        scanners += [build_scanner(name, count) for count in name_counts]
     return scanners
 
 

@@ -304,14 +304,14 @@ def bench_integrity(
     `presage bench integrity --worlds 5 --cases moved-50,wrong-map --model exact --estimators precise --out quick`;
     `presage bench integrity --logs uwb.npz,fr079.npz --mount 0,0,0 --out results`.
     """
-    from common.geometry.pose_text import pose_of_text
+    from common.geometry.pose_text import parse_pose
     from lab.integrity.cases import CASES
     from lab.integrity.logs import cases_of
     from lab.integrity.report import bench_integrity as run
     from lab.integrity.runner import IntegrityPlan
 
     names = tuple(cases.split(",")) if cases else tuple(CASES)
-    laser_pose: Any = tuple(pose_of_text(mount, "--mount").tolist()) if mount else None
+    laser_pose: Any = tuple(parse_pose(mount, "--mount").tolist()) if mount else None
     of_logs = [case for log in logs.split(",") if log for case in cases_of(log, laser_pose)]
     plan = IntegrityPlan(worlds, seed, names, tuple(estimators.split(",")), model, seconds, tuple(of_logs))
     raise typer.Exit(run(plan, out, worker_count(), console))

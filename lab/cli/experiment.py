@@ -193,13 +193,13 @@ def real_drive(
     `presage experiment real --log drive.npz --mount 0,0,0 --world first_half.yaml --quick`;
     `presage experiment --out mine real --log fr079.mcap --world fr079.yaml --name fr079 --every 50`.
     """
-    from common.geometry.pose_text import pose_of_text
+    from common.geometry.pose_text import parse_pose
     from lab.real_logs import experiment as real
 
     seed, out = context.obj
     if not re.fullmatch(r"[\w.-]*", name):
         raise UserError(f"--name {name!r}: use only letters, digits, '.', '_' and '-', as it becomes a file name")
-    laser_pose: Any = tuple(pose_of_text(mount, "--mount").tolist()) if mount else None
+    laser_pose: Any = tuple(parse_pose(mount, "--mount").tolist()) if mount else None
     job = real.RealLogJob(log, world, laser_pose, every, quick, seed, name, exchange)
     show(real, lambda: real.run(job, out, worker_count(), console), out)
 

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from common.errors import UserError
-from common.geometry.pose_text import NUMBER, POSE_TEXT, pose_of_text
+from common.geometry.pose_text import NUMBER_PATTERN, POSE_PATTERN, parse_pose
 from presage.logs.log import Reading
 
 
@@ -18,7 +18,7 @@ class LogSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    mount: Annotated[str, Field(pattern=POSE_TEXT)] = ""  # x,y[,yaw_deg] of the laser in base_link, m and deg
+    mount: Annotated[str, Field(pattern=POSE_PATTERN)] = ""  # x,y[,yaw_deg] of the laser in base_link, m and deg
     upside_down: bool | None = None  # the scanner is mounted with a roll of 180 deg
     # Whose poses are estimated or recorded, and which the poses in an .npz file are of.
     frame: Literal["base_link", "laser"] = "base_link"
@@ -37,7 +37,7 @@ class LogSettings(BaseModel):
     def reading(self) -> Reading:
         """The options for reading the log; raises UserError if the angles are malformed."""
         return Reading(
-            pose_of_text(self.mount, "--mount") if self.mount else None,
+            parse_pose(self.mount, "--mount") if self.mount else None,
             self.scan_topic,
             self.odom_topic,
             self.base_frame,
@@ -52,7 +52,7 @@ class LogSettings(BaseModel):
 
 def angles_of(text: str) -> tuple[float, float]:
     """Angles of the first and last beam, rad, from text FIRST,LAST in degrees; raises UserError if malformed."""
-    if not re.fullmatch(f"{NUMBER},{NUMBER}", text):
+    if not re.fullmatch(f"{NUMBER_PATTERN},{NUMBER_PATTERN}", text):
         raise UserError(f"angles {text!r}: give the angles of the first and the last beam in degrees, such as -90,90")
     first, last = (float(np.deg2rad(float(part))) for part in text.split(","))
     if not 0 < last - first <= 2 * np.pi:

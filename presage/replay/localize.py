@@ -17,7 +17,7 @@ from rich.console import Console
 
 from common.errors import UserError
 from common.geometry import se2
-from common.geometry.pose_text import start_of_text
+from common.geometry.pose_text import parse_initial_pose
 from common.geometry.se2 import Array
 from common.geometry.world import load_world
 from presage.estimator import Estimator
@@ -112,7 +112,7 @@ def build_estimator_options(
     """
     if estimator not in get_args(EstimatorPreset):
         raise UserError(f"no estimator {estimator!r}: choose one of {', '.join(get_args(EstimatorPreset))}")
-    pose = start_of_text(initial_pose, "--initial-pose") if initial_pose else None
+    pose = parse_initial_pose(initial_pose, "--initial-pose") if initial_pose else None
     if not world:
         if kind_of(file) != "recording":
             raise UserError(f"{file}: a log does not state its world: give it with --world")

@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from common.errors import UserError
-from common.geometry.pose_text import POSE_TEXT, pose_of_text
+from common.geometry.pose_text import POSE_PATTERN, parse_pose
 from common.messages.ros_messages import Mount
 from common.runtime.robot_settings import SelfFilterSettings
 from services.bridge_ros2.keys import TOPIC_NAME, RosKeys, full_name
@@ -126,7 +126,7 @@ class BridgeRos2Settings(SelfFilterSettings):
     mount: Annotated[
         str,
         Field(
-            pattern=POSE_TEXT,
+            pattern=POSE_PATTERN,
             description="x,y[,yaw_deg] (m, m, degrees): pose of the laser in the base frame; defaults to the one in tf",
         ),
     ] = ""
@@ -159,5 +159,5 @@ class BridgeRos2Settings(SelfFilterSettings):
             if self.upside_down:
                 raise UserError("--upside-down needs --mount x,y[,yaw_deg]: without it the mount is taken from tf")
             return None
-        x, y, yaw = map(float, pose_of_text(self.mount, "--mount"))
+        x, y, yaw = map(float, parse_pose(self.mount, "--mount"))
         return Mount((x, y, yaw), self.upside_down)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from common.errors import UserError
-from common.geometry.pose_text import start_of_text
+from common.geometry.pose_text import parse_initial_pose
 from common.geometry.world import World
 from common.messages.definitions import (
     Belief,
@@ -78,7 +78,7 @@ def estimator_options(settings: EstimatorSettings) -> EstimatorOptions:
         models=settings.models,
         sigma=settings.sigma,
         seed=settings.seed,
-        initial_pose=start_of_text(settings.initial_pose, "--initial-pose") if settings.initial_pose else None,
+        initial_pose=parse_initial_pose(settings.initial_pose, "--initial-pose") if settings.initial_pose else None,
         descent=Descent(alpha=settings.alpha, iterations=settings.iterations),
     )
 

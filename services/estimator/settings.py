@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from common.geometry.pose_text import POSE_TEXT
+from common.geometry.pose_text import POSE_PATTERN
 from common.runtime.config import ServiceSettings
 
 ROBOT_NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
@@ -81,7 +81,7 @@ class EstimatorSettings(ServiceSettings):
     initial_pose: Annotated[
         str,
         Field(
-            pattern=POSE_TEXT,
+            pattern=POSE_PATTERN,
             description="initial pose x,y[,yaw_deg], or x,y for any heading; empty if unknown (paper: the centre)",
         ),
     ] = ""

@@ -6,10 +6,10 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from common.geometry.pose_text import POSE_TEXT, pose_of_text
+from common.geometry.pose_text import POSE_PATTERN, parse_pose
 from common.limits import MAX_BEAMS
 from common.robot.scanner import SCANNERS, Scanner
-from common.robot.scanner_options import chosen_scanner
+from common.robot.scanner_options import build_scanner
 from common.runtime.robot_settings import RobotSettings
 
 
@@ -44,7 +44,7 @@ class SimulatorSettings(RobotSettings):
     mount: Annotated[
         str,
         Field(
-            pattern=POSE_TEXT,
+            pattern=POSE_PATTERN,
             description="x,y[,yaw_deg] of the laser in base_link; if empty, that of the scanner model",
         ),
     ] = ""
@@ -52,7 +52,8 @@ class SimulatorSettings(RobotSettings):
     start: Annotated[
         str,
         Field(
-            pattern=POSE_TEXT, description="x,y[,yaw_deg] at which the robot starts; if empty, the start of the world"
+            pattern=POSE_PATTERN,
+            description="x,y[,yaw_deg] at which the robot starts; if empty, the start of the world",
         ),
     ] = ""
     seed: Annotated[int, Field(ge=0, description="random seed of all noise and of people's motion")] = 0
@@ -89,7 +90,7 @@ class SimulatorSettings(RobotSettings):
 
     def build_scanner(self) -> Scanner:
         """Scanner according to the settings. Raises UserError if it is unknown."""
-        return chosen_scanner(self.scanner, self.beams, self.noise, self.mount, upside_down=self.upside_down)
+        return build_scanner(self.scanner, self.beams, self.noise, self.mount, upside_down=self.upside_down)
 
     def required_services(self) -> set[str]:
         """Names of the services that must be running before the first scan."""
@@ -101,5 +102,5 @@ class SimulatorSettings(RobotSettings):
         """Start x m, y m, yaw rad; None if the world's start is to be used."""
         if not self.start:
             return None
-        x, y, yaw = map(float, pose_of_text(self.start, "--start"))
+        x, y, yaw = map(float, parse_pose(self.start, "--start"))
         return x, y, yaw

@@ -11,7 +11,7 @@ from common.errors import UserError
 from common.geometry import se2
 from common.robot.scan_geometry import ALL_ROUND, Sweep
 from common.robot.scanner import SCANNERS
-from common.robot.scanner_options import chosen_scanner, load_scanner
+from common.robot.scanner_options import build_scanner, load_scanner
 from common.runtime.config import load_settings
 from services.simulator.settings import SimulatorSettings
 
@@ -86,11 +86,11 @@ def test_beams_are_found_by_direction(first, step, clockwise, beams):
 def test_a_file_describes_a_scanner(tmp_path):
     file = tmp_path / "mine.yaml"
     file.write_text(FILE)
-    scanner = chosen_scanner(str(file))
+    scanner = build_scanner(str(file))
     assert np.rad2deg(scanner.angles()[[0, 1, -1]]) == pytest.approx([0, -0.5, -359.5])
     assert scanner.mount == pytest.approx((0.1, 0, np.pi / 2))
     assert "mine: 720 beams over 359.5 deg" in str(scanner)
-    other = chosen_scanner(str(file), 100, 0.05, "0,-0.2,180", upside_down=False)
+    other = build_scanner(str(file), 100, 0.05, "0,-0.2,180", upside_down=False)
     assert (other.beams, other.sigma, other.upside_down) == (100, 0.05, False)
     assert other.mount == pytest.approx((0, -0.2, np.pi))
 
@@ -126,12 +126,13 @@ def test_invalid_files_are_explained(tmp_path, change, wrong):
         ({"name": "no/such.yaml"}, "choose one of"),
         ({"name": ""}, "cannot be read"),
         *(({"mount": mount}, "--mount '.*': give x,y") for mount in ("1", "a,b", "1,2,3,4")),
-        *(({"noise": noise}, "tim571 with --noise .*: sigma: Input should be") for noise in (-1e-9, np.nan, np.inf)),
+        ({"mount": "0,0,999999999"}, "scanner tim571: mount, entry 3: Input should be"),
+        *(({"noise": noise}, "scanner tim571: sigma: Input should be") for noise in (-1e-9, np.nan, np.inf)),
     ],
 )
 def test_invalid_options_are_explained(options, error):
     with pytest.raises(UserError, match=error):
-        chosen_scanner(**{"name": "tim571", **options})
+        build_scanner(**{"name": "tim571", **options})
 
 
 @pytest.mark.parametrize("noise", [-1.0, np.nan, np.inf])
@@ -141,5 +142,5 @@ def test_invalid_noise_settings_are_refused(noise):
 
 
 def test_noise_option():
-    scanner = chosen_scanner("rplidar-a1", 30, 0.0)
+    scanner = build_scanner("rplidar-a1", 30, 0.0)
     assert (scanner.sigma, scanner.sigma_relative, scanner.beams) == (0, 0, 30)

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from common.bus.bus import DEFAULT_ENDPOINT, Link
 from common.errors import UserError
-from common.geometry.pose_text import POSE_TEXT, pose_of_text, start_of_text
+from common.geometry.pose_text import POSE_PATTERN, parse_initial_pose, parse_pose
 from common.router.router import RouterSettings
 from common.runtime.config import ServiceSettings, load_settings, split_endpoints
 
@@ -76,23 +76,23 @@ def test_a_value_may_begin_with_a_minus(load, given):
     [("1,-2.5", [1, -2.5, 0]), ("-3,1.5,-90", [-3, 1.5, -np.pi / 2]), (".5,-2.", [0.5, -2, 0]), ("", None)],
 )
 def test_pose_texts(text, pose):
-    assert re.match(POSE_TEXT, text)
+    assert re.match(POSE_PATTERN, text)
     if pose is not None:
-        np.testing.assert_allclose(pose_of_text(text, "--start"), pose)
+        np.testing.assert_allclose(parse_pose(text, "--start"), pose)
         heading = text.count(",") == 2  # without it, a start has an unknown one
-        np.testing.assert_allclose(start_of_text(text, "--start"), pose if heading else pose[:2])
+        np.testing.assert_allclose(parse_initial_pose(text, "--start"), pose if heading else pose[:2])
 
 
 @pytest.mark.parametrize("text", ["1.2.3,1", "1", ".,1", "nan,1", "1,2,3,4", "1,,2", "-,1", "1e3,1"])
 def test_invalid_poses(text):
-    assert not re.match(POSE_TEXT, text)
+    assert not re.match(POSE_PATTERN, text)
     with pytest.raises(UserError, match=r"--mount '.*': give x,y\[,yaw_deg\] in m and degrees"):
-        pose_of_text(text, "--mount")
+        parse_pose(text, "--mount")
 
 
 def test_poses_beyond_the_limits():
     with pytest.raises(UserError, match=r"--start '999999999,1': x and y must be within 10000 m of the origin"):
-        pose_of_text("999999999,1", "--start")
+        parse_pose("999999999,1", "--start")
 
 
 def test_empty_values_count_only_as_arguments(load, monkeypatch):
