@@ -3,7 +3,7 @@
 0 < range     distance to a surface
 +inf          no surface within range_max
 -inf          a surface too close to measure: an obstacle, but not used for localisation
-0             not measured: not used at all. LaserScan has no other value for it, and drivers send 0
+0             not measured: not used at all; drivers send 0 or NaN
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-Numbers = TypeVar("Numbers", np.float32, np.float64)
+Float = TypeVar("Float", np.float32, np.float64)
 NOT_MEASURED = 0.0  # m
 
 
-def normalise_driver_ranges(ranges: npt.NDArray[Numbers], range_min: float, range_max: float) -> npt.NDArray[Numbers]:
+def normalise_driver_ranges(ranges: npt.NDArray[Float], range_min: float, range_max: float) -> npt.NDArray[Float]:
     """Converts a driver's ranges of any shape to those of a scan message; all in m.
 
     ``range_max`` and larger values become +inf, because drivers report them when there is no return. Values above 0 and
@@ -29,15 +29,15 @@ def normalise_driver_ranges(ranges: npt.NDArray[Numbers], range_min: float, rang
     unmeasured = np.isnan(ranges) | ((ranges <= 0) & ~np.isneginf(ranges))
     far, near = single >= np.float32(range_max), (single < np.float32(range_min)) & ~unmeasured
     dtype = ranges.dtype.type
-    known = np.where(far, dtype(np.inf), np.where(near, dtype(-np.inf), ranges))
-    return np.where(unmeasured, dtype(NOT_MEASURED), known)
+    measured = np.where(far, dtype(np.inf), np.where(near, dtype(-np.inf), ranges))
+    return np.where(unmeasured, dtype(NOT_MEASURED), measured)
 
 
 def is_surface(ranges: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:
-    """Mask, of the same shape, of the ranges that are distances to a surface."""
+    """Whether each range is a distance to a surface; same shape."""
     return np.asarray(np.isfinite(ranges) & (ranges > 0))
 
 
 def ranges_for_localisation(ranges: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
-    """Ranges in m as estimators use them: -inf replaces those that are too close or not measured."""
+    """Ranges in m as estimators use them: those that are too close or not measured become -inf."""
     return np.where(is_surface(ranges) | np.isposinf(ranges), ranges, -np.inf).astype(np.float64)

@@ -34,7 +34,7 @@ class Scanner(BaseModel):
     upside_down: bool = False  # mounted with a roll of 180 deg, so that the beams run clockwise seen from above
 
     @model_validator(mode="after")
-    def _limits(self) -> Scanner:
+    def _check_range_limits(self) -> Scanner:
         if self.range_max <= self.range_min:
             raise ValueError(f"range_max {self.range_max:g} m must be more than range_min {self.range_min:g} m")
         return self
@@ -61,7 +61,7 @@ class Scanner(BaseModel):
         return self.angle_min + self.angle_increment * np.arange(self.beams, dtype=np.float64)
 
     def with_beams(self, beams: int | None) -> Scanner:
-        """The same scanner with another number of beams over the same field of view; unchanged if it is None.
+        """A copy with another number of beams over the same field of view; None keeps the number.
 
         Raises UserError for an invalid number.
         """
@@ -74,15 +74,15 @@ class Scanner(BaseModel):
 
     def deviation(self, ranges: Array) -> Array:
         """Standard deviation in m of measurements of ``ranges`` m, of the same shape."""
-        if not self.sigma_relative:
+        if not self.sigma_relative:  # 0 times inf would be NaN
             return np.full(np.shape(ranges), self.sigma)
         return np.hypot(self.sigma, self.sigma_relative * np.asarray(ranges))
 
     def add_noise(self, ranges: Array, rng: np.random.Generator) -> Array:
         """Adds this scanner's noise to exact ``ranges`` in m; +inf stays +inf."""
         draws = rng.standard_normal(np.shape(ranges))
-        finite = np.isfinite(ranges)
-        return np.asarray(ranges + np.where(finite, self.deviation(np.where(finite, ranges, 0.0)), 0.0) * draws)
+        finite = np.where(np.isfinite(ranges), ranges, 0.0)
+        return np.asarray(ranges + self.deviation(finite) * draws)
 
     def limit(self, ranges: Array) -> Array:
         """Replaces ranges beyond the scanner's limits (REP-117): +inf for too far, -inf for too close."""
@@ -91,7 +91,7 @@ class Scanner(BaseModel):
 
     def __str__(self) -> str:
         x, y, yaw = self.mount
-        relative = f" and {self.sigma_relative:.2g} of the range" if self.sigma_relative else ""
+        relative = f" and {self.sigma_relative:.2g} times the range" if self.sigma_relative else ""
         return (
             f"{self.name}: {self.beams} beams over {np.rad2deg(self.fov):.4g} deg from "
             f"{np.rad2deg(self.angle_min):.4g} deg, {self.rate:g} Hz, {self.range_min:g} to {self.range_max:g} m, "

@@ -1,7 +1,7 @@
 """Masks beams that hit the robot itself.
 
 In published scans such a beam is marked as not measured (0, see `ranges`), so that it is used neither for localisation
-nor for obstacles. For braking and planning within a process it is NaN, which counts as no beam at all.
+nor for obstacles. For braking and planning within a process it is NaN, as if the scanner did not have this beam.
 """
 
 from __future__ import annotations
@@ -19,8 +19,10 @@ from common.robot.scan_geometry import Sweep
 if TYPE_CHECKING:
     from common.messages.definitions import Scan
 
-# A masked sector wider than this is removed from the field of view; a narrow one, such as a post, is not.
+# A sector at least this wide is removed from the field of view; a narrower one, such as a post, is only masked.
 MIN_TRIMMED_SECTOR_RAD = float(np.deg2rad(30))
+
+Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -37,54 +39,52 @@ class SelfFilter:
 
     def mask_for_bus(self, scan: Scan) -> Scan:
         """The scan to publish: masked beams are marked as not measured."""
-        return self._replaced(scan, self._masked(scan), NOT_MEASURED) if self.is_active else scan
+        return self._mask(scan, NOT_MEASURED) if self.is_active else scan
 
     def mask_for_planning(self, scan: Scan) -> Scan:
         """The scan for braking and planning, not to be published: masked beams are NaN, and wide sectors are removed.
 
         A wide sector in the middle of a scan that does not cover the full circle cannot be removed and is NaN only.
         """
-        if not self.is_active:
-            return scan
-        in_sector = self._in_sectors(scan)
-        scan = self._replaced(scan, self._masked(scan), np.nan)
-        sweep, shift = Sweep.of(scan), 0
-        if sweep.all_round and in_sector.any() and not in_sector.all():
-            shift = _end_of_longest_run(in_sector)  # rotate the longest run to the end, where it can be removed
-            in_sector = np.roll(in_sector, -shift)
-        min_beams = max(1, round(MIN_TRIMMED_SECTOR_RAD / sweep.spacing)) if sweep.spacing else len(in_sector) + 1
-        first, last = _leading_run(in_sector), _leading_run(in_sector[::-1])
-        first, last = (run if run >= min_beams else 0 for run in (first, last))
-        if first + last >= len(in_sector) or not (first or last):
-            return scan
-        ranges = np.roll(scan.ranges, -shift)[first : len(in_sector) - last]
-        angle_min = float(wrap(scan.angle_min + scan.angle_increment * (shift + first)))
-        return scan.model_copy(update={"ranges": ranges, "angle_min": angle_min})
+        return _trim_wide_sectors(self._mask(scan, np.nan), self._in_sectors(scan)) if self.is_active else scan
 
-    def _in_sectors(self, scan: Scan) -> npt.NDArray[np.bool_]:
+    def _in_sectors(self, scan: Scan) -> Mask:
         angles, inside = scan.angles(), np.zeros(len(scan.ranges), bool)
         for low, high in self.sectors:
             inside |= np.abs(wrap(angles - (low + high) / 2)) <= (high - low) / 2 + 1e-9
         return inside
 
-    def _masked(self, scan: Scan) -> npt.NDArray[np.bool_]:
-        """(B,) mask by sectors and radius: it includes -inf (too close) but not 0, which is not a distance."""
-        if not self.radius:
-            return self._in_sectors(scan)
-        return np.asarray(self._in_sectors(scan) | (scan.ranges < np.float32(self.radius)) & (scan.ranges != 0))
-
-    @staticmethod
-    def _replaced(scan: Scan, masked: npt.NDArray[np.bool_], value: float) -> Scan:
-        ranges = np.where(masked, np.float32(value), scan.ranges).astype(np.float32)
-        return scan.model_copy(update={"ranges": ranges})
+    def _mask(self, scan: Scan, value: float) -> Scan:
+        """Sets the ranges of beams in the sectors or within the radius to ``value``."""
+        # Within the radius are also those that are too close to measure (-inf), but not those not measured (0).
+        in_radius = (scan.ranges < np.float32(self.radius)) & (scan.ranges != NOT_MEASURED)
+        masked = self._in_sectors(scan) | (in_radius & (self.radius > 0))
+        return scan.model_copy(update={"ranges": np.where(masked, np.float32(value), scan.ranges)})
 
 
-def _leading_run(mask: npt.NDArray[np.bool_]) -> int:
-    """Number of True values at the beginning."""
-    return len(mask) if mask.all() else int(np.argmin(mask))
+def _trim_wide_sectors(scan: Scan, in_sector: Mask) -> Scan:
+    """Removes the beams ``in_sector`` (B,) from both ends of a scan, as far as they form wide sectors."""
+    sweep, shift = Sweep.of(scan), 0
+    if in_sector.all() or not in_sector.any() or not sweep.spacing:
+        return scan
+    if sweep.all_round:
+        shift = _end_of_longest_run(in_sector)  # rotate the longest run to the end, where it can be removed
+        in_sector = np.roll(in_sector, -shift)
+    min_beams = max(1, round(MIN_TRIMMED_SECTOR_RAD / sweep.spacing))
+    first, last = (run if run >= min_beams else 0 for run in (_leading_run(in_sector), _leading_run(in_sector[::-1])))
+    if not (first or last):
+        return scan
+    ranges = np.roll(scan.ranges, -shift)[first : len(in_sector) - last]
+    angle_min = float(wrap(scan.angle_min + scan.angle_increment * (shift + first)))
+    return scan.model_copy(update={"ranges": ranges, "angle_min": angle_min})
 
 
-def _end_of_longest_run(mask: npt.NDArray[np.bool_]) -> int:
+def _leading_run(mask: Mask) -> int:
+    """Number of True values before the first False one."""
+    return int(np.argmin(mask))
+
+
+def _end_of_longest_run(mask: Mask) -> int:
     """Index after the longest run of True values in a circular mask that has both values."""
     begin = int(np.argmin(mask))  # False, so that no run continues across it
     ring = np.roll(mask, -begin).astype(np.int8)
