@@ -1,4 +1,4 @@
-"""A grid that lists the segments and circles in each of its cells, so that a ray is compared with few of them."""
+"""A grid that lists the segments and circles in each of its cells, so that a ray is tested against few of them."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
         Array, Array, npt.NDArray[np.int64], npt.NDArray[np.int64], tuple[int, int], tuple[float, float, float]
     ]
 
-MARGIN_CELLS = 1e-6  # an outline this near a cell counts as inside, because a ray's position is rounded
-MARGIN_M = 1e-3  # around all outlines
+MARGIN_CELLS = 1e-6  # an outline this near a cell counts as inside it, because the positions of rays are rounded
+MARGIN_M = 1e-3  # of the grid around all outlines
 
 jit = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -30,7 +30,8 @@ class OutlineIndex:
 
     segments: Array  # (S, 4) x0, y0, x1, y1 in m
     circles: Array  # (C, 3) x, y, radius in m
-    # Cell (i, j) lists members[starts[k] : starts[k + 1]], with k = columns * i + j; numbers from S on are circles.
+    # Cell (i, j), with k = columns * i + j, has members[starts[k] : starts[k + 1]]: numbers of segments, from S on of
+    # circles.
     starts: npt.NDArray[np.int64]  # (rows * columns + 1,)
     members: npt.NDArray[np.int64]
     shape: tuple[int, int]  # rows, columns
@@ -45,14 +46,15 @@ class OutlineIndex:
         low = points.min(axis=0) - MARGIN_M
         extent = points.max(axis=0) + MARGIN_M - low
         count = len(segments) + len(circles) + 1
-        frame = (float(low[0]), float(low[1]), max(math.sqrt(extent.prod() / count), float(extent.max()) / count))
-        columns, rows = (int(n) for n in np.ceil(extent / frame[2]))
+        size = max(math.sqrt(extent.prod() / count), float(extent.max()) / count)  # m, edge length of a cell
+        frame = (float(low[0]), float(low[1]), size)
+        columns, rows = (int(n) for n in np.ceil(extent / size))
         # Two passes over the outlines: the first one counts the members of each cell, the second one lists them.
-        starts, members = np.zeros(rows * columns + 1, np.int64), np.zeros(0, np.int64)
-        _list(segments, circles, (rows, columns), frame, starts, members)
-        starts = np.cumsum(starts)
+        counts, no_members = np.zeros(rows * columns, np.int64), np.zeros(0, np.int64)
+        _visit_cells(segments, circles, (rows, columns), frame, counts, no_members)
+        starts = np.concatenate([[0], np.cumsum(counts)])
         members = np.empty(starts[-1], np.int64)
-        _list(segments, circles, (rows, columns), frame, starts.copy(), members)
+        _visit_cells(segments, circles, (rows, columns), frame, starts[:-1].copy(), members)
         return cls(segments, circles, starts, members, (rows, columns), frame)
 
     @property
@@ -62,38 +64,40 @@ class OutlineIndex:
 
 
 @jit
-def _list(
+def _visit_cells(
     segments: Array,
     circles: Array,
     shape: tuple[int, int],
     frame: tuple[float, float, float],
-    ends: npt.NDArray[np.int64],
+    positions: npt.NDArray[np.int64],
     members: npt.NDArray[np.int64],
 ) -> None:
-    """Counts the members of cell k in ends[k + 1] if ``members`` is empty, else writes them from ends[k] on."""
+    """Visits the cells of each outline: writes its number to members[positions[k]] and adds 1 to positions[k].
+
+    If ``members`` is empty, only counts in ``positions``.
+    """
     (rows, columns), (x, y, size) = shape, frame
-    for s in range(segments.shape[0] + circles.shape[0]):
-        if s < segments.shape[0]:
-            ax, ay = (segments[s, 0] - x) / size, (segments[s, 1] - y) / size
-            bx, by = (segments[s, 2] - x) / size, (segments[s, 3] - y) / size
+    for number in range(segments.shape[0] + circles.shape[0]):
+        # In units of cells, a segment from a to b or the square around a circle.
+        if number < segments.shape[0]:
+            ax, ay = (segments[number, 0] - x) / size, (segments[number, 1] - y) / size
+            bx, by = (segments[number, 2] - x) / size, (segments[number, 3] - y) / size
         else:
-            circle = circles[s - segments.shape[0]]
+            circle = circles[number - segments.shape[0]]
             ax, ay = (circle[0] - circle[2] - x) / size, (circle[1] - circle[2] - y) / size
             bx, by = (circle[0] + circle[2] - x) / size, (circle[1] + circle[2] - y) / size
-        first = max(math.floor(min(ay, by) - MARGIN_CELLS), 0)
-        last = min(math.floor(max(ay, by) + MARGIN_CELLS), rows - 1)
-        for i in range(first, last + 1):
-            low, high = min(ax, bx), max(ax, bx)
-            if s < segments.shape[0] and ay != by:  # only the part of the segment within the row
+        bottom = max(math.floor(min(ay, by) - MARGIN_CELLS), 0)
+        top = min(math.floor(max(ay, by) + MARGIN_CELLS), rows - 1)
+        for i in range(bottom, top + 1):
+            x0, x1 = ax, bx
+            if number < segments.shape[0] and ay != by:  # only the part of the segment within the row
                 u, v = (i - MARGIN_CELLS - ay) / (by - ay), (i + 1 + MARGIN_CELLS - ay) / (by - ay)
                 u, v = max(min(u, v), 0.0), min(max(u, v), 1.0)
-                low, high = min(ax + u * (bx - ax), ax + v * (bx - ax)), max(ax + u * (bx - ax), ax + v * (bx - ax))
-            for j in range(
-                max(math.floor(low - MARGIN_CELLS), 0), min(math.floor(high + MARGIN_CELLS), columns - 1) + 1
-            ):
-                k = i * columns + j
+                x0, x1 = ax + u * (bx - ax), ax + v * (bx - ax)
+            left = max(math.floor(min(x0, x1) - MARGIN_CELLS), 0)
+            right = min(math.floor(max(x0, x1) + MARGIN_CELLS), columns - 1)
+            for j in range(left, right + 1):
+                k = columns * i + j
                 if members.size:
-                    members[ends[k]] = s
-                    ends[k] += 1
-                else:
-                    ends[k + 1] += 1
+                    members[positions[k]] = number
+                positions[k] += 1
