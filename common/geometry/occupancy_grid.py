@@ -1,7 +1,7 @@
 """An occupancy grid: free, occupied and unknown cells, and the geometry derived from them.
 
 Occupied cells are squares, and a beam ends at the first one it meets. Unknown cells do not stop beams, but no robot may
-be in them. Geometry derived from the cells is cached for each map, also if several worlds share the map.
+be in them. Cells and geometry are cached, so that equal grids of several worlds are decoded only once.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Cells = npt.NDArray[np.uint8]
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, 255  # as in nav_msgs/OccupancyGrid, whose -1 is 255 in an unsigned byte
 MAX_CELLS = 16_000_000  # 4000 by 4000
-CACHED_MAPS = 4  # whose geometry is kept
+MAX_CACHED_GRIDS = 4
 
 
 class OccupancyGrid(BaseModel):
@@ -57,33 +57,32 @@ class OccupancyGrid(BaseModel):
         return cls(width=width, height=height, resolution=resolution, origin=origin, cells=packed)
 
     @model_validator(mode="after")
-    def _cells_are_cells(self) -> OccupancyGrid:
+    def _check_cells(self) -> OccupancyGrid:
         if self.width * self.height > MAX_CELLS:
             raise ValueError(f"{self.width} x {self.height} cells are more than {MAX_CELLS}")
-        _unpacked(self.cells, self.width, self.height)
+        _decode(self.cells, self.width, self.height)
         return self
 
     @property
     def values(self) -> Cells:
         """(height, width) cells of FREE, OCCUPIED and UNKNOWN, lowest row first; read-only."""
-        return _unpacked(self.cells, self.width, self.height)
+        return _decode(self.cells, self.width, self.height)
 
     @property
-    def shapes(self) -> GridShapes:
+    def geometry(self) -> GridGeometry:
         """Geometry derived from the cells."""
-        return _shapes(self)
+        return _geometry(self)
 
     def corners(self) -> list[tuple[float, float]]:
-        """Corners of the grid in m in map, counter-clockwise. Its edge is not a wall."""
+        """Corners of the grid in m in map, counter-clockwise. The edge of the grid is not a wall."""
         width, height = self.width * self.resolution, self.height * self.resolution
-        x, y = self.to_map(np.array([[0, 0], [width, 0], [width, height], [0, height]])).T.tolist()
-        return list(zip(x, y, strict=True))
+        return [(x, y) for x, y in self.to_map([(0, 0), (width, 0), (width, height), (0, height)]).tolist()]
 
     def to_map(self, points: npt.ArrayLike) -> Array:
         """Transforms points (N, 2) in m from the grid's frame, with origin at its lower left corner, to map."""
         x, y, yaw = self.origin
-        moved: Array = (rotate(yaw, points) if yaw else np.asarray(points, float)) + np.array([x, y])
-        return moved
+        rotated = rotate(yaw, points) if yaw else np.asarray(points, float)
+        return np.asarray(rotated + np.array([x, y]))
 
     def from_map(self, points: Array) -> Array:
         """Inverse of `to_map`."""
@@ -100,33 +99,33 @@ class OccupancyGrid(BaseModel):
         return found
 
 
-@functools.lru_cache(CACHED_MAPS)
-def _unpacked(packed: str, width: int, height: int) -> Cells:
+@functools.lru_cache(MAX_CACHED_GRIDS)
+def _decode(packed: str, width: int, height: int) -> Cells:
     """Decodes cells; raises ValueError if they are invalid. Never decompresses more bytes than there are cells."""
     reader, count = zlib.decompressobj(), width * height
     try:
         plain = reader.decompress(base64.b64decode(packed, validate=True), count)
     except (binascii.Error, ValueError, zlib.error) as error:
-        raise ValueError(f"the cells are not base64 of zlib ({error})") from None
+        raise ValueError(f"the cells are not zlib-compressed and base64-encoded ({error})") from None
     if len(plain) != count or not reader.eof or reader.unused_data:
-        raise ValueError(f"the cells are not {width} x {height} bytes")
+        raise ValueError(f"the decompressed cells are not {width} x {height} bytes")
     values = np.frombuffer(plain, np.uint8).reshape(height, width)
     if not np.isin(values, (FREE, OCCUPIED, UNKNOWN)).all():
-        raise ValueError(f"a cell is {FREE} free, {OCCUPIED} occupied or {UNKNOWN} unknown")
+        raise ValueError(f"each cell must be {FREE} (free), {OCCUPIED} (occupied) or {UNKNOWN} (unknown)")
     return values
 
 
-@functools.lru_cache(CACHED_MAPS)
-def _shapes(grid: OccupancyGrid) -> GridShapes:
-    return GridShapes(grid)
+@functools.lru_cache(MAX_CACHED_GRIDS)
+def _geometry(grid: OccupancyGrid) -> GridGeometry:
+    return GridGeometry(grid)
 
 
 @dataclass(frozen=True, eq=False)
-class GridShapes:
+class GridGeometry:
     """Geometry of one grid, computed when it is first used."""
 
     grid: OccupancyGrid
-    _trees: dict[int, shapely.STRtree] = field(default_factory=dict)  # by cell value: outlines of cells with that value
+    _trees: dict[int, shapely.STRtree] = field(default_factory=dict)  # outlines of the cells of each value
 
     @functools.cached_property
     def walls(self) -> Array:
@@ -143,35 +142,32 @@ class GridShapes:
         in_map: shapely.Geometry = shapely.transform(local, lambda xy: self.grid.to_map(xy * self.grid.resolution))
         return in_map
 
-    def distance(self, kind: int, points: Array) -> Array:
-        """(N,) distances in m from points (N, 2) in map to the edge of the cells of value ``kind``; negative inside."""
-        inside = self.grid.values_at(points) == kind
-        if kind not in self._trees:
-            self._trees[kind] = shapely.STRtree(_lines(self._in_map(outline(self.grid.values == kind))))
-        away = np.full(len(points), np.inf)
-        if len(points) and len(self._trees[kind]):
-            found, distance = self._trees[kind].query_nearest(
-                shapely.points(points), return_distance=True, all_matches=False
-            )
-            away[found[0]] = distance
-        return np.where(inside, -away, away)
+    def distance(self, value: int, points: Array) -> Array:
+        """(N,) distances in m from points (N, 2) in map to the edge of the cells with ``value``; negative inside."""
+        if value not in self._trees:
+            self._trees[value] = shapely.STRtree(_lines(self._in_map(outline(self.grid.values == value))))
+        tree, to_edge = self._trees[value], np.full(len(points), np.inf)
+        if len(points) and len(tree):
+            found, distance = tree.query_nearest(shapely.points(points), return_distance=True, all_matches=False)
+            to_edge[found[0]] = distance
+        return np.where(self.grid.values_at(points) == value, -to_edge, to_edge)
 
-    def lattice_distances(self, kind: int, x: Array, y: Array, max_distance: float = np.inf) -> Array:
-        """(len(y), len(x)) `distance` in m at the nodes x, y of a lattice in map, which are ascending.
+    def lattice_distances(self, value: int, x: Array, y: Array, max_distance: float = np.inf) -> Array:
+        """(R, C) `distance` in m at the nodes of a lattice with ascending coordinates x (C,) and y (R,) in m in map.
 
-        Distances are limited to ``max_distance``. It is fast if the grid is not rotated in map.
+        Distances are limited to ``max_distance``. Much faster than `distance`, unless the grid is rotated in map.
         """
         grid = self.grid
         if grid.origin[2]:
             nodes = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-            return np.clip(self.distance(kind, nodes).reshape(len(y), len(x)), -max_distance, max_distance)
+            return np.clip(self.distance(value, nodes).reshape(len(y), len(x)), -max_distance, max_distance)
         x, y = (x - grid.origin[0]) / grid.resolution, (y - grid.origin[1]) / grid.resolution
-        return signed_distance(grid.values == kind, x, y, max_distance / grid.resolution) * grid.resolution
+        return signed_distance(grid.values == value, x, y, max_distance / grid.resolution) * grid.resolution
 
     def cells_with_clearance(self, clearance: float) -> npt.NDArray[np.int_]:
         """(K, 2) column and row of free cells whose centre is at least ``clearance`` m from the edge of free space."""
         free, size = self.grid.values == FREE, self.grid.resolution
-        if clearance <= size / 2:
+        if clearance <= size / 2:  # all free cells
             return np.argwhere(free)[:, ::-1]
         x, y = (np.arange(side, dtype=float) + 0.5 for side in (self.grid.width, self.grid.height))
         return np.argwhere(inner_distance(free, x, y, clearance / size + 1) * size >= clearance)[:, ::-1]
@@ -179,12 +175,13 @@ class GridShapes:
     def points_in_cells(self, cells: npt.NDArray[np.int_], shares: npt.ArrayLike) -> Array:
         """(N, 2) points in m in map inside cells (N, 2) column, row.
 
-        ``shares`` (N, 2), from 0 to 1, are the positions along the cell's edges; 0.5 is its centre.
+        ``shares`` (N, 2), from 0 to 1, are the positions within the cells along x and y; 0.5 is the centre.
         """
         return self.grid.to_map((cells + np.asarray(shares)) * self.grid.resolution)
 
-    def _in_map(self, runs: npt.NDArray[np.int_]) -> Array:
-        return self.grid.to_map(runs.reshape(-1, 2) * self.grid.resolution).reshape(-1, 4)
+    def _in_map(self, segments: npt.NDArray[np.int_]) -> Array:
+        """Segments (S, 4) in cells, in m in map."""
+        return self.grid.to_map(segments.reshape(-1, 2) * self.grid.resolution).reshape(-1, 4)
 
 
 def outline(mask: Mask) -> npt.NDArray[np.int_]:
@@ -193,21 +190,21 @@ def outline(mask: Mask) -> npt.NDArray[np.int_]:
     Segments meet only at their ends: where two cells touch at a corner, segments end there.
     """
     padded = np.pad(mask, 1).astype(np.int8)
-    line, begin, end = _runs(np.diff(padded, axis=0))
-    level = np.column_stack([begin, line, end, line])
-    line, begin, end = _runs(np.diff(padded, axis=1).T)
-    return np.concatenate([level, np.column_stack([line, begin, line, end])])
+    y, x0, x1 = _runs(np.diff(padded, axis=0))
+    horizontal = np.column_stack([x0, y, x1, y])
+    x, y0, y1 = _runs(np.diff(padded, axis=1).T)
+    return np.concatenate([horizontal, np.column_stack([x, y0, x, y1])])
 
 
-def _runs(step: npt.NDArray[np.int8]) -> tuple[npt.NDArray[np.int_], npt.NDArray[np.int_], npt.NDArray[np.int_]]:
-    """Line, begin and end of the runs of equal nonzero steps, in coordinates of the cells before padding."""
-    zeros = np.zeros((len(step), 1), np.int8)
-    edged = np.hstack([zeros, step, zeros])
-    before, after = edged[:, :-1], edged[:, 1:]
+def _runs(steps: npt.NDArray[np.int8]) -> tuple[npt.NDArray[np.int_], npt.NDArray[np.int_], npt.NDArray[np.int_]]:
+    """Row, begin and end of the runs of equal nonzero steps, in coordinates of the cells before padding."""
+    zeros = np.zeros((len(steps), 1), np.int8)
+    padded = np.hstack([zeros, steps, zeros])
+    before, after = padded[:, :-1], padded[:, 1:]
     changes = before != after
-    line, begin = np.nonzero(changes & (after != 0))
-    _, end = np.nonzero(changes & (before != 0))
-    return line, begin - 1, end - 1
+    row, begin = np.nonzero(changes & (after != 0))
+    _, end = np.nonzero(changes & (before != 0))  # in the same order as the beginnings: runs do not overlap
+    return row, begin - 1, end - 1
 
 
 def _lines(segments: Array) -> npt.NDArray[np.object_]:

@@ -15,7 +15,7 @@ import numba
 import numpy as np
 from scipy import ndimage
 
-from common.geometry.occupancy_grid import CACHED_MAPS, OCCUPIED, OccupancyGrid
+from common.geometry.occupancy_grid import MAX_CACHED_GRIDS, OCCUPIED, OccupancyGrid
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -58,7 +58,7 @@ def _cast_rays(
     return ranges, jacobian
 
 
-@functools.lru_cache(CACHED_MAPS)
+@functools.lru_cache(MAX_CACHED_GRIDS)
 def _cells_of(grid: OccupancyGrid | None) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.uint8], Array]:
     """Occupied cells (rows, columns), `clear_radius` of each cell, and frame (4,).
 

@@ -132,7 +132,7 @@ class World(WorldPart):
     @functools.cached_property
     def segments(self) -> Array:
         """(S, 4) x0, y0, x1, y1 in m of all straight edges of walls and obstacles."""
-        return self.outlines if self.grid is None else np.concatenate([self.grid.shapes.walls, self.outlines])
+        return self.outlines if self.grid is None else np.concatenate([self.grid.geometry.walls, self.outlines])
 
     @functools.cached_property
     def outlines(self) -> Array:
@@ -162,7 +162,7 @@ class World(WorldPart):
     def free_space(self) -> shapely.Geometry:
         """The free area."""
         if self.grid is not None:
-            room = self.grid.shapes.free_space
+            room = self.grid.geometry.free_space
         elif self.floors:
             room = shapely.union_all([shapely.Polygon(ring) for ring in self.wall_rings])
         else:
@@ -199,14 +199,14 @@ class World(WorldPart):
         points = np.asarray(points, float).reshape(-1, 2)
         if self.grid is None:
             return self._free_area.signed_distance(points)
-        return self._limit_by_obstacles(points, 0.0 - self.grid.shapes.distance(FREE, points))
+        return self._limit_by_obstacles(points, 0.0 - self.grid.geometry.distance(FREE, points))
 
     def surface_distance(self, points: npt.ArrayLike) -> Array:
         """(N,) distances in m from points (N, 2) to the nearest surface, negative behind; unknown cells have none."""
         points = np.asarray(points, float).reshape(-1, 2)
         if self.grid is None:
             return self._free_area.signed_distance(points)
-        return self._limit_by_obstacles(points, self.grid.shapes.distance(OCCUPIED, points))
+        return self._limit_by_obstacles(points, self.grid.geometry.distance(OCCUPIED, points))
 
     def has_room(self, place: Array, radius: float) -> bool:
         """Whether a robot of ``radius`` m can stand at a point (2,) or pose (3,)."""
@@ -226,7 +226,7 @@ class World(WorldPart):
         nodes = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
         if self.grid is None:
             return self.clearance(nodes).reshape(len(y), len(x))
-        clearance = 0.0 - self.grid.shapes.lattice_distances(FREE, x, y)  # subtracted, to avoid -0.0
+        clearance = 0.0 - self.grid.geometry.lattice_distances(FREE, x, y)  # subtracted, to avoid -0.0
         return self._limit_by_obstacles(nodes, clearance.ravel()).reshape(len(y), len(x))
 
     def surface_distances(self, x: Array, y: Array, max_distance: float) -> Array:
@@ -237,7 +237,7 @@ class World(WorldPart):
         """
         if self.grid is not None:
             nodes = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-            distance = self.grid.shapes.lattice_distances(OCCUPIED, x, y, max_distance).ravel()
+            distance = self.grid.geometry.lattice_distances(OCCUPIED, x, y, max_distance).ravel()
             distance = self._limit_by_obstacles(nodes, distance)
             return np.clip(distance, -max_distance, max_distance).reshape(len(y), len(x))
         columns = [self._free_area.signed_distance(np.column_stack([np.full(len(y), x_k), y])) for x_k in x]
@@ -271,13 +271,13 @@ class World(WorldPart):
     def _sample_cells(self, count: int, rng: np.random.Generator, clearance: float) -> Array:
         """`sample_free` on a grid: samples points in cells that may have the clearance, and keeps those that do."""
         assert self.grid is not None  # noqa: S101 - for the type checker
-        shapes = self.grid.shapes
+        geometry = self.grid.geometry
         # The resolution is more than half a cell's diagonal, so that all cells with suitable points are included.
-        cells = shapes.cells_with_clearance(clearance - self.grid.resolution)
+        cells = geometry.cells_with_clearance(clearance - self.grid.resolution)
         found, attempts_left = [np.zeros((0, 2))], MAX_SAMPLING_ATTEMPTS
         while attempts_left and len(cells) and sum(map(len, found)) < count:
             chosen = rng.integers(len(cells), size=max(count, 256))
-            points = shapes.points_in_cells(cells[chosen], rng.random((len(chosen), 2)))
+            points = geometry.points_in_cells(cells[chosen], rng.random((len(chosen), 2)))
             found.append(points[self.clearance(points) >= clearance])
             attempts_left = attempts_left if len(found[-1]) else attempts_left - 1
         if sum(map(len, found)) < count:
@@ -298,8 +298,8 @@ class World(WorldPart):
         x0, y0, x1, y1 = self.floors[0].bounds if self.floors else self.bounds
         centre = np.array([(x0 + x1) / 2, (y0 + y1) / 2])
         if self.grid is not None:
-            shapes = self.grid.shapes
-            places = shapes.points_in_cells(shapes.cells_with_clearance(clearance), 0.5)
+            geometry = self.grid.geometry
+            places = geometry.points_in_cells(geometry.cells_with_clearance(clearance), 0.5)
             places = places[self._limit_by_obstacles(places, np.full(len(places), np.inf)) >= clearance]
             if not len(places):
                 raise self._no_room(clearance)

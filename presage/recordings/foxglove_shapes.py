@@ -217,7 +217,7 @@ def world_entities(world: World, ns: int) -> list[SceneEntity]:
     for wall in world.wall_rings:
         walls.cubes.extend(_slabs(np.array(wall), WALL, outside=True))
     if world.grid is not None:  # a ROS map has thousands of walls, so only their top edges are drawn
-        edges = line(world.grid.shapes.walls.reshape(-1, 2), WALL, z=WALL_HEIGHT)
+        edges = line(world.grid.geometry.walls.reshape(-1, 2), WALL, z=WALL_HEIGHT)
         edges.type = LinePrimitive.LINE_LIST
         walls.lines.append(edges)
     found = [walls]

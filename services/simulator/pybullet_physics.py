@@ -56,7 +56,7 @@ class PybulletPhysics:
             for ring in world.wall_rings:
                 self._body(self._shape(np.array(ring)))
         else:
-            self._add_walls(world.grid.shapes.walls)
+            self._add_walls(world.grid.geometry.walls)
         self.place(pose)
 
     def close(self) -> None:

@@ -26,7 +26,7 @@ def hall():
 def test_particle_filter_tables(hall):
     field = SurfaceDistances(hall)
     places = hall.sample_free(300, np.random.default_rng(0), 0.1)
-    exact = hall.grid.shapes.distance(OCCUPIED, places)
+    exact = hall.grid.geometry.distance(OCCUPIED, places)
     assert np.abs(field(places[:, 0], places[:, 1]) - np.minimum(exact, 2.0)).max() < 0.03  # half a cell, at corners
     table, angles = RangeTable(hall), np.arange(0, 360, 10) * np.pi / 180
     cell = np.floor(places[:20] / 0.05)

@@ -35,7 +35,7 @@ def test_a_figure_shows_each_cell_where_it_is(origin):
     canvas.draw()
     pixels = np.asarray(canvas.buffer_rgba())
     row, column = np.indices(VALUES.shape).reshape(2, -1)
-    places = world.grid.shapes.points_in_cells(np.column_stack([column, row]), 0.5)
+    places = world.grid.geometry.points_in_cells(np.column_stack([column, row]), 0.5)
     x, y = np.round(axes.transData.transform(places)).astype(int).T
     shown = pixels[len(pixels) - 1 - y, x, 0]
     assert shown.tolist() == [{FREE: 255, OCCUPIED: 0, UNKNOWN: 0xE4}[value] for value in VALUES.ravel()]
@@ -56,7 +56,7 @@ def test_map_in_foxglove():
     assert set(data[clear & (kinds == UNKNOWN)]) == {255}
     assert set(data[(from_crate < 0.29) | (kinds == OCCUPIED)]) == {100}
     walls, crate = world_entities(world, 0)
-    assert len(walls.lines[0].points) == 2 * len(world.grid.shapes.walls)
+    assert len(walls.lines[0].points) == 2 * len(world.grid.geometry.walls)
     assert crate.id == "obstacle 0"
 
 

@@ -111,7 +111,7 @@ def test_map_stops_the_robot(make, rooms_map):
 def test_occupied_map_cells(make, rooms_map, kind):
     simulation = make(rooms_map)
     row, column = np.argwhere(rooms_map.grid.values == kind)[7]
-    place = np.array([*rooms_map.grid.shapes.points_in_cells(np.array([[column, row]]), 0.5)[0], 0.0])
+    place = np.array([*rooms_map.grid.geometry.points_in_cells(np.array([[column, row]]), 0.5)[0], 0.0])
     with pytest.raises(UserError, match="inside a wall or outside"):
         simulation.teleport(place)
     with pytest.raises(UserError, match="inside a wall or outside"):

@@ -154,7 +154,7 @@ def test_cells_of_a_ros_map(look):
     for kind, colour in colours.items():
         inner = signed_distance(MAPPED.grid.values != kind, np.arange(260) + 0.5, np.arange(260) + 0.5)
         for row, column in np.argwhere(inner > 1)[[20, 200, -200, -20]]:  # deep enough that no edge is blended in
-            x, y = MAPPED.grid.shapes.points_in_cells(np.array([[column, row]]), 0.5)[0].tolist()
+            x, y = MAPPED.grid.geometry.points_in_cells(np.array([[column, row]]), 0.5)[0].tolist()
             at = seen.see("view.camera.toScreen(...arg)", [x, y])
             if kind == OCCUPIED:
                 near = f"'{colour}'.split(',').every((value, i) => Math.abs(value - {PIXEL}.split(',')[i]) < 3)"

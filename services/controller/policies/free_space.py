@@ -112,7 +112,7 @@ class FreeSpace:
         grid = Grid(cells.origin[:2], factor * cells.resolution, shape)
         known = (values != UNKNOWN).reshape(shape[0], factor, shape[1], factor).any(axis=(1, 3))
         centres = grid.centres().reshape(*shape, 2)
-        clearance = cells.shapes.lattice_distances(OCCUPIED, centres[0, :, 0], centres[:, 0, 1], MAX_CLEARANCE_M)
+        clearance = cells.geometry.lattice_distances(OCCUPIED, centres[0, :, 0], centres[:, 0, 1], MAX_CLEARANCE_M)
         return cls(grid, clearance, ~known)
 
     def place_text(self, place: Array, decimals: int = 2) -> str:

@@ -125,7 +125,7 @@ def test_nearest_reachable_place():
 def test_goals_off_the_map():
     world = World(name="rooms", grid=OccupancyGrid.of(rooms(200), 0.05, (-10.0, -10.0, 0.0)))
     row, column = np.argwhere(world.grid.values == UNKNOWN)[0]
-    unknown = world.grid.shapes.points_in_cells(np.array([[column, row]]), 0.5)[0]
+    unknown = world.grid.geometry.points_in_cells(np.array([[column, row]]), 0.5)[0]
     policies = GeodesicPolicy(Robot(), world), StraightLinePolicy(Robot(), None, world)
     for place in (unknown, np.array([50.0, 50.0])):
         assert all("is inside something, or off the map" in policy.refusal(place) for policy in policies)
