@@ -23,9 +23,10 @@ if TYPE_CHECKING:
     from common.geometry.world import World
 
 GAP_M = 2.0  # between floors; their walls stop all beams
-GRID_GAP_M = 30.0  # between ROS maps, which beams may leave through unknown cells; longer than a beam
+# Between ROS maps: more than the range of a scanner, because beams may leave a map through unknown cells.
+GRID_GAP_M = 30.0
 
-EXAMPLES = {
+EXAMPLES = {  # by key, for error messages
     "floors": "floors: {ground: ground.yaml, first: first.yaml}",
     "lifts": "lifts: [{ground: [9, 1], first: [1, 1]}]",
     "start": "start: {floor: ground, x: 1.5, y: 1.5}",
@@ -52,7 +53,10 @@ class BuildingFile(WorldPart):
 
 
 def is_building(data: object) -> bool:
-    """Whether the contents of a YAML file are a building, or meant to be one, and not a saved world with floors."""
+    """Whether the contents of a YAML file are those of a building, valid or not.
+
+    A saved world with floors is not one; its floors have offsets.
+    """
     if not isinstance(data, dict) or "floors" not in data:
         return False
     floors = data["floors"]
@@ -60,7 +64,7 @@ def is_building(data: object) -> bool:
 
 
 def read_building(data: dict[str, Any]) -> BuildingFile:
-    """The building in the contents of a YAML file; raises UserError if they are invalid."""
+    """Validates the contents of a building's YAML file; raises UserError if they are invalid."""
     try:
         return BuildingFile.model_validate(data)
     except ValidationError as error:
@@ -74,18 +78,18 @@ def read_building(data: dict[str, Any]) -> BuildingFile:
 
 
 def lay_out(building: BuildingFile, worlds: Mapping[str, World]) -> dict[str, Any]:
-    """Fields of the World for a building, whose floors are ``worlds``; raises UserError if they do not go together."""
+    """Fields of the World for a building, whose floors are ``worlds``; raises UserError if they cannot be combined."""
     first = next(iter(worlds.values()))
     for name, world in worlds.items():
         if world.floors:
             raise UserError(f"floor {name!r} is itself a building")
         if (world.grid is None) != (first.grid is None):
-            raise UserError(f"floor {name!r}: floors are either all ROS maps, or none is")
+            raise UserError(f"floor {name!r}: either all floors must be ROS maps, or none")
     fields: dict[str, Any] = {}
     if first.grid is None:
-        offsets = _side_by_side(worlds)
+        offsets = _polygon_offsets(worlds)
     else:
-        fields["grid"], offsets = _paste({name: world.grid for name, world in worlds.items() if world.grid})
+        fields["grid"], offsets = _combine_grids({name: world.grid for name, world in worlds.items() if world.grid})
     floors = {
         name: Floor(name=name, offset=offsets[name], boundary=moved(world.boundary, offsets[name]).tolist())
         for name, world in worlds.items()
@@ -94,25 +98,33 @@ def lay_out(building: BuildingFile, worlds: Mapping[str, World]) -> dict[str, An
     if start is None and first.start is not None:
         start = FloorStart(floor=next(iter(worlds)), **first.start.model_dump())
     if start is not None:
-        floor, place = floors.get(start.floor), (start.x, start.y)
-        error = no_floor(start.floor, worlds) if floor is None else floor.placement_error(place)
-        if floor is None or error is not None:
-            raise UserError(f"start: {error}")
-        x, y = floor.to_map(place).tolist()
-        fields["start"] = {"x": x, "y": y, "yaw_deg": start.yaw_deg}
+        fields["start"] = _start_in_map(start, floors)
     return {
         "name": building.name,
         **fields,
         "obstacles": [
-            _obstacle(obstacle, name, offsets[name]) for name, world in worlds.items() for obstacle in world.obstacles
+            _obstacle_in_map(obstacle, name, offsets[name])
+            for name, world in worlds.items()
+            for obstacle in world.obstacles
         ],
         "floors": list(floors.values()),
         "lifts": building.lifts,
     }
 
 
-def _side_by_side(worlds: Mapping[str, World]) -> dict[str, tuple[float, float]]:
-    """Offsets in m by name of floors with walls."""
+def _start_in_map(start: FloorStart, floors: Mapping[str, Floor]) -> dict[str, float]:
+    """Fields of the World's start."""
+    if start.floor not in floors:
+        raise UserError(f"start: {no_floor(start.floor, floors)}")
+    floor = floors[start.floor]
+    if (error := floor.placement_error((start.x, start.y))) is not None:
+        raise UserError(f"start: {error}")
+    x, y = floor.to_map((start.x, start.y)).tolist()
+    return {"x": x, "y": y, "yaw_deg": start.yaw_deg}
+
+
+def _polygon_offsets(worlds: Mapping[str, World]) -> dict[str, tuple[float, float]]:
+    """Offsets in m, by name, that put floors without ROS maps side by side."""
     offsets: dict[str, tuple[float, float]] = {}
     right = 0.0  # m, the right edge of the previous floor
     for name, world in worlds.items():
@@ -122,37 +134,38 @@ def _side_by_side(worlds: Mapping[str, World]) -> dict[str, tuple[float, float]]
     return offsets
 
 
-def _paste(grids: Mapping[str, OccupancyGrid]) -> tuple[OccupancyGrid, dict[str, tuple[float, float]]]:
+def _combine_grids(grids: Mapping[str, OccupancyGrid]) -> tuple[OccupancyGrid, dict[str, tuple[float, float]]]:
     """One grid with the cells of all floors and unknown cells between them, and the floors' offsets in m by name."""
     first = next(iter(grids.values()))
     size = first.resolution
     for name, grid in grids.items():
         if not np.isclose(grid.resolution, size, rtol=1e-6, atol=0):
             raise UserError(
-                f"floor {name!r}: the resolution is {grid.resolution:g} m, that of floor {next(iter(grids))!r} "
-                f"{size:g} m; they must be equal"
+                f"floor {name!r}: its resolution of {grid.resolution:g} m differs from the {size:g} m of floor "
+                f"{next(iter(grids))!r}; all floors must have the same one"
             )
         if grid.origin[2]:
             raise UserError(f"floor {name!r}: its map is rotated; the yaw must be 0")
     gap = round(GRID_GAP_M / size)
-    columns = np.cumsum([0, *(grid.width + gap for grid in grids.values())])  # in which the floors begin
+    ends = np.cumsum([grid.width + gap for grid in grids.values()]).tolist()
+    width = ends[-1] - gap
+    columns = [0, *ends[:-1]]  # first column of each floor
     rows = [round((grid.origin[1] - first.origin[1]) / size) for grid in grids.values()]
     low = min(rows)
     height = max(row + grid.height for row, grid in zip(rows, grids.values(), strict=True)) - low
-    width = int(columns[-1]) - gap
     if width * height > MAX_CELLS:
         raise UserError(f"the floors side by side are {width} x {height} cells, which is more than {MAX_CELLS}")
     values = np.full((height, width), UNKNOWN, np.uint8)
     x, y = first.origin[:2]
     offsets = {}
-    for (name, grid), column, row in zip(grids.items(), columns.tolist(), rows, strict=False):
+    for (name, grid), column, row in zip(grids.items(), columns, rows, strict=True):
         values[row - low : row - low + grid.height, column : column + grid.width] = grid.values
         offsets[name] = (x + column * size - grid.origin[0], y + row * size - grid.origin[1])
     return OccupancyGrid.of(values, size, (x, y + low * size, 0.0)), offsets
 
 
-def _obstacle(obstacle: Obstacle, floor: str, offset: tuple[float, float]) -> dict[str, Any]:
-    """Fields of an obstacle of a floor, in map; its name begins with that of the floor."""
+def _obstacle_in_map(obstacle: Obstacle, floor: str, offset: tuple[float, float]) -> dict[str, Any]:
+    """Fields of a floor's obstacle, moved to map and with the floor's name before its own."""
     fields = obstacle.model_dump(exclude_none=True)
     if obstacle.polygon is not None:
         fields["polygon"] = moved(obstacle.polygon, offset).tolist()

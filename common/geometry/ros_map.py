@@ -1,7 +1,7 @@
 """Reads a ROS map (map.yaml and its image) by the rules of nav2's map_server.
 
-A darker pixel is more likely to be occupied; the mode defines how it is interpreted. In some modes map_server publishes
-percentages between free and occupied; `cells` describes how they become free, occupied or unknown cells here.
+A darker pixel is more likely to be occupied; the key `mode` defines how much. In some modes map_server publishes
+percentages between free and occupied; `classify_pixels` turns them into free, occupied and unknown cells.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
 
 MAP_SAVER_GREYS = (0, 205, 254)  # of map_saver's trinary images: occupied, unknown, free
-IMAGES = {".pgm", ".png", ".bmp"}
+IMAGE_SUFFIXES = {".pgm", ".png", ".bmp"}
 WORLD_KEYS = ("name", "start", "obstacles")  # presage's additional keys, as in world files; map_server ignores them
 
-Share = Annotated[float, Field(ge=0, le=1)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 class MapFile(BaseModel):
-    """The keys of map.yaml, with map_saver's defaults; others are ignored, as by map_server."""
+    """The keys of map.yaml, with map_saver's defaults; unknown keys are ignored, as by map_server."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
@@ -39,29 +39,29 @@ class MapFile(BaseModel):
     resolution: Annotated[float, Field(gt=0, le=1e3)]  # m, edge length of a pixel
     origin: tuple[Coordinate, Coordinate, Angle]  # x m, y m, yaw rad of the lower left pixel's lower left corner
     negate: bool = False  # white is occupied
-    occupied_thresh: Share = 0.65  # darker pixels are occupied
-    free_thresh: Share = 0.25  # lighter pixels are free
+    occupied_thresh: Fraction = 0.65  # darker pixels are occupied
+    free_thresh: Fraction = 0.25  # lighter pixels are free
     mode: Literal["trinary", "scale", "raw"] = "trinary"
 
     @field_validator("mode", mode="before")
     @classmethod
-    def _any_case(cls, value: object) -> object:
+    def _lower_case_mode(cls, value: object) -> object:
         return value.lower() if isinstance(value, str) else value
 
     @field_validator("negate", mode="before")
     @classmethod
-    def _number(cls, value: object) -> object:
+    def _negate_as_bool(cls, value: object) -> object:
         return value != 0 if isinstance(value, int) else value
 
     @model_validator(mode="after")
-    def _in_order(self) -> MapFile:
+    def _check_thresholds(self) -> MapFile:
         if self.free_thresh >= self.occupied_thresh:
             raise ValueError(f"free_thresh {self.free_thresh:g} must be below occupied_thresh {self.occupied_thresh:g}")
         return self
 
 
 def is_map(data: object) -> bool:
-    """Whether the contents of a YAML file are a ROS map and not a world."""
+    """Whether the contents of a YAML file are those of a ROS map, not of a world."""
     return isinstance(data, dict) and bool({"image", "resolution"} & data.keys()) and "boundary" not in data
 
 
@@ -76,30 +76,29 @@ def read_map(path: Path, data: dict[str, Any]) -> dict[str, Any]:
         raise UserError(f"map {path}: {first_fault(error)}") from None
     image = path.parent / map_file.image
     colours, alpha = _pixels(image)
-    grid = OccupancyGrid.of(cells(map_file, colours, alpha)[::-1], map_file.resolution, map_file.origin)
+    grid = OccupancyGrid.of(classify_pixels(map_file, colours, alpha)[::-1], map_file.resolution, map_file.origin)
     return {**{key: data[key] for key in WORLD_KEYS if key in data}, "grid": grid}
 
 
-def cells(map_file: MapFile, colours: Array, alpha: Array | None) -> Cells:
+def classify_pixels(map_file: MapFile, colours: Array, alpha: Array | None) -> Cells:
     """(H, W) cells FREE, OCCUPIED or UNKNOWN, with rows as in the image.
 
-    ``colours`` (H, W, C) and ``alpha`` (H, W) are from 0 to 1. Percentages of map_server are interpreted as follows: in
-    mode scale, 0 is free, 100 is occupied and everything between is unknown, as in AMCL; in mode raw, the thresholds
-    are used.
+    ``colours`` (H, W, C) and ``alpha`` (H, W) are from 0 to 1. In mode raw, the thresholds are applied to map_server's
+    percentages. In the other modes, 0 is free, 100 is occupied and everything between is unknown, as in AMCL.
     """
     percent = percentages(map_file, colours, alpha)
     low, high = (100 * map_file.free_thresh, 100 * map_file.occupied_thresh) if map_file.mode == "raw" else (1, 99)
-    found = np.where(percent > high, OCCUPIED, np.where((percent >= 0) & (percent < low), FREE, UNKNOWN))
+    cells = np.where(percent > high, OCCUPIED, np.where((percent >= 0) & (percent < low), FREE, UNKNOWN))
     if map_file.mode == "trinary" and not map_file.negate and alpha is None:
         # Until 2025 map_saver wrote free_thresh 0.25, with which its own grey for unknown, 205, would be free.
         grey = np.rint(colours.mean(axis=-1) * 255)
         if np.isin(grey, MAP_SAVER_GREYS).all():
-            found[grey == MAP_SAVER_GREYS[1]] = UNKNOWN
-    return found.astype(np.uint8)
+            cells[grey == MAP_SAVER_GREYS[1]] = UNKNOWN
+    return cells.astype(np.uint8)
 
 
 def percentages(map_file: MapFile, colours: Array, alpha: Array | None) -> npt.NDArray[np.int_]:
-    """(H, W) occupancy as map_server publishes it: 0 to 100, or -1 for unknown. Arguments as of `cells`."""
+    """(H, W) occupancy as map_server publishes it: 0 to 100, or -1 for unknown; arguments as of `classify_pixels`."""
     if map_file.mode == "trinary" and alpha is not None:
         colours = np.concatenate([colours, alpha[..., None]], axis=-1)  # map_server averages alpha like a colour
     shade = colours.mean(axis=-1)
@@ -123,7 +122,7 @@ def _pixels(path: Path) -> tuple[Array, Array | None]:
     except ImportError:
         raise UserError(f"map image {path}: reading it needs the package Pillow: pip install pillow") from None
     if path.exists() and not path.is_file():  # opening a pipe would block
-        raise UserError(f"map image {path}: not a file but a folder, a pipe or a device")
+        raise UserError(f"map image {path}: a folder, pipe or device, not a file")
     try:
         with Image.open(path) as image:
             if image.width * image.height > MAX_CELLS:
@@ -134,7 +133,7 @@ def _pixels(path: Path) -> tuple[Array, Array | None]:
             return _normalised(image)
     except FileNotFoundError:
         raise UserError(
-            f"map image {path}: no such file (the path image: in map.yaml is relative to its folder)"
+            f"map image {path}: no such file (the key image is a path relative to the folder of map.yaml)"
         ) from None
     except UnidentifiedImageError:
         raise UserError(f"map image {path}: not an image; use PGM, PNG or BMP") from None
@@ -143,10 +142,10 @@ def _pixels(path: Path) -> tuple[Array, Array | None]:
 
 
 def _normalised(image: Image) -> tuple[Array, Array | None]:
-    """Colours and alpha as of `_pixels`, for an image of any pixel type."""
+    """Colours and alpha of an image of any pixel type, as `_pixels` returns them."""
     if image.mode.startswith(("I", "F")):  # 16 bits per pixel
         return np.asarray(image, float)[..., None] / 65535, None
-    wanted = "RGBA" if image.has_transparency_data else "RGB"
-    values = np.asarray(image if image.mode in {"L", wanted} else image.convert(wanted), np.uint8)
-    values = values.reshape(*values.shape[:2], -1)
+    mode = "RGBA" if image.has_transparency_data else "RGB"
+    values = np.asarray(image if image.mode in {"L", mode} else image.convert(mode), np.uint8)
+    values = values.reshape(*values.shape[:2], -1)  # also one grey channel gets an axis
     return values[..., :3] / 255, values[..., 3] / 255 if values.shape[2] == 4 else None

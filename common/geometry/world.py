@@ -372,7 +372,7 @@ def _load(name: str, folder: Path, *, is_floor: bool = False) -> World:
     except (FileNotFoundError, NotADirectoryError):
         raise UserError(f"no world {str(path)!r}: give a file or one of {', '.join(known_worlds())}") from None
     except UnicodeDecodeError:
-        image = path.suffix.lower() in ros_map.IMAGES
+        image = path.suffix.lower() in ros_map.IMAGE_SUFFIXES
         hint = (
             f"an image: give the map.yaml that names it, such as {path.with_suffix('.yaml')}" if image else "not text"
         )

@@ -136,10 +136,10 @@ def test_ros_maps_and_shipped_worlds_as_floors(tmp_path):
         ({"floors": {"ground": "nowhere.yaml"}}, "floor 'ground': no world"),
         ({"floors": {"ground": "ground.yaml", "all": "tower.yaml"}}, "floor 'all': a floor cannot be a building"),
         ({"floors": {"ground": "ground.yaml", "b": "saved.yaml"}}, "floor 'b' is itself a building"),
-        ({"floors": {"ground": "ground.yaml", "b": "map.yaml"}}, "floor 'b': floors are either all ROS maps"),
+        ({"floors": {"ground": "ground.yaml", "b": "map.yaml"}}, "floor 'b': either all floors must be ROS maps"),
         (
             {"floors": {"a": "map.yaml", "b": "fine.yaml"}},
-            "floor 'b': the resolution is 0.1 m, that of floor 'a' 0.5 m",
+            "floor 'b': its resolution of 0.1 m differs from the 0.5 m of floor 'a'",
         ),
         ({"floors": {"a": "map.yaml", "b": "turned.yaml"}}, "floor 'b': its map is rotated"),
         ({"floors": {}}, "floors: too few entries: at least 1 are needed, not 0; an example is floors: {ground: "),

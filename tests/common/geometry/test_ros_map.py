@@ -114,7 +114,7 @@ def test_keys_of_map_yaml(tmp_path):
         ({"image": "map.yaml"}, "not an image"),
         ({"image": "cut.png"}, "cut.png: cannot be read"),
         ({"image": "huge.png"}, "5000 x 4000 pixels are more than 16000000"),
-        ({"image": "pipe.pgm"}, r"map image .*pipe.pgm: not a file but a folder, a pipe or a device"),
+        ({"image": "pipe.pgm"}, r"map image .*pipe.pgm: a folder, pipe or device, not a file"),
         ({}, "image: missing"),
         ({"image": "map.pgm", "mode": "quaternary"}, "mode: .*'trinary', 'scale' or 'raw'"),
         ({"image": "map.pgm", "origin": [0, float("nan"), 0]}, "origin, entry 2: .*finite"),
