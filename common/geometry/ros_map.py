@@ -6,6 +6,7 @@ percentages between free and occupied; `classify_pixels` turns them into free, o
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -124,21 +125,28 @@ def _pixels(path: Path) -> tuple[Array, Array | None]:
     if path.exists() and not path.is_file():  # opening a pipe would block
         raise UserError(f"map image {path}: a folder, pipe or device, not a file")
     try:
-        with Image.open(path) as image:
-            if image.width * image.height > MAX_CELLS:
-                raise UserError(
-                    f"map image {path}: {image.width} x {image.height} pixels are more than {MAX_CELLS}; "
-                    "crop it, or scale it down and make the resolution coarser"
-                )
-            return _normalised(image)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            with Image.open(path) as image:
+                if image.width * image.height > MAX_CELLS:
+                    raise _too_large(path)
+                return _normalised(image)
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning):  # for much larger images
+        raise _too_large(path) from None
     except FileNotFoundError:
         raise UserError(
             f"map image {path}: no such file (the key image is a path relative to the folder of map.yaml)"
         ) from None
     except UnidentifiedImageError:
         raise UserError(f"map image {path}: not an image; use PGM, PNG or BMP") from None
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, Warning) as error:
+    except (OSError, ValueError, SyntaxError) as error:
         raise UserError(f"map image {path}: cannot be read ({' '.join(str(error).split())})") from None
+
+
+def _too_large(path: Path) -> UserError:
+    return UserError(
+        f"map image {path}: more than {MAX_CELLS} pixels; crop it, or scale it down and make the resolution coarser"
+    )
 
 
 def _normalised(image: Image) -> tuple[Array, Array | None]:
