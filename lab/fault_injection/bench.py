@@ -16,7 +16,7 @@ from rich.console import Console
 from common.errors import UserError
 from common.versions import commit, versions
 from lab.fault_injection.faults import FAULTS, Fault
-from lab.fault_injection.hosts import NAMESPACE_VARIABLE, Network, enter_own_namespaces, missing_for_namespaces
+from lab.fault_injection.hosts import Network, enter_own_namespaces, namespaces_unavailable_reason
 from lab.fault_injection.measure import MAX_RECOVERY_TIME_S, MAX_STOP_TIME_S, FaultOutcome, measure
 from lab.fault_injection.system import System
 from presage.terminal.output import check_file, write_json
@@ -45,21 +45,21 @@ def bench_chaos(
     """
     faults = select_faults(names)
     check_file(json_file, "--json")
-    missing = "--one-host was given" if one_host else missing_for_namespaces()
-    if not missing and not os.environ.get(NAMESPACE_VARIABLE):
+    one_host_reason = "--one-host was given" if one_host else namespaces_unavailable_reason()
+    if not one_host_reason:
         enter_own_namespaces(["-m", "presage", *sys.argv[1:]])
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PRESAGE_")}
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="presage-chaos-")))
-        network = None if missing else stack.enter_context(Network())
+        network = None if one_host_reason else stack.enter_context(Network())
         with console.status("starting the system"):
             system = stack.enter_context(System(folder, network, environment, quiet=quiet))
-        outcomes, skipped = _inject(faults, repeats, system, missing, console)
+        outcomes, skipped = _inject(faults, repeats, system, one_host_reason, console)
     print(faults_table(outcomes))
     data = {
         "command": "presage bench chaos",
         "arguments": {"faults": list(names), "repeats": repeats},
-        "hosts": not missing,
+        "hosts": not one_host_reason,
         "rows": [outcome.row() for outcome in outcomes],
         "skipped": skipped,
         "limits": {"stopped_s": MAX_STOP_TIME_S, "again_s": MAX_RECOVERY_TIME_S},
@@ -72,16 +72,18 @@ def bench_chaos(
 
 
 def _inject(
-    faults: Sequence[Fault], repeats: int, system: System, missing: str, console: Console
+    faults: Sequence[Fault], repeats: int, system: System, one_host_reason: str, console: Console
 ) -> tuple[list[FaultOutcome], dict[str, str]]:
     """Injects all faults that are possible here; returns the outcomes, and by name why others were skipped.
 
-    ``missing`` says why there are no several hosts; empty if there are.
+    ``one_host_reason`` states why all services run on one host; it is empty if they run on several.
     """
     outcomes: list[FaultOutcome] = []
     skipped: dict[str, str] = {}
     for fault in faults:
-        reason = f"needs several hosts: {missing}" if fault.needs_hosts and missing else fault.unavailable_reason()
+        reason = fault.unavailable_reason()
+        if fault.needs_hosts and one_host_reason:
+            reason = f"needs several hosts: {one_host_reason}"
         if reason:
             skipped[fault.name] = reason
             console.print(f"[yellow]not tried[/] {fault.name}: {reason}", highlight=False)

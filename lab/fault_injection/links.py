@@ -18,10 +18,9 @@ from rich.table import Table
 from common.errors import UserError
 from common.versions import commit, versions
 from lab.fault_injection.hosts import (
-    NAMESPACE_VARIABLE,
     Network,
     enter_own_namespaces,
-    missing_for_namespaces,
+    namespaces_unavailable_reason,
     port_of,
     run,
 )
@@ -39,10 +38,9 @@ def bench_hosts(seconds: float, beams: int, json_file: Path | None, console: Con
     Raises UserError if this machine permits no network namespaces.
     """
     check_file(json_file, "--json")
-    if missing := missing_for_namespaces():
-        raise UserError(f"several hosts on one machine need network namespaces: {missing}")
-    if not os.environ.get(NAMESPACE_VARIABLE):
-        enter_own_namespaces(["-m", "presage", *sys.argv[1:]])
+    if reason := namespaces_unavailable_reason():
+        raise UserError(f"several hosts on one machine need network namespaces: {reason}")
+    enter_own_namespaces(["-m", "presage", *sys.argv[1:]])
     clean = {name: value for name, value in os.environ.items() if not name.startswith("PRESAGE_")}
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="presage-hosts-")))

@@ -66,7 +66,7 @@ class System(Stack):
     @property
     def endpoint(self) -> str:
         """The router's endpoint, as seen from all hosts."""
-        return f"tcp/{'127.0.0.1' if self.network is None else self.network.here}:{self.port}"
+        return f"tcp/{'127.0.0.1' if self.network is None else self.network.own_address}:{self.port}"
 
     def router_endpoints(self) -> str:
         """Endpoints on which the router listens: loopback, and the address for the other hosts."""
@@ -74,15 +74,16 @@ class System(Stack):
 
     def command(self, name: str, args: list[str]) -> list[str]:
         """The command line that starts a process on its host."""
-        entering = [] if self.network is None or name not in HOST_OF else self.network.hosts[HOST_OF[name]].entering
-        return [*entering, sys.executable, *args]
+        if self.network is None or name not in HOST_OF:
+            return [sys.executable, *args]
+        return [*self.network.hosts[HOST_OF[name]].command_prefix, sys.executable, *args]
 
     def child_environment(self, name: str) -> Mapping[str, str]:
         """Environment variables of a process; with several hosts it listens on its host's address."""
         more = {"PRESAGE_INSECURE": "1", "PRESAGE_LOG_JSON": "true", **self.extra.get(name, {})}
         if self.network is None or name == "router":
             return more
-        host = self.network.hosts[HOST_OF[name]].address if name in HOST_OF else self.network.here
+        host = self.network.hosts[HOST_OF[name]].address if name in HOST_OF else self.network.own_address
         return {"PRESAGE_LISTEN": f"tcp/{host}:0", **more}
 
     def __enter__(self) -> Self:

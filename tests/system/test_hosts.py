@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from lab.fault_injection.hosts import missing_for_namespaces
+from lab.fault_injection.hosts import namespaces_unavailable_reason
 from services.recorder.reader import read_recording
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_documented_hosts(process, tmp_path):
-    if why := missing_for_namespaces():
+    if why := namespaces_unavailable_reason():
         print(f"\n==== NO NETWORK NAMESPACES HERE ({why}): several hosts were NOT tested ====", file=sys.__stderr__)
         pytest.skip(f"several hosts were NOT tested: {why}")
     script = ROOT / "tests" / "system" / "three_hosts.py"

@@ -30,9 +30,9 @@ def main(page: Path, folder: Path) -> int:
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PRESAGE_")} | {"PATH": path}
     with Network() as network:
-        entering = [[], network.add("robot").entering, network.add("brain").entering]
+        prefixes = [[], network.add("robot").command_prefix, network.add("brain").command_prefix]
         try:
-            for prefix, block in zip(entering, shell_blocks(page.read_text()), strict=True):
+            for prefix, block in zip(prefixes, shell_blocks(page.read_text()), strict=True):
                 # `wait` keeps the shell alive until it gets SIGTERM.
                 script = "trap 'kill $(jobs -p); wait' TERM\n" + block + "\nwait"
                 started.append(
