@@ -11,7 +11,7 @@ from common.messages.requests import Reply
 from common.messages.topics import MAX_BYTES, MAX_REQUEST_BYTES, Query, Topic
 from common.messages.wire import DecodeError
 
-MAX_KEYS = 1000  # number of keys that have their own counters, so that a sender that invents keys cannot fill memory
+MAX_KEYS = 1000  # keys with counters of their own, so that a sender that invents keys cannot fill memory
 OTHERS = "others"  # counter of all further keys
 
 
@@ -39,12 +39,12 @@ class IncomingRequest:
 
 @dataclass(frozen=True)
 class RequestResult:
-    """The result of a request that this process sent: a reply, not yet decoded, or the reason why there is none."""
+    """The result of a request that this process sent: a reply, not yet decoded, or the reason for its absence."""
 
     query: Query
     number: int  # of the request
     payload: bytes
-    refusal: str = ""  # why there is no payload
+    refusal: str = ""  # the reason if there is no reply
     session: str = ""  # the zenoh session that replied, set by `Bus.query_all`
 
     def reply(self) -> Reply:
@@ -71,13 +71,13 @@ class Inbox:
         ``changed`` is notified of each new entry; several inboxes may share it, so that one loop can wait for all.
         """
         self.capacity, self.max_bytes = capacity, max_bytes
-        self.received: Counter[str] = Counter()  # by key
+        self.received: Counter[str] = Counter()  # these three by `counter_name`
         self.dropped: Counter[str] = Counter()
         self.oversized: Counter[str] = Counter()
         self._entries: OrderedDict[object, Sample | IncomingRequest | RequestResult] = OrderedDict()
         self._bytes = 0
         self._serial = 0
-        self._counted: set[str] = set()
+        self._counted_keys: set[str] = set()
         lock = threading.RLock()  # reentrant, because a signal handler may call `wake` while this thread waits
         self._changed = changed or threading.Condition(lock)
         # Lock with this and not with the condition: its __enter__ is Python code, and Ctrl-C inside it would leave the
@@ -90,12 +90,12 @@ class Inbox:
         Entries that are too large or do not fit are dropped and counted; dropped requests are refused.
         """
         size = len(entry.payload)
-        full_key = entry.key if isinstance(entry, Sample) else entry.query.name
+        key = entry.key if isinstance(entry, Sample) else entry.query.name
         with self._lock:
-            key = self.counter_name(full_key)
-            self.received[key] += 1
+            counter = self.counter_name(key)
+            self.received[counter] += 1
             if size > (MAX_BYTES if isinstance(entry, Sample) else MAX_REQUEST_BYTES):
-                self.oversized[key] += 1
+                self.oversized[counter] += 1
                 if isinstance(entry, IncomingRequest):
                     entry.refuse(f"the request of {size} bytes is too large")
                 if not isinstance(entry, RequestResult):
@@ -103,14 +103,14 @@ class Inbox:
                 entry, size = replace(entry, payload=b"", refusal=f"the reply of {size} bytes is too large"), 0
             self._serial += 1
             # One slot for each source, so that a source never replaces the sample of another.
-            slot: object = (full_key, entry.source) if newest_only and isinstance(entry, Sample) else self._serial
-            old = self._entries.get(slot)
+            slot: object = (key, entry.source) if newest_only and isinstance(entry, Sample) else self._serial
+            replaced = self._entries.get(slot)
             full = len(self._entries) >= self.capacity or self._bytes + size > self.max_bytes
-            if old is not None:
-                self._bytes -= len(old.payload)
-                self.dropped[key] += 1
-            elif full and not isinstance(entry, RequestResult):  # there are never more results than requests
-                self.dropped[key] += 1
+            if replaced is not None:
+                self._bytes -= len(replaced.payload)
+                self.dropped[counter] += 1
+            elif full and not isinstance(entry, RequestResult):  # always kept: there are no more results than requests
+                self.dropped[counter] += 1
                 if isinstance(entry, IncomingRequest):
                     entry.refuse("too many requests are waiting")
                 return
@@ -120,24 +120,24 @@ class Inbox:
 
     def counter_name(self, key: str) -> str:
         """Name of the counter of a key: the key itself, or `OTHERS` if there are too many keys."""
-        if key not in self._counted and len(self._counted) >= MAX_KEYS:
+        if key not in self._counted_keys and len(self._counted_keys) >= MAX_KEYS:
             return OTHERS
-        self._counted.add(key)
+        self._counted_keys.add(key)
         return key
 
-    def handled_counts(self) -> tuple[Counter[str], Counter[str], Counter[str]]:
-        """Counts by key at one moment: samples that have left the queue (taken or dropped), dropped, oversized."""
-        with self._lock:
-            taken = self.received.copy()
-            taken.subtract(
-                self.counter_name(entry.key) for entry in self._entries.values() if isinstance(entry, Sample)
-            )
-            return taken, self.dropped.copy(), self.oversized.copy()
-
     def received_counts(self) -> tuple[Counter[str], Counter[str], Counter[str]]:
-        """Counts by key at one moment: received (including waiting entries), dropped, oversized."""
+        """Counts of entries that were received, dropped and oversized, by `counter_name`, all at one moment."""
         with self._lock:
             return self.received.copy(), self.dropped.copy(), self.oversized.copy()
+
+    def handled_counts(self) -> tuple[Counter[str], Counter[str], Counter[str]]:
+        """Like `received_counts`, but samples that still wait in the queue do not count as received."""
+        with self._lock:
+            received, dropped, oversized = self.received_counts()
+            received.subtract(
+                self.counter_name(entry.key) for entry in self._entries.values() if isinstance(entry, Sample)
+            )
+            return received, dropped, oversized
 
     def get(self, timeout: float) -> Sample | IncomingRequest | RequestResult | None:
         """Takes the oldest entry, waiting at most ``timeout`` s for one; returns None if there is none."""

@@ -9,16 +9,16 @@ from common.bus.instances import Instances, describe_instance
 from common.errors import UserError
 from common.log import Logger
 
-LINK_TIMEOUT_S = 0.5  # for the first link of a service, before it looks for other instances
+LINK_TIMEOUT_S = 0.5  # for the first link, before a service looks for other instances
 
 
 class LeaderElection:
-    """Lets this instance become active when no other is, and ends it if an older instance is active too."""
+    """Makes this instance active while no other is, and stand by otherwise."""
 
     def __init__(self, bus: Bus, service: str, log: Logger, wake: Callable[[], None]) -> None:
         """Takes part in the election for ``service``; ``wake`` is called from another thread when instances change."""
         self._bus, self._service, self._log, self._wake = bus, service, log, wake
-        self._others: Instances | None = None
+        self._others: Instances | None = None  # known since the first attempt to become active
         self._end_standby: Callable[[], None] | None = None  # set while this instance stands by
 
     def try_activate(self) -> bool:
@@ -45,11 +45,11 @@ class LeaderElection:
         if self._others is not None:
             self._others.refresh()
 
-    def check(self) -> None:
+    def check_oldest(self) -> None:
         """Raises UserError if an older instance is active too, as after two parts of a network were joined."""
         if self._others is not None and self._others.must_yield():
             older = describe_instance(self._others.leaders()[0])
             raise UserError(
                 f"another {self._service} of {self._bus.robot!r}, {older}, was started before this one and is active, "
-                "so this one ends. If it is started again, it stands by"
+                "so this one ends. Start it again to have it stand by"
             )

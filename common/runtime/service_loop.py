@@ -165,7 +165,7 @@ class Loop:
     def handle(self, event: Sample | IncomingRequest | RequestResult | None) -> None:
         """Handles one entry of the inbox; raises UserError if an older instance has become active."""
         if self._election is not None:
-            self._election.check()
+            self._election.check_oldest()
         if isinstance(event, Sample):
             if self._accepts(event):
                 with nullcontext() if self._metrics is None else self._metrics.step(event):
