@@ -3,7 +3,7 @@
 python -m tests.viewer.stub_server --port 8123
 
 http://127.0.0.1:8123/planning/ is the scene of that name; there are: tracking, planning, blocked, exploring, ambiguous,
-lost, half-dead, empty, watching, mapped (a ROS map), floors (a building). Without a name it is `tracking`.
+lost, no-estimator, empty, watch-only, mapped (a ROS map), floors (a building). Without a name it is `tracking`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from common.geometry.occupancy_grid import OccupancyGrid
 from common.geometry.world import World, load_world
 from common.robot.robot import Robot
 from tests.common.geometry.maps import building, rooms
-from tests.viewer.stub_session import DT, SCANNER, SCENES, WORLDS, Session, pulses
+from tests.viewer.stub_session import DT, SCANNER, SCENES, WORLDS, Session, services_message
 
 STATIC = Path(__file__).resolve().parents[2] / "services" / "viewer" / "static"
 
@@ -63,7 +63,7 @@ class Visitor:
         session, count = self.session, 0
         live = session.scene != "empty"
         await self.send(
-            type="hello", control=session.scene != "watching", version="stub", robots=["robot"] * live, robot="robot"
+            type="hello", control=session.scene != "watch-only", version="stub", robots=["robot"] * live, robot="robot"
         )
         if live:
             await self.world()
@@ -78,7 +78,7 @@ class Visitor:
                     self.field = session.planner.news
                     await self.socket.send_bytes(self.field)
             if count % 15 == 0:
-                await self.send(**pulses(session.scene))
+                await self.send(**services_message(session.scene))
             count += 1
             await asyncio.sleep(DT)
 

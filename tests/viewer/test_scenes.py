@@ -14,7 +14,7 @@ from tests.conftest import WAIT_TIMEOUT_S, accepts, free_tcp_port
 from tests.viewer.stub_server import MAPPED
 
 browser_tools = pytest.importorskip("tests.viewer.browser", reason="NO PLAYWRIGHT: the page is not tested")
-SCENES = ("floors", "planning", "blocked", "exploring", "ambiguous", "lost", "half-dead", "empty", "watching")
+SCENES = ("floors", "planning", "blocked", "exploring", "ambiguous", "lost", "no-estimator", "empty", "watch-only")
 STANDING = {"blocked", "exploring", "ambiguous", "lost"}  # scenes that show a reason
 PHONE = {"width": 360, "height": 740, "has_touch": True, "is_mobile": True}
 NAMELESS = """[...document.querySelectorAll("button")].filter(
@@ -91,11 +91,11 @@ def test_scenes_on_a_phone(look, scene):
     )
     assert seen.see(NAMELESS) == 0
     seen.wait(f"{VISIBLE} === {str(scene == 'empty').lower()}", 5, "empty")
-    if scene == "watching":
+    if scene == "watch-only":
         seen.wait(f"{VISIBLE} && document.getElementById('pause').disabled", 5, "watch-only")
-    if scene == "half-dead":
+    if scene == "no-estimator":
         assert "python -m services.estimator" in seen.page.locator(".notice code").inner_text()
-    if scene not in {"empty", "half-dead"}:
+    if scene not in {"empty", "no-estimator"}:
         seen.wait("store.frame?.status")
         seen.wait(f"{VISIBLE} === {str(scene in STANDING).lower()} && !{OVERLAPPING}.length", 5, "why")
 
