@@ -1,6 +1,7 @@
 """`make platforms`: checks that every dependency has a wheel on each platform, and prints the download sizes.
 
-"demo" is what `make demo` installs. "all" adds every extra; without its size, which depends on the build of PyTorch.
+Rows "demo" are for what `make demo` installs. Rows "all" add every extra; they have no sizes, because those depend on
+the build of PyTorch.
 """
 
 from __future__ import annotations
@@ -23,13 +24,16 @@ VERSIONS = ("3.10", "3.11", "3.12", "3.13", "3.14")
 
 
 def download_size(platform: str, version: str, *options: str) -> float:
-    """Size of the wheels, MB; of several wheels that fit, the largest counts. Raises RuntimeError if one is missing."""
+    """Size of all wheels in MB, or its upper bound if several wheels of a package fit.
+
+    Raises RuntimeError if a package has no wheel.
+    """
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "pylock.toml"
         command = [sys.executable, "-m", "uv", "pip", "compile", "--quiet", "--only-binary", ":all:", *options]
         command += ["--python-platform", platform, "--python-version", version, "-c", "constraints.txt"]
         command += ["-o", str(out), "pyproject.toml"]
-        environment = {**os.environ, "MACOSX_DEPLOYMENT_TARGET": "14.0"}  # PyTorch has no wheels for older ones
+        environment = {**os.environ, "MACOSX_DEPLOYMENT_TARGET": "14.0"}  # PyTorch has no wheels for older macOS
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
         if done.returncode != 0:
             raise RuntimeError(done.stderr)
@@ -42,16 +46,16 @@ def main() -> None:
     print("|", *VERSIONS, "", sep=" | ")
     print("|---" * (len(VERSIONS) + 1) + "|")
     for name, platform in PLATFORMS.items():
-        for what, options in (("demo", ()), ("all", ("--all-extras",))):
+        for row, options in (("demo", ()), ("all", ("--all-extras",))):
             cells = []
             for version in VERSIONS:
                 try:
                     size = download_size(platform, version, *options)
                     cells.append("wheels" if options else f"{size:.0f} MB")
                 except RuntimeError as error:
-                    errors.append(f"{name}, Python {version}, {what}: {error}")
+                    errors.append(f"{name}, Python {version}, {row}: {error}")
                     cells.append("no")
-            print(f"| {name}, {what}", *cells, "", sep=" | ", flush=True)
+            print(f"| {name}, {row}", *cells, "", sep=" | ", flush=True)
     if errors:
         sys.exit("\n".join(errors))
 

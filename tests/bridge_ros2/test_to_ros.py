@@ -10,15 +10,16 @@ from common.geometry.occupancy_grid import OccupancyGrid
 from common.messages.definitions import Pose
 from services.bridge_ros2 import to_ros
 from services.bridge_ros2.ros_types import OCCUPANCY_GRID, encode
-from tests.bridge_ros2 import independent as other
+from tests.bridge_ros2 import independent
 from tests.bridge_ros2.messages import belief
 
 
 def test_covariance():
-    six = to_ros.pose_message(belief(), "map").pose.covariance.reshape(6, 6)
-    assert (six[0, 0], six[0, 1], six[1, 1], six[0, 5], six[1, 5], six[5, 5]) == (0.01, 0.002, 0.04, 0.003, 0.005, 0.09)
-    assert np.count_nonzero(six) == 9
-    np.testing.assert_array_equal(six, six.T)
+    """ROS has x, y, z, roll, pitch, yaw; only x, y and yaw are known."""
+    covariance = to_ros.pose_message(belief(), "map").pose.covariance.reshape(6, 6)
+    planar = covariance[np.ix_([0, 1, 5], [0, 1, 5])]
+    assert planar.tolist() == [[0.01, 0.002, 0.003], [0.002, 0.04, 0.005], [0.003, 0.005, 0.09]]
+    assert np.count_nonzero(covariance) == 9
 
 
 def test_no_covariance():
@@ -32,15 +33,15 @@ def test_untracked_robot(state):
 
 
 def test_map_to_odom():
-    odometry, there = np.array([1.0, 2.0, 3.0]), Pose(x=-4.0, y=5.0, yaw=-2.0)
-    np.testing.assert_allclose(se2.compose(to_ros.correction(there, odometry), odometry), there.array())
-    np.testing.assert_array_equal(to_ros.correction(there, None), there.array())
+    odometry, pose = np.array([1.0, 2.0, 3.0]), Pose(x=-4.0, y=5.0, yaw=-2.0)
+    np.testing.assert_allclose(se2.compose(to_ros.correction(pose, odometry), odometry), pose.array())
+    np.testing.assert_array_equal(to_ros.correction(pose, None), pose.array())
 
 
 def test_map():
-    """Row by row from the lower left: 0 free, 100 occupied, -1 unknown; the origin is that corner's pose."""
+    """Cells are listed by row from the lower left corner: 0 free, 100 occupied, -1 unknown."""
     grid = OccupancyGrid.of(np.array([[0, 100, 255], [0, 0, 0]], np.uint8), 0.05, (-1.0, 2.0, np.pi / 2))
-    read = other.decode(OCCUPANCY_GRID, encode(OCCUPANCY_GRID, to_ros.map_message(grid, "map")))
+    read = independent.decode(OCCUPANCY_GRID, encode(OCCUPANCY_GRID, to_ros.map_message(grid, "map")))
     assert (read.header.frame_id, read.info.width, read.info.height) == ("map", 3, 2)
     assert read.info.resolution == pytest.approx(0.05)
     assert list(read.data) == [0, 100, -1, 0, 0, 0]

@@ -28,7 +28,7 @@ SAMPLES = {row.sample: row for row in METRICS}
 
 
 def read(text: str) -> dict[tuple[str, frozenset], float]:
-    """Values by sample and labels; checks help texts and labels against the table of metrics."""
+    """Values of a scrape by sample name and labels; checks help texts and labels against the table of metrics."""
     found = {}
     for metric in text_string_to_metric_families(text):
         if metric.name.startswith(("process_", "python_")):
@@ -44,10 +44,10 @@ def read(text: str) -> dict[tuple[str, frozenset], float]:
 
 
 def value(found, name: str, **labels) -> float | None:
-    """Value of the only sample that has these labels."""
-    fits = [number for (n, own), number in found.items() if n == name and labels.items() <= dict(own).items()]
-    assert len(fits) <= 1
-    return fits[0] if fits else None
+    """Value of the only sample that has these labels, perhaps among others, or None."""
+    matches = [number for (n, own), number in found.items() if n == name and labels.items() <= dict(own).items()]
+    assert len(matches) <= 1
+    return matches[0] if matches else None
 
 
 def address_of(running) -> str:
@@ -80,15 +80,15 @@ def test_metrics_of_a_real_service(bus, process):
     bus.put(HEALTH, b"\xc1", key=HEALTH.key(bus.robot, "intruder"))
     found = {}
 
-    def settled() -> bool:
+    def up_to_date() -> bool:
         found.update(read(scrape(address)))
-        bad = value(found, "presage_messages_undecodable_total", topic="health/intruder")
+        undecodable = value(found, "presage_messages_undecodable_total", topic="health/intruder")
         rate = value(found, "presage_message_rate_hertz", topic="health/small")
-        return bad == 1 and bool(rate)
+        return undecodable == 1 and bool(rate)
 
-    assert wait_until(settled, WAIT_TIMEOUT_S), found
+    assert wait_until(up_to_date, WAIT_TIMEOUT_S), found
     assert value(found, "presage_message_latency_seconds_bucket", topic="scan", le="+Inf") == 5
-    whose = {"robot": bus.robot, "service": "small"}
+    labels = {"robot": bus.robot, "service": "small"}
     for name, topic, expected in (
         ("presage_messages_received_total", "scan", 5),
         ("presage_messages_published_total", "cmd_vel", 5),
@@ -96,11 +96,11 @@ def test_metrics_of_a_real_service(bus, process):
         ("presage_step_duration_seconds_count", "scan", 5),
         ("presage_message_latency_seconds_count", "scan", 5),
     ):
-        assert value(found, name, **whose, topic=topic) == expected, name
-    assert value(found, "presage_events_total", **whose, event="scans") == 5
-    assert value(found, "presage_steps_failed_total", **whose) == 0
-    assert value(found, "presage_build_info", **whose) == 1
-    assert value(found, "presage_uptime_seconds", **whose) > 0
+        assert value(found, name, **labels, topic=topic) == expected, name
+    assert value(found, "presage_events_total", **labels, event="scans") == 5
+    assert value(found, "presage_steps_failed_total", **labels) == 0
+    assert value(found, "presage_build_info", **labels) == 1
+    assert value(found, "presage_uptime_seconds", **labels) > 0
     assert "process_cpu_seconds_total" in scrape(address)
     assert running.stop() == 0
     assert "Traceback" not in running.output
@@ -144,7 +144,7 @@ def belief(state: str, energy: float) -> Belief:
     return Belief(stamp_ns=0, state=state, pose=pose, xi=np.zeros(3), free_energy=energy, probability=0.25)
 
 
-def numbers(metrics) -> dict:
+def values_of(metrics) -> dict:
     return read(generate_latest(metrics.registry).decode())
 
 
@@ -154,7 +154,7 @@ def test_several_robots_in_one_process():
         metrics.published(BELIEF.key(robot), belief(state, energy))
         with metrics.step(Sample(SCAN, SCAN.key(robot), b"", time.time_ns(), 0)):
             pass
-    found = numbers(metrics)
+    found = values_of(metrics)
     assert value(found, "presage_free_energy_nats", robot="one") == 5.5
     assert value(found, "presage_free_energy_nats", robot="two") == -2.0
     assert value(found, "presage_pose_probability", robot="two") == 0.25
@@ -170,7 +170,7 @@ def test_controller_and_recorder():
     controller.published(STATUS.key("robot"), Status(stamp_ns=0, state="blocked"))
     rows = [TopicHealth(key=SCAN.key("robot"), written=9, missing=2, rate=15.0)]
     recorder.published(HEALTH.key("robot", "recorder"), Health(stamp_ns=0, service="recorder", uptime=1, topics=rows))
-    found = {**numbers(controller), **numbers(recorder)}
+    found = {**values_of(controller), **values_of(recorder)}
     assert value(found, "presage_controller_state", state="blocked") == 1
     assert value(found, "presage_controller_state", state="navigating") == 0
     assert value(found, "presage_recorder_messages_written_total", topic="scan") == 9
@@ -186,7 +186,7 @@ def test_timing_of_steps():
         raise ValueError("bug")
     with metrics.step(Sample(SCAN, SCAN.key("robot"), b"", time.time_ns() + 10**10, 0)):  # the clocks differ
         pass
-    found = numbers(metrics)
+    found = values_of(metrics)
     assert value(found, "presage_step_duration_seconds_count", robot="", topic="odd") == 1
     assert value(found, "presage_message_latency_seconds_count", topic="odd") == 0  # its time of publication is unknown
     assert value(found, "presage_message_latency_seconds_sum", topic="scan") == 0
