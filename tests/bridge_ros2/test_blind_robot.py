@@ -13,7 +13,7 @@ from services.bridge_ros2.service import BridgeRos2Service
 from services.bridge_ros2.settings import BridgeRos2Settings
 from services.controller.service import ControllerService
 from services.controller.settings import ControllerSettings
-from tests.bridge_ros2 import independent as other
+from tests.bridge_ros2 import cdr
 
 SELF_FILTER = {"ignore_angles": "-5:5", "blind_radius": 0.3}
 
@@ -28,7 +28,7 @@ def test_the_bridge(monkeypatch, settings, visible):
     published, used = [], []
     monkeypatch.setattr(service, "publish", lambda topic, message: published.append((topic, message)))
     monkeypatch.setattr(service.gate, "add_scan", lambda scan, now: used.append(scan))
-    service._on_scan(decode(LASER_SCAN, other.laser_scan(10**9, RANGES)))
+    service._on_scan(decode(LASER_SCAN, cdr.laser_scan(10**9, RANGES)))
     ((topic, scan),) = published
     assert topic is SCAN
     assert not np.isnan(Scan.decode(scan.encode()).ranges).any()

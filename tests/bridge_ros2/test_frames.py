@@ -9,7 +9,7 @@ from common.geometry import se2
 from services.bridge_ros2.frames import DeadReckoning, OdometryBuffer
 from services.bridge_ros2.odometry import MountAndOdometry
 from services.bridge_ros2.ros_types import TF_MESSAGE, decode
-from tests.bridge_ros2 import independent as other
+from tests.bridge_ros2 import cdr
 
 SECOND = 10**9
 
@@ -17,7 +17,7 @@ SECOND = 10**9
 def turned(roll=0.0, pitch=0.0, yaw=0.0):
     """Quaternion of fixed-axis angles, rad (REP-103)."""
     (sr, sp, sy), (cr, cp, cy) = np.sin(np.array([roll, pitch, yaw]) / 2), np.cos(np.array([roll, pitch, yaw]) / 2)
-    return other.quaternion(
+    return cdr.quaternion(
         sr * cp * cy - cr * sp * sy,
         cr * sp * cy + sr * cp * sy,
         cr * cp * sy - sr * sp * cy,
@@ -29,12 +29,12 @@ def tf(*each):
     """A tf message of transforms given as (parent, child, (x, y, z), rotation, stamp)."""
     transforms = [
         {
-            "header": other.header(stamp, parent), "child_frame_id": child,
-            "transform": {"translation": other.vector(*at), "rotation": rotation},
+            "header": cdr.header(stamp, parent), "child_frame_id": child,
+            "transform": {"translation": cdr.vector(*at), "rotation": rotation},
         }
         for parent, child, at, rotation, stamp in each
     ]  # fmt: skip
-    return decode(TF_MESSAGE, other.encode(TF_MESSAGE, {"transforms": transforms}))
+    return decode(TF_MESSAGE, cdr.encode(TF_MESSAGE, {"transforms": transforms}))
 
 
 @pytest.mark.parametrize(("roll", "upside_down"), [(0.0, False), (np.pi, True)])
@@ -81,7 +81,7 @@ def test_unconnected_odometry():
 def test_invalid_transforms():
     motion = MountAndOdometry("base_link", "odom")
     motion.add_tf(tf(
-        ("base_link", "a", (np.nan, 0, 0), turned(), 0), ("base_link", "b", (0, 0, 0), other.quaternion(w=0.0), 0),
+        ("base_link", "a", (np.nan, 0, 0), turned(), 0), ("base_link", "b", (0, 0, 0), cdr.quaternion(w=0.0), 0),
         ("x", "y", (0, 0, 0), turned(), 0), ("y", "x", (0, 0, 0), turned(), 0),  # a cycle
     ))  # fmt: skip
     for frame in ("a", "b", "x"):

@@ -10,11 +10,11 @@ from common.messages.ros_messages import IDENTITY, Mount, Transform
 from common.runtime import safety
 from services.bridge_ros2.from_ros import dead_reckoning_of, odom_of, pose_of, scan_of
 from services.bridge_ros2.ros_types import LASER_SCAN, ODOMETRY, POSE_STAMPED, decode
-from tests.bridge_ros2 import independent as other
+from tests.bridge_ros2 import cdr
 
 
 def laser(ranges, **fields):
-    return decode(LASER_SCAN, other.laser_scan(5, ranges, **fields))
+    return decode(LASER_SCAN, cdr.laser_scan(5, ranges, **fields))
 
 
 def test_plain_scan():
@@ -93,7 +93,7 @@ def test_invalid_scans(wrong):
 
 
 def odometry(x=1.0, y=2.0, yaw=0.0, twist=(0.3, 0.0, 0.5), covariance=(0.0,) * 36):
-    return decode(ODOMETRY, other.odometry(9, other.planar_pose(x, y, yaw), twist, "base_footprint", covariance))
+    return decode(ODOMETRY, cdr.odometry(9, cdr.planar_pose(x, y, yaw), twist, "base_footprint", covariance))
 
 
 def test_covariance_of_odometry():
@@ -120,7 +120,7 @@ def test_odometry_of_another_frame():
 
 def test_frame_of_a_pose():
     def message(frame):
-        return decode(POSE_STAMPED, other.pose_stamped(other.planar_pose(3, 4, 1), frame))
+        return decode(POSE_STAMPED, cdr.pose_stamped(cdr.planar_pose(3, 4, 1), frame))
 
     for frame in ("map", "/map", ""):
         np.testing.assert_allclose(pose_of(message(frame), "map").array(), [3, 4, 1])

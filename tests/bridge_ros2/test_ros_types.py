@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from common.messages.ros_messages import stamp_of
 from services.bridge_ros2 import ros_types as r
 from services.bridge_ros2.to_ros import hypotheses_message, pose_message, transform_message, twist_message
-from tests.bridge_ros2 import independent as other
+from tests.bridge_ros2 import cdr
 from tests.bridge_ros2.messages import belief
 
 # As `ros2 topic info -v` of Iron and later prints them ("Topic type hash"), rosbag2 writes them into metadata.yaml
@@ -55,17 +55,17 @@ def test_bytes_of_a_header():
 
 def test_bytes_read_elsewhere():
     kind, twist = twist_message(np.array([0.5, 0.1, -0.2]), 3_000_000_001, "base_link")
-    read = other.decode(kind, r.encode(kind, twist))
+    read = cdr.decode(kind, r.encode(kind, twist))
     assert (read.header.stamp.sec, read.header.stamp.nanosec, read.header.frame_id) == (3, 1, "base_link")
     assert (read.twist.linear.x, read.twist.linear.y, read.twist.angular.z) == (0.5, 0.1, -0.2)
-    read = other.decode(r.POSE_WITH_COVARIANCE, r.encode(r.POSE_WITH_COVARIANCE, pose_message(belief(), "map")))
+    read = cdr.decode(r.POSE_WITH_COVARIANCE, r.encode(r.POSE_WITH_COVARIANCE, pose_message(belief(), "map")))
     assert (read.pose.pose.position.x, read.pose.pose.position.y) == (3.0, -1.5)
     assert read.pose.covariance[0] == 0.01
     assert len(read.pose.covariance) == 36
-    read = other.decode(r.POSE_ARRAY, r.encode(r.POSE_ARRAY, hypotheses_message(belief(), "map")))
+    read = cdr.decode(r.POSE_ARRAY, r.encode(r.POSE_ARRAY, hypotheses_message(belief(), "map")))
     assert [pose.position.x for pose in read.poses] == [3.0, 8.0]
     tf = transform_message(np.array([1.0, 2.0, np.pi / 2]), 7, "map", "odom")
-    (read,) = other.decode(r.TF_MESSAGE, r.encode(r.TF_MESSAGE, tf)).transforms
+    (read,) = cdr.decode(r.TF_MESSAGE, r.encode(r.TF_MESSAGE, tf)).transforms
     assert (read.header.frame_id, read.child_frame_id, read.transform.translation.y) == ("map", "odom", 2.0)
     assert read.transform.rotation.z == pytest.approx(np.sqrt(0.5))
 
@@ -77,7 +77,7 @@ def test_bytes_read_elsewhere():
 )
 def test_bytes_written_elsewhere(ranges, frame, sec):
     """Of every length of the frame's name, which moves what follows."""
-    payload = other.laser_scan(sec * 10**9 + 5, ranges, frame, intensities=ranges[:3])
+    payload = cdr.laser_scan(sec * 10**9 + 5, ranges, frame, intensities=ranges[:3])
     message = r.decode(r.LASER_SCAN, payload)
     assert stamp_of(message.header) == sec * 10**9 + 5
     assert message.header.frame_id == frame

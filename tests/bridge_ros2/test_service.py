@@ -18,7 +18,7 @@ from common.geometry.world import load_world
 from common.messages.definitions import Goal, Health, Odom, Scan
 from common.messages.requests import LocaliseRequest, Reply
 from common.messages.topics import BELIEF, CMD_VEL, GOAL, HEALTH, LOCALISE, ODOM, SCAN
-from tests.bridge_ros2 import independent as other
+from tests.bridge_ros2 import cdr
 from tests.bridge_ros2.messages import belief
 from tests.conftest import WAIT_TIMEOUT_S
 from tests.system.ros2_robot import BEGIN, Ros, transform, transforms
@@ -32,7 +32,7 @@ RANGES = [1.0, 2.0, 3.0, 0.0, 5.0]
 
 
 def odometry(stamp_ns):
-    return other.odometry(stamp_ns, other.planar_pose(2.0, 0.0), (0.5, 0.0, 0.0))
+    return cdr.odometry(stamp_ns, cdr.planar_pose(2.0, 0.0), (0.5, 0.0, 0.0))
 
 
 class Beside:
@@ -50,13 +50,13 @@ class Beside:
         kinds = {"tf_static": TF, "scan": LASER, "odom": ODOMETRY, "initialpose": POSED, "goal_pose": GOAL_POSE}
         self.put = {name: node.publisher(name, kind) for name, kind in kinds.items()}
         # Published before the bridge starts.
-        self.put["tf_static"](transforms(transform("base_link", "laser", 0.3, 0, 0, other.quaternion(), 0)))
+        self.put["tf_static"](transforms(transform("base_link", "laser", 0.3, 0, 0, cdr.quaternion(), 0)))
 
     def sweep(self):
         """Publishes odometry and, 50 ms later by its stamp, a scan. Returns the bridge's Odom and Scan."""
         self.stamp += 10**8
         self.put["odom"](odometry(self.stamp - 5 * 10**7))
-        self.put["scan"](other.laser_scan(self.stamp, RANGES))
+        self.put["scan"](cdr.laser_scan(self.stamp, RANGES))
         return tuple(self.next(kind, lambda each: each.stamp_ns == self.stamp) for kind in (Odom, Scan))
 
     def next(self, kind, condition=lambda _: True):
@@ -99,7 +99,7 @@ def beside(module_processes, router):
             if time.monotonic() - last > 0.2:
                 last, found.stamp = time.monotonic(), found.stamp + 10**8
                 found.put["odom"](odometry(found.stamp))
-                found.put["scan"](other.laser_scan(found.stamp, RANGES))
+                found.put["scan"](cdr.laser_scan(found.stamp, RANGES))
             return all(found.inbox.received[topic.key("rover")] > 0 for topic in (SCAN, ODOM))
 
         assert wait_until(heard, WAIT_TIMEOUT_S), bridge.output
@@ -126,16 +126,16 @@ def test_published_beliefs(beside):
 
 
 def test_buttons_of_rviz(beside):
-    posed = {"pose": other.planar_pose(4, 2), "covariance": [0.0] * 36}
-    message = {"header": other.header(0, "map"), "pose": posed}
-    beside.put["initialpose"](other.encode("geometry_msgs/msg/PoseWithCovarianceStamped", message))
+    posed = {"pose": cdr.planar_pose(4, 2), "covariance": [0.0] * 36}
+    message = {"header": cdr.header(0, "map"), "pose": posed}
+    beside.put["initialpose"](cdr.encode("geometry_msgs/msg/PoseWithCovarianceStamped", message))
     calls = []
     assert wait_until(lambda: (call := beside.calls.get(0)) is not None and not calls.append(call), WAIT_TIMEOUT_S)
     request = LocaliseRequest.decode(calls[0].payload)
     assert (request.pose.x, request.pose.y) == (4, 2)
     calls[0].reply(Reply().encode())
-    beside.put["goal_pose"](other.pose_stamped(other.planar_pose(9, 9), "odom"))  # in the wrong frame: rejected
-    beside.put["goal_pose"](other.pose_stamped(other.planar_pose(5, 1), "map"))
+    beside.put["goal_pose"](cdr.pose_stamped(cdr.planar_pose(9, 9), "odom"))  # in the wrong frame: rejected
+    beside.put["goal_pose"](cdr.pose_stamped(cdr.planar_pose(5, 1), "map"))
     goal = beside.next(Goal)
     assert (goal.pose.x, goal.pose.y, goal.seq) == (5, 1, 0)
 
@@ -165,7 +165,7 @@ def test_map_for_late_subscribers(beside):
     assert not again
     sample = heard[0]
     assert len(sample.attachment.to_bytes()) == 33
-    published = other.decode("nav_msgs/msg/OccupancyGrid", sample.payload.to_bytes())
+    published = cdr.decode("nav_msgs/msg/OccupancyGrid", sample.payload.to_bytes())
     grid = rasterise(load_world("maze"))
     assert (published.info.width, published.info.height, published.header.frame_id) == (grid.width, grid.height, "map")
     np.testing.assert_array_equal(np.array(published.data, np.int8).view(np.uint8), grid.values.ravel())
@@ -191,7 +191,7 @@ def test_reported_problems(processes, router):
         def complains_about_tf():
             if time.monotonic() - last[0] > 0.2:
                 last[0] = time.monotonic()
-                put(other.laser_scan(BEGIN, RANGES, "lidar"))
+                put(cdr.laser_scan(BEGIN, RANGES, "lidar"))
             return "tf does not connect lidar with base_link" in bridge.output
 
         assert wait_until(complains_about_tf, WAIT_TIMEOUT_S), bridge.output

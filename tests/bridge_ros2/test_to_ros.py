@@ -10,7 +10,7 @@ from common.geometry.occupancy_grid import OccupancyGrid
 from common.messages.definitions import Pose
 from services.bridge_ros2 import to_ros
 from services.bridge_ros2.ros_types import OCCUPANCY_GRID, encode
-from tests.bridge_ros2 import independent
+from tests.bridge_ros2 import cdr
 from tests.bridge_ros2.messages import belief
 
 
@@ -41,7 +41,7 @@ def test_map_to_odom():
 def test_map():
     """Cells are listed by row from the lower left corner: 0 free, 100 occupied, -1 unknown."""
     grid = OccupancyGrid.of(np.array([[0, 100, 255], [0, 0, 0]], np.uint8), 0.05, (-1.0, 2.0, np.pi / 2))
-    read = independent.decode(OCCUPANCY_GRID, encode(OCCUPANCY_GRID, to_ros.map_message(grid, "map")))
+    read = cdr.decode(OCCUPANCY_GRID, encode(OCCUPANCY_GRID, to_ros.map_message(grid, "map")))
     assert (read.header.frame_id, read.info.width, read.info.height) == ("map", 3, 2)
     assert read.info.resolution == pytest.approx(0.05)
     assert list(read.data) == [0, 100, -1, 0, 0, 0]

@@ -23,7 +23,7 @@ from common.messages.definitions import Twist
 from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS
 from services.simulator.simulation import Simulation, SimulationSetup
-from tests.bridge_ros2.independent import (
+from tests.bridge_ros2.cdr import (
     decode,
     encode,
     header,

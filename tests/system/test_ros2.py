@@ -11,7 +11,7 @@ from common.bus.bus import Link, open_bus, wait_until
 from common.geometry import se2
 from common.messages.definitions import Goal, Pose
 from common.messages.topics import GOAL
-from tests.bridge_ros2.independent import planar_pose, pose_stamped
+from tests.bridge_ros2.cdr import planar_pose, pose_stamped
 from tests.conftest import WAIT_TIMEOUT_S
 from tests.system.ros2_robot import Ros
 
