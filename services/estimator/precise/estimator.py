@@ -62,6 +62,9 @@ MAX_SEARCH_INTERVAL = 150  # scans between two searches without success; the int
 WRONG_MATCH = 1e-6
 # As a share of the scanner's noise: smaller errors of the map cannot be told from the noise of one scan.
 SIGNIFICANT_MAP_ERROR = 0.25
+# Share of the beams at surfaces which the map lacks that happen to end at one of its surfaces. At nine of ten wrong
+# poses in buildings of development, the map explained less than 5 to 9 %.
+EXPLAINED_BY_CHANCE = 0.05
 UNKNOWN_SIGMA_M = 100.0  # published where the model does not know what to expect
 TARGET_BEAMS = 2000  # a scan with at least twice as many is thinned, because the time of a search grows with the beams
 
@@ -303,6 +306,8 @@ class PreciseEstimator:
         mode, period = self.modes[k], self._period(observation.stamp)
         candidates, pose, evidence = match.motions[k], match.poses[k], match.evidence
         unobserved = self._remove_unobserved(view, mode, pose, evidence, k)
+        # Where the map explains few beams, they may all be there by chance, and say nothing about the pose.
+        evidence.scale(k, _share_not_by_chance(view.surface_evidence(pose[None]).explained[0]))
         # A match with the local map, the only candidate then, gives the motion in the unobserved directions, too.
         unknown_motion = len(unobserved) > 0 and len(candidates) > 1
         if unknown_motion and self._odometry_since_last_scan(observation) is None:
@@ -624,6 +629,12 @@ class PreciseEstimator:
             if tracked_alone or self.modes[1].weight * known > self.settings.ambiguous_weight:
                 return "ambiguous"
         return "lost" if self._was_tracking else "localising"
+
+
+def _share_not_by_chance(explained: float) -> float:
+    """Share of the beams at surfaces of the map, a share ``explained`` of all, that are not there by chance."""
+    real = max(0.0, explained - EXPLAINED_BY_CHANCE) / (1 - EXPLAINED_BY_CHANCE)
+    return real / explained if real else 0.0
 
 
 def _log_ideal(view: View, skip: npt.NDArray[np.bool_]) -> float:

@@ -57,6 +57,11 @@ class Evidence:
         for values, replacement in zip(vars(self).values(), vars(other).values(), strict=True):
             values[row] = replacement[0]
 
+    def scale(self, row: int, share: float) -> None:
+        """Multiplies the derivatives at one pose, and the covariances of xi, by ``share``, in place."""
+        for values in (self.xi, self.curvature, self.xi_noise_covariance, self.xi_model_covariance):
+            values[row] *= share
+
 
 @dataclass(frozen=True)
 class Likelihood:
