@@ -4,7 +4,7 @@ A drive consists of pieces; within a piece, tracking was never interrupted.
 
 A scan that contradicts the last key scans is suspect: something hides the surroundings, or the robot was kidnapped.
 Its pose is unknown. After `MAX_SUSPECT_SCANS` in a row a new piece begins, whose pose relative to the former pieces is
-unknown.
+unknown, unless odometry and the local map agree on it.
 
 A scan that matches, but far from where the motion model expects it, or with more contradictions than usual, also begins
 a piece: the wheels may have slipped, a door may have moved, or the robot was carried to a place that looks alike. This
@@ -151,9 +151,12 @@ class FrontEnd:
         self._since_key = self._since_key + PRIOR_SCALE**2 * covariance
         found = self._register(scan, prior, period)
         contradiction = self._contradiction(scan, found, prior)
-        suspect = contradiction > MAX_CONTRADICTION or self._is_suspect(found, prior, period)
-        if found is not None and not suspect:
-            doubtful = self._is_doubtful(contradiction) or prior.difference(found.pose)[1] > MAX_SLIP**2
+        known = [self.poses[-1], prior.mean] if used_odometry else [self.poses[-1]]
+        suspect = contradiction > MAX_CONTRADICTION or self._is_suspect(found, prior, known, period)
+        # If the odometry still agrees with the local map after many such scans, more likely much has moved.
+        confirmed = self._suspect_scans + 1 >= MAX_SUSPECT_SCANS and used_odometry and not _is_far(found, prior)
+        if found is not None and (confirmed or not suspect):
+            doubtful = suspect or self._is_doubtful(contradiction) or prior.difference(found.pose)[1] > MAX_SLIP**2
             return self._add_matched(scan, found, prior, deviation, period, doubtful=doubtful)
         self.unmatched += 1
         if used_odometry:
@@ -221,15 +224,18 @@ class FrontEnd:
         best = min(matches, key=lambda each: each.cost, default=None)
         return None if best is None or best.share < MIN_MATCHED_SHARE else best
 
-    def _is_suspect(self, found: Registration | None, prior: PosePrior, period: float) -> bool:
-        """Whether a registration implies that the robot was kidnapped, or may match by chance."""
+    def _is_suspect(self, found: Registration | None, prior: PosePrior, known: list[Array], period: float) -> bool:
+        """Whether a registration implies that the robot was kidnapped, or may match by chance.
+
+        It was kidnapped if it is farther from all ``known`` poses (3,) than it can drive in ``period`` s. These are the
+        last one and, with odometry, the next one: odometry that paused reports the motion of several scans at once.
+        """
         pose = prior.mean if found is None else found.pose
-        if (np.abs(se2.between(self.poses[-1], pose)) > MAX_MOTION * period).any():
+        if all((np.abs(se2.between(each, pose)) > MAX_MOTION * period).any() for each in known):
             return True
         if found is not None and found.share > FAMILIAR_SHARE:
             return False
-        far = bool((np.abs(se2.between(prior.mean, pose)) > CLOSE_TO_PRIOR).any())
-        return self._suspect_scans > 0 and (found is None or far)
+        return self._suspect_scans > 0 and _is_far(found, prior)
 
     def _contradiction(self, scan: _Scan, found: Registration | None, prior: PosePrior) -> float:
         """Share of contradictions between a scan and the local map; 0 if most of the scan matches."""
@@ -338,6 +344,11 @@ def track_drive(drive: RawDrive, report: Callable[[float], None] = lambda _done:
         front_end.add(float(stamp), ranges, None if drive.odom is None else drive.odom[k])
         report(k / len(drive.ranges))
     return front_end.track()
+
+
+def _is_far(found: Registration | None, prior: PosePrior) -> bool:
+    """Whether a registration is far from where the motion model expects it, or there is none."""
+    return found is None or bool((np.abs(se2.between(prior.mean, found.pose)) > CLOSE_TO_PRIOR).any())
 
 
 def _median_range(elements: Elements) -> float:

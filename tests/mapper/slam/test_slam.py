@@ -13,6 +13,7 @@ from common.geometry.world import load_world
 from lab.accuracy.motion_distortion import observations
 from lab.accuracy.scenes import TWIN_OFFSET, TWINS, Scene
 from services.mapper.slam.drive import Laser, RawDrive
+from services.mapper.slam.front_end import NO_PIECE, track_drive
 from services.mapper.slam.pose_graph import ANCHOR, LinkTable, PoseLink, Uncertainty, optimise
 from services.mapper.slam.trajectory import build_trajectory
 from tests.mapper.drives import driven
@@ -100,6 +101,19 @@ def test_pausing_odometry():
     built = build_trajectory(replace(driven(world, truth), odom=odom))
     error = se2.compose(truth[0], built.poses)[:, :2] - truth[:, :2]
     assert np.hypot(*error.T).max() < 0.1
+
+
+@pytest.mark.parametrize("pause", [4, 5])
+def test_pausing_odometry_is_no_kidnapping(pause):
+    """After a pause, odometry reports the motion of several scans at once, here along a corridor with few features."""
+    x = np.arange(2.0, 12.0, 0.21)
+    truth = np.column_stack([x, np.full(len(x), 1.5), np.zeros(len(x))])
+    number = np.arange(len(truth))
+    since = number % 24 - 10
+    odom = truth[np.where((since >= 0) & (since < pause), number - since, number)]
+    drive = driven(load_world("corridor"), truth)
+    tracked = track_drive(replace(drive, odom=odom, stamps=3.2 * drive.stamps))
+    assert (tracked.pieces != NO_PIECE).all()
 
 
 def test_look_alike_rooms_stay_apart():
