@@ -44,7 +44,7 @@ def test_run(tmp_path, capsys):
     assert bench_integrity(plan, tmp_path, 1, Console(quiet=True)) == 0
     stored = json.loads((tmp_path / "integrity.json").read_text())["summary"]["precise"]["unchanged"]
     assert stored["correct"]["count"] == stored["correct"]["of"] == 6
-    assert "| unchanged | precise | 1 | 100 % |" in capsys.readouterr().out
+    assert "| unchanged | 100 | 0 " in capsys.readouterr().out
     assert len((tmp_path / "integrity.trials.jsonl").read_text().splitlines()) == 1
 
 
