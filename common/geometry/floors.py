@@ -54,19 +54,23 @@ class Floor(WorldPart):
 
     def placement_error(self, places: npt.ArrayLike) -> str | None:
         """The reason why points (N, 2) or poses (N, 3) in the floor's frame are not all on it, or None if they are."""
-        edges = self.from_map(np.reshape(self.bounds, (2, 2)))
-        for x, y, *_ in np.atleast_2d(places).tolist():
-            # A place off this floor may be on the next one in map.
-            if not ((edges[0] <= (x, y)) & ((x, y) <= edges[1])).all():
+        for place in np.atleast_2d(places):
+            if not self.contains(self.to_map(place)):  # it may be on the next floor in map
+                edges = self.from_map(np.reshape(self.bounds, (2, 2)))
                 (x0, y0), (x1, y1) = (np.round(edges, 2) + 0.0).tolist()
                 where = f"which reaches from ({x0:g}, {y0:g}) to ({x1:g}, {y1:g}) m"
-                return f"({x:g}, {y:g}) is not on floor {self.name!r}, {where}"
+                return f"({place[0]:g}, {place[1]:g}) is not on floor {self.name!r}, {where}"
         return None
+
+
+def floor_at(floors: Iterable[Floor], place: npt.ArrayLike) -> Floor | None:
+    """The floor on which a point (2,) or pose (3,) in map is; None between floors, and without any."""
+    return next((floor for floor in floors if floor.contains(place)), None)
 
 
 def place_text(floors: Iterable[Floor], place: npt.ArrayLike, decimals: int = 2) -> str:
     """A point (2,) or pose (3,) in map for messages to users: on a floor, its name and coordinates in its frame."""
-    floor = next((floor for floor in floors if floor.contains(place)), None)
+    floor = floor_at(floors, place)
     position = np.asarray(place, float) if floor is None else floor.from_map(place)
     x, y = np.round(position, decimals)[:2] + 0.0  # no -0.00
     return f"({x:.{decimals}f}, {y:.{decimals}f})" + ("" if floor is None else f" on floor {floor.name!r}")

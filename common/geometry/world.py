@@ -15,7 +15,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from common.errors import UserError, first_fault
 from common.geometry import building, ros_map
-from common.geometry.floors import Floor, Lift, bounds_of, check_floors, corners_of, no_floor, place_text
+from common.geometry.floors import Floor, Lift, bounds_of, check_floors, corners_of, floor_at, no_floor, place_text
 from common.geometry.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from common.geometry.shapes import Box, Circle, Degrees, Obstacle, Ring, WorldName, WorldPart, check_ring
 from common.geometry.yaml_text import TooLargeError, parse_yaml
@@ -107,7 +107,7 @@ class World(WorldPart):
 
     def floor_at(self, place: npt.ArrayLike) -> Floor | None:
         """The floor on which a point (2,) or pose (3,) in map is; None between floors, and in a world without any."""
-        return next((floor for floor in self.floors if floor.contains(place)), None)
+        return floor_at(self.floors, place)
 
     def floor(self, name: str) -> Floor:
         """The floor of that name; raises UserError if there is none."""
