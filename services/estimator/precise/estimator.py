@@ -164,7 +164,10 @@ class PreciseEstimator:
             # during the scan.
             view, match = self._correct_motion_again(view, observation, match, period)
         # Fusion of match and motion prior
-        modes = [self._fuse(view, k, match, motions[k][-1], observation) for k in range(len(match.poses))]
+        shares = view.surface_evidence(match.poses).explained
+        modes = [
+            self._fuse(view, k, match, float(share), motions[k][-1], observation) for k, share in enumerate(shares)
+        ]
         modes += self._find_alternatives(view, modes[0], match.motions[0])
         # Weights, also of the unknown place
         self._weigh_hypotheses(view, modes, match.local_pose, period)
@@ -296,8 +299,16 @@ class PreciseEstimator:
         poses, evidence = view.descend(match.poses, _prior_of([each[-1] for each in match.motions]))
         return view, replace(match, poses=poses, evidence=evidence)
 
-    def _fuse(self, view: View, k: int, match: ScanMatch, widest: MotionCandidate, observation: Observation) -> Mode:
-        """Fuses the k-th hypothesis with the scan.
+    def _fuse(
+        self,
+        view: View,
+        k: int,
+        match: ScanMatch,
+        explained: float,
+        widest: MotionCandidate,
+        observation: Observation,
+    ) -> Mode:
+        """Fuses the k-th hypothesis with the scan, of which the map explains the share ``explained`` there.
 
         A motion of which the robot is hardly capable, within the ``widest`` candidate, is evidence against the
         hypothesis: the robot may have been carried off instead. If the stamp is earlier than that of the last scan,
@@ -307,7 +318,7 @@ class PreciseEstimator:
         candidates, pose, evidence = match.motions[k], match.poses[k], match.evidence
         unobserved = self._remove_unobserved(view, mode, pose, evidence, k)
         # Where the map explains few beams, they may all be there by chance, and say nothing about the pose.
-        evidence.scale(k, _share_not_by_chance(view.surface_evidence(pose[None]).explained[0]))
+        evidence.scale(k, _share_not_by_chance(explained))
         # A match with the local map, the only candidate then, gives the motion in the unobserved directions, too.
         unknown_motion = len(unobserved) > 0 and len(candidates) > 1
         if unknown_motion and self._odometry_since_last_scan(observation) is None:

@@ -27,8 +27,9 @@ SAME_POSITION_M, SAME_HEADING_RAD = 0.1, 0.1  # hypotheses nearer to one another
 MIN_INFORMATION_RATIO, RIPPLE_FACTOR = 1e-4, 7.0
 WEAK_PRIOR = np.eye(3)  # 1/m², 1/rad²: keeps the covariance finite along unobserved directions
 MIN_WEIGHT = 1e-9  # hypotheses with less weight are dropped
-# What is new in a key scan is as the map predicts it, is clutter, or is in a room that the map lacks. Probabilities at
-# the first key scan, and of each (column) after a key scan of each (row): clutter is soon passed, a room is not.
+# What is new in a key scan is as the map predicts it, is clutter, or is in a room that the map lacks. The probabilities
+# of these three at the first key scan, and from one key scan (row) to the next (column): clutter ends soon, a room
+# lasts.
 FIRST_SURROUNDINGS = np.array([0.7, 0.3, 0.0])
 NEXT_SURROUNDINGS = np.array([[0.784, 0.214, 0.002], [0.498, 0.5, 0.002], [0.014, 0.006, 0.98]])
 

@@ -21,9 +21,8 @@ if TYPE_CHECKING:
 
 UPDATE_SHARE = 0.1  # weight of the present scan, or key scan, in the averages, at least
 MIN_CHANGED, MAX_CHANGED = 0.02, 0.5  # limits of the share of changed surfaces
-MAX_NOISE_FACTOR = (
-    4.0  # scans with more than this times the stated noise, or less than its inverse, show no smooth walls
-)
+# Scans with more than this times the stated noise, or less than its inverse, show no smooth walls.
+MAX_NOISE_FACTOR = 4.0
 MAX_MAP_ERROR_M = 0.1  # larger errors are not the map's, but changes of the surroundings
 MIN_LEARNING_BEAMS, MIN_LEARNING_SHARE = 30, 0.3  # of a scan; nothing is learned from fewer
 DAMPING = 1e-9  # in m; keeps the inverse finite where a direction is not observed
@@ -129,7 +128,7 @@ class Precision:
 
 
 def _share(scans: int) -> float:
-    """Weight of the last of so many scans; what was known before counts as one more scan."""
+    """Weight of the newest of ``scans`` scans in an average, in which the value before them counts as one more."""
     return max(UPDATE_SHARE, 1 / (scans + 1))
 
 
