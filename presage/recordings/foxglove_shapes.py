@@ -216,7 +216,7 @@ def world_entities(world: World, ns: int) -> list[SceneEntity]:
     walls = SceneEntity(timestamp=time_of(ns), frame_id="map", id="walls", frame_locked=True)
     for wall in world.wall_rings:
         walls.cubes.extend(_slabs(np.array(wall), WALL, outside=True))
-    if world.grid is not None:  # a ROS map has thousands of walls, so only their top edges are drawn
+    if world.grid is not None:  # lines instead of cubes, because a ROS map has thousands of walls
         edges = line(world.grid.geometry.walls.reshape(-1, 2), WALL, z=WALL_HEIGHT)
         edges.type = LinePrimitive.LINE_LIST
         walls.lines.append(edges)

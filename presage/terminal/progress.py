@@ -30,8 +30,8 @@ def status_line(
 ) -> Iterator[Callable[[str, str], None]]:
     """Yields a function that shows a text: in one line on a terminal; elsewhere in a new line when its status changes.
 
-    The function takes the text and its status. Numbers in the status are no change. ``status`` is the first one, which
-    is shown on a terminal only. Lines come at intervals of at least ``interval_s``.
+    The function takes the text and its status. A change of numbers alone does not count. ``status`` is the first one,
+    which is shown on a terminal only. Lines come at intervals of at least ``interval_s``.
     """
     if console.is_terminal:
         with console.status(status) as line:
