@@ -67,7 +67,7 @@ class Docking:
         # Angle between heading and line; the robot may also follow the line backwards.
         angle = float(se2.wrap(2 * (self.heading - self.direction))) / 2
         if self.robot.drive == "differential" and abs(angle) > (self.yaw_tolerance or np.inf):
-            return "goal refused: a differential base moves along its heading, and cannot approach the goal across it"
+            return "a differential base moves along its heading, and cannot approach the goal across it"
         return None
 
     def interrupt(self) -> None:

@@ -70,7 +70,9 @@ class GoalState:
     def start(self, goal: Goal, refusal: str | None) -> None:
         """Replaces the goal, and refuses the new one if ``refusal`` gives a reason."""
         self.goal = goal
-        self._enter(Phase.NAVIGATING if refusal is None else Phase.REFUSED, refusal or "")
+        self._enter(Phase.NAVIGATING)
+        if refusal is not None:
+            self.refuse(refusal)
 
     def cancel(self) -> None:
         """Forgets the goal."""
@@ -78,8 +80,8 @@ class GoalState:
         self._enter(Phase.IDLE, "cancelled")
 
     def refuse(self, reason: str) -> None:
-        """Refuses the goal, because it has turned out to be unreachable."""
-        self._enter(Phase.REFUSED, reason)
+        """Refuses the goal, which cannot be reached for this reason."""
+        self._enter(Phase.REFUSED, f"goal refused: {reason}")
 
     def reach(self, reason: str) -> None:
         """Ends the goal: the robot has arrived."""

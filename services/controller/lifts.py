@@ -49,14 +49,11 @@ def plan_ride(world: World, place: Array, goal: Array, refusal: Callable[[Array]
             enter, leave = here.to_map(lift[here.name]), there.to_map(lift[there.name])
             ways.append((float(np.hypot(*(enter - place[:2])) + np.hypot(*(goal - leave))), enter))
     if not ways:
-        return (
-            f"goal refused: it is on floor {there.name!r}, the robot is on floor {here.name!r}, and no lift "
-            "stops at both"
-        )
+        return f"it is on floor {there.name!r}, the robot is on floor {here.name!r}, and no lift stops at both"
     ways.sort(key=lambda way: way[0])
     problems = []
     for _, enter in ways:
         if (problem := refusal(enter)) is None:
             return LiftRide(enter, there.name)
-        problems.append(problem.removeprefix("goal refused: "))
-    return f"goal refused: the lift to floor {there.name!r} cannot be reached: {problems[0]}"
+        problems.append(problem)
+    return f"the lift to floor {there.name!r} cannot be reached: {problems[0]}"

@@ -139,7 +139,7 @@ class Navigator:
         try:
             goal = goal.in_map(self.world)
         except UserError as error:
-            self.goal_state.start(goal, f"goal refused: {error}")
+            self.goal_state.start(goal, str(error))
             self.policy.set_goal(None)
             return
         self._docking = None if goal.approach is None else Docking(goal, self.robot)

@@ -57,7 +57,7 @@ def test_obstacle_on_the_line():
     ("to", "reason"),
     [
         (dock(0.5, 1.5), "cannot approach the goal across it"),
-        (goal(0.6, 2.0, approach=0.0), "the line to the goal is not free: goal refused: (0.00, 2.00)"),
+        (goal(0.6, 2.0, approach=0.0), "goal refused: the line to the goal is not free: (0.00, 2.00)"),
     ],
     ids=["across", "from the wall"],
 )

@@ -75,13 +75,14 @@ class GeodesicPolicy:
         self._field_of_view = ALL_ROUND
         # Least distance from the goal in m, and the stamp at which the robot got there; None until it is near the goal.
         self._nearest: tuple[float, int] | None = None
+        self._obstructed_ns = -STUCK_AFTER_NS  # when an obstacle was last near the robot or the goal
         self._standing_since_ns: int | None = None
         self._backing_off_until_ns: int | None = None
 
     def refusal(self, goal: Array) -> str | None:
         """The reason why a goal (2,) m cannot be reached by the map, with the nearest place that can, or None."""
         if self.free is NO_MAP:
-            return "goal refused: there is no map yet; does the mapper run, and do scans arrive?"
+            return "there is no map yet; does the mapper run, and do scans arrive?"
         refusal = self._wall_refusal(goal)
         if refusal is None:
             cell = self.graph.nearest_free(goal, self.robot.radius, map_only=True)
@@ -302,21 +303,28 @@ class GeodesicPolicy:
         ``place`` (2,) m is the end of the ``path``: the goal, or the free place nearest to it.
         """
         assert self._goal is not None  # noqa: S101 - there is a path
-        distance = float(np.hypot(*(self._goal - pose[:2])))
-        if distance > self.robot.radius:
+        to_goal = self._goal - pose[:2]
+        distance, shift = float(np.hypot(*to_goal)), float(np.hypot(*(place - self._goal)))
+        if distance > shift + 2 * self.robot.radius:
             self._nearest = None
         elif self._nearest is None or stamp_ns < self._nearest[1] or distance < self._nearest[0] - MIN_PROGRESS_M:
             self._nearest = (distance, stamp_ns)
         # Several cells may be about as near to the goal, so the robot need not stand in a certain one.
-        shift = float(np.hypot(*(place - self._goal)))
         arrived = shift > 0 and distance < shift + self.free.grid.resolution
         stuck = self._nearest is not None and stamp_ns - self._nearest[1] > STUCK_AFTER_NS
-        if np.hypot(*surroundings.points.T).min(initial=np.inf) < 2 * self.robot.radius:  # it may go away
+        of_robot, of_goal = (
+            np.hypot(*(surroundings.points - centre).T).min(initial=np.inf)
+            for centre in (np.zeros(2), se2.rotate(-pose[2], to_goal))
+        )
+        if min(of_robot, of_goal) < 2 * self.robot.radius:
+            self._obstructed_ns = stamp_ns
             reason = f"{distance:.2f} m from the goal, {self._hindrance(pose, surroundings, standing=True)}"
-            return Decision(reason=reason, state="blocked", path=path) if arrived else None
+            return Decision(reason=reason, state="blocked", path=path) if arrived or stuck else None
+        # The field may still lead around something that has just gone.
+        if not stuck or distance > self.robot.radius or 0 <= stamp_ns - self._obstructed_ns < STUCK_AFTER_NS:
+            return None
         problem = f"is too near to a wall: stopped {distance:.2f} m from it"
-        reason = self._refusal_text(self._goal, problem)
-        return Decision(reason=reason, state="blocked", path=path, refused=True) if arrived or stuck else None
+        return Decision(reason=self._refusal_text(self._goal, problem), state="blocked", path=path, refused=True)
 
     def _back_off(self, pose: Array, velocity: Array, surroundings: Surroundings, path: Array) -> Decision:
         """Recovers: drives towards the direction with the largest gap to walls and obstacles."""
