@@ -26,7 +26,7 @@ class Floor(WorldPart):
 
     name: FloorName
     offset: Point  # m, origin of the floor's frame in map; the axes are parallel
-    boundary: Ring  # m in map, the floor's walls; in a world with a grid, the edge of the floor's cells
+    boundary: Ring  # m in map, the floor's walls; with a grid, the edge of its cells
 
     @model_validator(mode="after")
     def _boundary_is_simple(self) -> Floor:

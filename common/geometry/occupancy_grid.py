@@ -39,10 +39,10 @@ class OccupancyGrid(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    width: Annotated[int, Field(ge=1, le=MAX_CELLS)]  # cells along the grid's x axis
-    height: Annotated[int, Field(ge=1, le=MAX_CELLS)]  # cells along its y axis
+    width: Annotated[int, Field(ge=1, le=MAX_CELLS)]  # cells along x
+    height: Annotated[int, Field(ge=1, le=MAX_CELLS)]  # cells along y
     resolution: Annotated[float, Field(allow_inf_nan=False, gt=0, le=1e3)]  # m, edge length of a cell
-    origin: tuple[Coordinate, Coordinate, Angle]  # x m, y m, yaw rad in map of the first cell's lower left corner
+    origin: tuple[Coordinate, Coordinate, Angle]  # x m, y m, yaw rad in map of the lower left corner
     cells: Annotated[str, Field(max_length=4 * MAX_CELLS)]
     # one byte per cell, row by row from the lower left, zlib, base64: 0 free, 100 occupied, 255 unknown
 

@@ -50,15 +50,15 @@ class World(WorldPart):
     """
 
     name: WorldName
-    boundary: Ring  # m, the walls; with a grid its edge, with floors a box around them: both may be left out
+    boundary: Ring  # m, the walls; optional with a grid or floors
     obstacles: Annotated[list[Obstacle], Field(max_length=10_000)] = []  # noqa: RUF012 - pydantic copies it
     start: Start | None = None
     grid: Annotated[OccupancyGrid | None, Field(exclude_if=lambda grid: grid is None)] = None
-    # a ROS map; worlds without one are sent without this field
+    # a ROS map; left out if there is none
     floors: Annotated[list[Floor], Field(max_length=100, exclude_if=lambda floors: not floors)] = []  # noqa: RUF012
-    # the floors of a building, side by side in map
+    # side by side in map
     lifts: Annotated[list[Lift], Field(max_length=1000, exclude_if=lambda lifts: not lifts)] = []  # noqa: RUF012
-    # place (x m, y m) of each lift by the name of the floor, in the floor's frame
+    # places x m, y m of a lift by floor, in the floor's frame
 
     @model_validator(mode="before")
     @classmethod

@@ -29,34 +29,34 @@ class Reply(Message):
     """Base of all replies, and a reply without data."""
 
     ok: bool = True
-    reason: Text = ""  # why the request failed, if ok is false
+    reason: Text = ""  # why the request failed
 
 
 class PoseRequest(Request):
     """Move the robot to a pose."""
 
-    pose: Pose  # base_link in map, or in the frame of the floor map_id
-    map_id: Name = ""  # a floor; empty for map
+    pose: Pose  # base_link in the frame of map_id
+    map_id: Name = ""  # a floor; empty: map
 
 
 class LocaliseRequest(Request):
     """Restart localisation, from a known pose or globally."""
 
-    pose: Pose | None = None  # base_link in map, or in the frame of the floor map_id; nil searches the whole map
-    heading_known: bool = True  # whether pose.yaw means anything
-    map_id: Name = ""  # a floor; empty for map
+    pose: Pose | None = None  # base_link in the frame of map_id; nil searches the whole map
+    heading_known: bool = True  # false: pose.yaw is unknown
+    map_id: Name = ""  # a floor; empty: map
 
 
 class ResetRequest(Request):
     """Restart the simulation."""
 
-    seed: Count | None = None  # nil keeps the present seed
+    seed: Count | None = None  # nil keeps the seed
 
 
 class SpeedRequest(Request):
     """Set the speed of the simulation's clock in realtime pace."""
 
-    factor: Annotated[float, Field(allow_inf_nan=False, ge=0.1, le=20)]  # simulated seconds per second of wall time
+    factor: Annotated[float, Field(allow_inf_nan=False, ge=0.1, le=20)]  # times real time
 
 
 class ObstacleRequest(Request):
@@ -71,7 +71,7 @@ class SampleRequest(Request):
     """Simulate scans from given poses."""
 
     poses: Poses  # (N, 3) base_link in map
-    beams: Annotated[int, Field(ge=2, le=MAX_BEAMS)] | None = None  # number of beams; nil for the scanner's own
+    beams: Annotated[int, Field(ge=2, le=MAX_BEAMS)] | None = None  # nil: the scanner's own
     noise: bool = False
     seed: Count = 0  # random seed of the noise
 
@@ -86,16 +86,16 @@ class SampleReply(Reply):
 class PredictRequest(Request):
     """Predict scans from given poses with the estimator's model."""
 
-    poses: Poses  # (N, 3) base_link in map, N at most 1000
-    beams: Annotated[int, Field(ge=2, le=MAX_BEAMS)] | None = None  # evenly spaced among the scanner's; nil for all
+    poses: Poses  # (N, 3) base_link in map, N ≤ 1000
+    beams: Annotated[int, Field(ge=2, le=MAX_BEAMS)] | None = None  # evenly spaced among the scanner's; nil: all
 
 
 class PredictReply(Reply):
     """The predicted scans."""
 
     angles: Floats = np.zeros(0, np.float32)  # (B,) rad in laser
-    ranges: Ranges = np.zeros(0, np.float32)  # (N * B,) m, row-major; +inf if no return is expected
-    sigma: Floats = np.zeros(0, np.float32)  # (N * B,) m, standard deviation of the ranges; empty if unknown
+    ranges: Ranges = np.zeros(0, np.float32)  # (N * B,) m, row-major; +inf: no return
+    sigma: Floats = np.zeros(0, np.float32)  # (N * B,) m, standard deviations; empty: unknown
 
 
 class WorldReply(Reply):
@@ -111,17 +111,17 @@ class PlayerRequest(Request):
 
     action: Literal["pause", "resume", "step", "seek", "rate", "status"]  # step plays to the end of a scan and pauses
     value: Finite = 0.0
-    # seek: s from the recording's start; rate: times the original speed, 0 for the maximum; step: number of scans
+    # seek: s from the start; rate: times the original speed, 0: maximum; step: number of scans
 
 
 class PlayerReply(Reply):
     """State of the replay after the request."""
 
     paused: bool = False
-    position_s: NotNegative = 0.0  # s from the recording's start
-    duration_s: NotNegative = 0.0  # s, length of the recording
-    rate: NotNegative = 1.0  # times the original speed; 0 is as fast as possible
-    loop: bool = False  # the replay starts again at its end
+    position_s: NotNegative = 0.0  # s from the start
+    duration_s: NotNegative = 0.0  # s
+    rate: NotNegative = 1.0  # times the original speed; 0: maximum
+    loop: bool = False  # the replay repeats
 
 
 class RecordRequest(Request):
@@ -134,9 +134,9 @@ class RecordReply(Reply):
     """State of the recorder after the request."""
 
     recording: bool = False
-    file: Text = ""  # path on the recorder's machine of the present or last recording; empty if there is none yet
-    messages: Count = 0  # number of messages in that recording
-    seconds: NotNegative = 0.0  # s of wall time since its start, or its length once it is complete
+    file: Text = ""  # present or last recording, on the recorder's machine
+    messages: Count = 0  # in that file
+    seconds: NotNegative = 0.0  # s of wall time, length so far
 
 
 class SaveMapRequest(Request):
@@ -148,7 +148,7 @@ class SaveMapRequest(Request):
 class SaveMapReply(Reply):
     """The world that was written."""
 
-    file: Text = ""  # path of NAME.yaml on the mapper's machine
+    file: Text = ""  # NAME.yaml on the mapper's machine
 
 
 class SaveModelRequest(Request):
@@ -160,7 +160,7 @@ class SaveModelRequest(Request):
 class SaveModelReply(Reply):
     """The model that was written."""
 
-    file: Text = ""  # path of NAME-precise.safetensors on the estimator's machine
+    file: Text = ""  # NAME-precise.safetensors on the estimator's machine
     version: Count = 0
 
 
@@ -170,16 +170,16 @@ class ConfigReply(Reply):
     service: Name = ""
     config: Text = ""  # the settings as JSON
     versions: dict[str, str] = {}  # noqa: RUF012
-    # versions of Python and packages, by name
-    protocol: Count = 0  # version of the message protocol (`PROTOCOL` in common/versions.py); 0 if unknown
-    host: Name = ""  # host name of the service's machine
-    uptime: NotNegative = 0.0  # s of wall time since the service's start
+    # of Python and packages, by name
+    protocol: Count = 0  # version of the messages; 0: unknown
+    host: Name = ""  # host name
+    uptime: NotNegative = 0.0  # s of wall time
 
 
 class ModelRequest(Request):
     """Query the estimator's map and weights."""
 
-    weights: bool = False  # include the weights themselves
+    weights: bool = False  # include the weights
 
 
 class ModelReply(Reply):
@@ -187,8 +187,8 @@ class ModelReply(Reply):
 
     estimator: Name = ""
     world: World | None = None  # the estimator's map
-    card: Text = ""  # the model card as JSON; empty if the model has no weights
-    file: Text = ""  # NAME.safetensors, the file of the weights (the card is NAME.json); empty if there are none
+    card: Text = ""  # model card as JSON; empty: no weights
+    file: Text = ""  # NAME.safetensors; the card is NAME.json
     size: Count = 0  # bytes of the weights
-    sha256: Name = ""  # SHA-256 of the weights, hexadecimal
-    weights: Bytes = np.zeros(0, np.uint8)  # the weights, if they were requested
+    sha256: Name = ""  # of the weights, hexadecimal
+    weights: Bytes = np.zeros(0, np.uint8)  # if requested

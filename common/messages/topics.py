@@ -60,11 +60,19 @@ class Query:
         return f"{ROOT}/{robot}/{self.name}" + (f"/{service}" if self.per_service else "")
 
 
-SCAN = Topic("scan", m.Scan, "simulator", 15, "newest", publisher_roles=ROBOT_ROLES, about="the laser scan")
+SCAN = Topic(
+    "scan",
+    m.Scan,
+    "simulator",
+    15,
+    "newest",
+    publisher_roles=ROBOT_ROLES,
+    about="the laser scan, stamped with the time of the beam that was measured first",
+)
 ODOM = Topic(
     "odom", m.Odom, "simulator", 15, "newest", publisher_roles=ROBOT_ROLES, about="dead reckoning, which drifts"
 )
-TRUTH = Topic("truth", m.Truth, "simulator", 15, "newest", about="true pose and velocity of the robot")
+TRUTH = Topic("truth", m.Truth, "simulator", 15, "newest", about="true state, from a simulator only")
 BELIEF = Topic(
     "belief",
     m.Belief,
@@ -72,9 +80,11 @@ BELIEF = Topic(
     15,
     "newest",
     publisher_roles=("estimator", "mapper"),
-    about="estimated pose, its uncertainty and free energy; while mapping, of the mapper",
+    about="posterior of the pose, with the stamp of the scan; while mapping, from the mapper",
 )
-PREDICTION = Topic("prediction", m.Prediction, "estimator", 15, "newest", about="the scan predicted for the belief")
+PREDICTION = Topic(
+    "prediction", m.Prediction, "estimator", 15, "newest", about="the scan predicted for the belief, with its stamp"
+)
 MAP = Topic("map", m.Map, "mapper", 0, "newest", about="the map so far, on change and every 5 s")
 FIELD = Topic(
     "field",
@@ -82,9 +92,16 @@ FIELD = Topic(
     "estimator",
     0,
     "all",
-    about="what the estimator learned while driving, on change and every 30 s",
+    about="distance field learned while driving, used for scans after the stamp; on change and every 30 s",
 )
-CMD_VEL = Topic("cmd_vel", m.CmdVel, "controller", 15, "newest", about="velocity command")
+CMD_VEL = Topic(
+    "cmd_vel",
+    m.CmdVel,
+    "controller",
+    15,
+    "newest",
+    about="velocity command, with the stamp of the scan that it responds to",
+)
 GOAL = Topic(
     "goal",
     m.Goal,
@@ -104,17 +121,17 @@ DRIVE = Topic(
     "newest",
     multiple_publishers=True,
     publisher_roles=CONTROL_ROLES,
-    about="velocity steered by hand; takes precedence over the goal",
+    about="velocity steered by hand; takes precedence over the goal for 0.5 s",
 )
 STATUS = Topic("status", m.Status, "controller", 15, "newest", latched=True, about="what the controller does, and why")
-PLAN = Topic("plan", m.Plan, "controller", 0, "newest", about="planned path, and obstacles that are not in the map")
+PLAN = Topic("plan", m.Plan, "controller", 0, "newest", about="planned path, and obstacles outside the map")
 PREFERENCE = Topic(
     "preference",
     m.Preference,
     "controller",
     0,
     "newest",
-    about="goal prior as a field, on change and every 5 s",
+    about="goal prior over known free space, on change and every 5 s",
 )
 HEALTH = Topic(
     "health",
@@ -124,7 +141,7 @@ HEALTH = Topic(
     "all",
     per_service=True,
     multiple_publishers=True,
-    about="counters of a service",
+    about="state and counters of a service",
 )
 
 TOPICS: tuple[Topic, ...] = (
@@ -160,20 +177,25 @@ SAMPLE = Query(
     about="simulate scans from given poses",
 )
 WORLD = Query(
-    "world", r.Request, r.WorldReply, "simulator", requester_roles=ALL_ROLES, about="world, scanner and robot as data"
+    "world", r.Request, r.WorldReply, "simulator", requester_roles=ALL_ROLES, about="world, scanner and robot"
 )
 LOCALISE = Query(
-    "localise", r.LocaliseRequest, r.Reply, "estimator", requester_roles=GOAL_ROLES, about="restart localisation"
+    "localise",
+    r.LocaliseRequest,
+    r.Reply,
+    "estimator",
+    requester_roles=GOAL_ROLES,
+    about="restart localisation, from a pose or globally",
 )
 PLAYER = Query("player", r.PlayerRequest, r.PlayerReply, "replay", about="control a replay")
-RECORDING = Query("recording", r.RecordRequest, r.RecordReply, "recorder", about="start or stop a recording")
+RECORDING = Query("recording", r.RecordRequest, r.RecordReply, "recorder", about="start, stop or query a recording")
 MODEL = Query(
     "model",
     r.ModelRequest,
     r.ModelReply,
     "estimator",
     requester_roles=ALL_ROLES,
-    about="the estimator's model: card, map, weights",
+    about="all that is needed to rebuild the estimator",
 )
 PREDICT = Query(
     "predict",
@@ -183,9 +205,19 @@ PREDICT = Query(
     requester_roles=COMPUTE_ROLES,
     about="predict scans from given poses",
 )
-SAVE_MAP = Query("save_map", r.SaveMapRequest, r.SaveMapReply, "mapper", about="write the map into files")
+SAVE_MAP = Query(
+    "save_map",
+    r.SaveMapRequest,
+    r.SaveMapReply,
+    "mapper",
+    about="write the map as NAME.yaml, NAME.pgm and NAME.tum (the path)",
+)
 SAVE_MODEL = Query(
-    "save_model", r.SaveModelRequest, r.SaveModelReply, "estimator", about="write what was learned while driving"
+    "save_model",
+    r.SaveModelRequest,
+    r.SaveModelReply,
+    "estimator",
+    about="write the field learned while driving, as NAME-precise.safetensors and NAME-precise.json (card)",
 )
 CONFIG = Query(
     "config",

@@ -17,14 +17,14 @@ class Robot(BaseModel):
 
     drive: Literal["holonomic", "differential"] = "holonomic"
     radius: Positive = 0.27  # m
-    max_speed: Positive = 1.0  # m/s, of the centre, in any direction
+    max_speed: Positive = 1.0  # m/s, in any direction
     max_turn: Positive = 2.0  # rad/s
     acceleration: Positive = 1.0  # m/s²
     turn_acceleration: Positive = 3.0  # rad/s²
-    dead_band: NotNegative = 0.0  # m/s, the base does not move at a lower speed
-    turn_dead_band: NotNegative = 0.0  # rad/s, nor turns at a lower rate
+    dead_band: NotNegative = 0.0  # m/s, slower commands do not move the base
+    turn_dead_band: NotNegative = 0.0  # rad/s, slower commands do not turn it
     latency: NotNegative = 0.0  # s, from a command to its effect
-    margin: Positive = 0.05  # m, gap to obstacles that the obstacle stop keeps
-    command_timeout: Positive = 0.2  # s, the robot brakes hard if it gets no new command for this time
-    command_age: Positive = 0.5  # s, commands that respond to older scans are ignored
-    braking: Positive = 5.0  # m/s², deceleration of hard braking; not used for planning
+    margin: Positive = 0.05  # m, gap that the obstacle stop keeps
+    command_timeout: Positive = 0.2  # s without a new command until the robot brakes hard
+    command_age: Positive = 0.5  # s, commands for older scans are ignored
+    braking: Positive = 5.0  # m/s², of hard braking

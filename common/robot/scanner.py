@@ -27,11 +27,10 @@ class Scanner(BaseModel):
     range_max: PositiveDistance  # m
     sigma: Distance  # m, standard deviation of a range
     mount: tuple[Coordinate, Coordinate, Angle] = (0.0, 0.0, 0.0)  # x m, y m, yaw rad in base_link
-    sigma_relative: Annotated[float, Field(ge=0, le=1)] = 0.0  # standard deviation as a share of the range,
-    # added to sigma in quadrature
+    sigma_relative: Annotated[float, Field(ge=0, le=1)] = 0.0  # part proportional to the range, added in quadrature
     first: Annotated[float, Field(ge=-2 * np.pi, le=2 * np.pi)] | None = None
-    # rad, direction of the first beam in the scanner's own frame, counter-clockwise from x; nil for -fov / 2
-    upside_down: bool = False  # mounted with a roll of 180 deg, so that the beams run clockwise seen from above
+    # rad, first beam in the scanner's frame, counter-clockwise; nil: -fov / 2
+    upside_down: bool = False  # a roll of 180 deg: beams run clockwise seen from above
 
     @model_validator(mode="after")
     def _check_range_limits(self) -> Scanner:
