@@ -22,8 +22,10 @@ def test_the_page_lists_all_topics_and_fields():
         assert row.about in text
     for cls in (Scan, Belief):
         section = text.split(f"### {cls.__name__}\n")[1].split("###")[0]
-        assert all(f"\n{name}: " in section for name in cls.model_fields.keys() - Stamped.model_fields.keys())
+        own = cls.model_fields.keys() - Stamped.model_fields.keys()
+        assert all(f"\n{name}: " in section or f"\n{name} = " in section for name in own)
     assert "\nmount: Pose = " in text  # a type and a default
+    assert "\nyaw = 0.0 " in text  # a default that shows the type
     assert "+inf is nothing within range_max" in text  # a comment beside its field
     assert "the negative gradient of accuracy" in " ".join(text.split())  # a comment below its field
 
