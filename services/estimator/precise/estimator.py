@@ -62,9 +62,9 @@ MAX_SEARCH_INTERVAL = 150  # scans between two searches without success; the int
 WRONG_MATCH = 1e-6
 # As a share of the scanner's noise: smaller errors of the map cannot be told from the noise of one scan.
 SIGNIFICANT_MAP_ERROR = 0.25
-# Share of the beams at surfaces which the map lacks that happen to end at one of its surfaces. At nine of ten wrong
-# poses in buildings of development, the map explained less than 5 to 9 %.
-EXPLAINED_BY_CHANCE = 0.05
+# Share of the beams at surfaces which the map lacks that happen to end at one of its surfaces, at most: at nine of ten
+# wrong poses in buildings of development, the map explained less than 5 to 9 %.
+EXPLAINED_BY_CHANCE = 0.1
 UNKNOWN_SIGMA_M = 100.0  # published where the model does not know what to expect
 TARGET_BEAMS = 2000  # a scan with at least twice as many is thinned, because the time of a search grows with the beams
 
@@ -211,6 +211,7 @@ class PreciseEstimator:
             observation.range_max,
             self._optimiser,
             self._precision.map_error,
+            self._precision.shared_error,
             self._precision.changed,
             self._precision.offset,
         )
@@ -495,13 +496,14 @@ class PreciseEstimator:
 
         Returns the view with the map's errors.
         """
-        if not self._precision.scans:
-            self._precision.learn_map_error(view, self.modes[0].pose)
-        error, offset = self._precision.map_error, self._precision.offset
+        precision = replace(self._precision)
+        if not precision.scans:
+            precision.learn_map_error(view, self.modes[0].pose)
+        error, offset = precision.map_error, precision.offset
         significant = SIGNIFICANT_MAP_ERROR * view.likelihood.sigma
         if error < max(view.map_error, significant) and abs(offset - view.map_offset) < significant:
             return view
-        view = replace(view, map_error=error, map_offset=offset)
+        view = replace(view, map_error=error, shared_error=precision.shared_error, map_offset=offset)
         self.modes, self._start = [], start
         self._search_for_hypotheses(view)
         return view

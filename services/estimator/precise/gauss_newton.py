@@ -98,7 +98,8 @@ class View:
     ranges: Array  # (B,) m
     range_max: float  # m
     optimiser: Optimiser = field(default_factory=GaussNewton)
-    map_error: float = 0.0  # m, standard deviation beyond what the model states, alike for neighbouring beams
+    map_error: float = 0.0  # m, standard deviation beyond what the model states
+    shared_error: float = 0.0  # share of the variance of the map's error that is alike for neighbouring beams
     changed: float = 0.25  # share of surfaces that the map does not show as they are
     map_offset: float = 0.0  # m, mean distance of the real surfaces behind those that the model predicts
     _last: list[_PredictedScans] = field(default_factory=list, init=False, repr=False)
@@ -165,11 +166,12 @@ class View:
 
     @cached_property
     def _correlation(self) -> float:
-        """Factor on the covariance of the model's error, because the map's error is alike for neighbouring beams."""
-        if not self.map_error or len(self.points) < 2:
+        """Factor on the covariance of the model's error, because part of it is alike for neighbouring beams."""
+        if len(self.points) < 2:
             return 1.0
         spacing = float(np.median(np.hypot(*np.diff(self.points, axis=0).T)))
-        return max(1.0, CORRELATED_M / max(spacing, 1e-3))
+        alike = max(1.0, CORRELATED_M / max(spacing, 1e-3))  # beams
+        return 1 + self.shared_error * (alike - 1)
 
     def surface_evidence(
         self, poses: Array, extra_sigma: float = 0.0, skip: npt.NDArray[np.bool_] | None = None

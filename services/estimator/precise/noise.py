@@ -29,3 +29,8 @@ def estimate_noise(ranges: Array, angles: Array) -> float:
     if not len(bend):
         return MIN_SIGMA_M
     return max(MIN_SIGMA_M, float(NORMAL_MAD * np.median(np.abs(bend)) / np.sqrt(2 + turn**2)))
+
+
+def robust_excess(errors: Array, stated: Array) -> float:
+    """Variance in m² of errors (K,) beyond what is ``stated``, (K,) or (), however large some of them are."""
+    return (NORMAL_MAD * float(np.median(np.abs(errors)))) ** 2 - float(np.median(stated))

@@ -17,7 +17,7 @@ from common.geometry import se2
 from services.estimator.precise.gauss_newton import View, polish
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.motion_model import MotionNoise
-from services.estimator.precise.precision import robust_excess
+from services.estimator.precise.noise import robust_excess
 from services.estimator.precise.settings import PreciseSettings
 
 if TYPE_CHECKING:

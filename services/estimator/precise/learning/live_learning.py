@@ -31,8 +31,7 @@ from services.estimator.precise.learning.field_learning import (
 from services.estimator.precise.learning.map_alignment import align_to_map
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.precise.likelihood import Likelihood
-from services.estimator.precise.noise import estimate_noise
-from services.estimator.precise.precision import robust_excess
+from services.estimator.precise.noise import estimate_noise, robust_excess
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array

@@ -1,0 +1,72 @@
+"""What the estimator learns of the scanner's noise and the map's errors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.geometry import se2
+from services.estimator.precise.gauss_newton import View
+from services.estimator.precise.likelihood import Likelihood
+from services.estimator.precise.precision import Precision, error_covariance
+from services.estimator.shared.generative_models import Expected, RayCaster
+from tests.estimator.models import ROOM
+
+MOUNT = np.array([0.2, 0.05, 0.3])
+ANGLES = np.deg2rad(np.linspace(-135, 135, 622))
+STATED = 0.02  # m, noise
+
+
+class WrongMap(RayCaster):
+    """A map whose surfaces are farther away by 2 cm or by nothing, in turns along the scan."""
+
+    ERROR = 0.02  # m
+
+    def expect(self, lasers, angles):
+        expected = super().expect(lasers, angles)
+        wrong = np.arange(len(angles)) // 60 % 2 == 0
+        return Expected(expected.ranges + self.ERROR * wrong * expected.slope, expected.scale, expected.jacobian)
+
+
+def learned(model, noise, seed):
+    """The map's error in m as learned from 20 scans with ``noise`` m that is stated as 2 cm."""
+    rng, precision = np.random.default_rng(seed), Precision()
+    for pose in ROOM.sample_poses(20, rng, 0.3):
+        clean = ROOM.ray_distances(se2.compose(pose, MOUNT)[None], ANGLES)[0]
+        ranges = clean + noise * rng.standard_normal(len(clean))
+        likelihood = precision.likelihood(Likelihood(sigma=STATED), ranges, ANGLES)
+        precision.learn_map_error(
+            View(model, likelihood, MOUNT, ANGLES, ranges, 25.0, map_error=precision.map_error), pose
+        )
+    return precision.map_error
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.02, 0.04])
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=5)
+def test_noise_is_no_error_of_the_map(noise, seed):
+    """However large the noise is, and however it was stated."""
+    assert learned(RayCaster(ROOM), noise, seed) < 0.15 * noise
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.02, 0.04])
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=5)
+def test_error_of_the_map(noise, seed):
+    """Half of the surfaces are 2 cm off, so the error has a standard deviation of 1 cm and a mean of 1 cm."""
+    assert learned(WrongMap(ROOM), noise, seed) == pytest.approx(WrongMap.ERROR / np.sqrt(2), rel=0.2)
+
+
+@given(st.lists(st.tuples(st.integers(0, 3), st.floats(-1, 1), st.floats(0.01, 1)), min_size=2, max_size=20))
+def test_covariance_of_all_pairs(beams):
+    """The fast sum over pieces is that over all pairs of two different beams on the same piece."""
+    pieces, errors, weights = (np.array(each) for each in zip(*sorted(beams), strict=True))
+    total = norm = 0.0
+    for i in range(len(beams)):
+        for j in range(len(beams)):
+            if i != j and pieces[i] == pieces[j]:
+                total += weights[i] * weights[j] * errors[i] * errors[j]
+                norm += weights[i] * weights[j]
+    assert error_covariance(errors, pieces, weights) == pytest.approx(total / norm if norm else 0.0, abs=1e-6)
