@@ -24,6 +24,17 @@ _PROBLEMS = {
     "float_parsing": "expected a number, not {input}",
     "model_type": "expected keys with values, such as {{x: 1, y: 2}}, not {input}",
     "model_attributes_type": "expected keys with values, such as {{x: 1, y: 2}}, not {input}",
+    "int_type": "expected a whole number, not {input}",
+    "int_parsing": "expected a whole number, not {input}",
+    "int_from_float": "expected a whole number, not {input}",
+    "finite_number": "expected a finite number, not {input}",
+    "bool_type": "expected true or false, not {input}",
+    "bool_parsing": "expected true or false, not {input}",
+    "literal_error": "expected {expected}, not {input}",
+    "greater_than": "must be greater than {gt:.10g}, not {input}",
+    "greater_than_equal": "must be at least {ge:.10g}, not {input}",
+    "less_than": "must be less than {lt:.10g}, not {input}",
+    "less_than_equal": "must be at most {le:.10g}, not {input}",
     "too_short": "too few entries: at least {min_length} are needed, not {actual_length}",
     "too_long": "too many entries: at most {max_length} are allowed, not {actual_length}",
 }
@@ -39,7 +50,8 @@ def first_problem(error: ValidationError) -> str:
     """The problem of the first error of a validation in plain words."""
     first = error.errors(include_url=False)[0]
     context = first.get("ctx", {})
-    value = repr(str(first["input"])[:40])
+    given = first["input"]
+    value = f"{given}" if isinstance(given, (int, float)) else repr(str(given)[:40])
     if first["type"] in _PROBLEMS:
         return _PROBLEMS[first["type"]].format(input=value, **context)
     if context.get("pattern") == NAME_PATTERN:

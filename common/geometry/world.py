@@ -18,8 +18,8 @@ from common.geometry import building, ros_map
 from common.geometry.floors import Floor, Lift, bounds_of, check_floors, corners_of, floor_at, no_floor, place_text
 from common.geometry.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from common.geometry.shapes import Box, Circle, Degrees, Obstacle, Ring, WorldName, WorldPart, check_ring
-from common.geometry.yaml_text import TooLargeError, parse_yaml
 from common.limits import Coordinate
+from common.yaml_text import NOT_YAML, TooLargeError, parse_yaml
 
 if TYPE_CHECKING:
     from common.geometry.outline_index import OutlineIndex
@@ -29,7 +29,6 @@ __all__ = ["NOT_YAML", "Box", "Circle", "Obstacle", "Start", "World", "known_wor
 
 FOLDER = Path(__file__).resolve().parents[2] / "worlds"
 
-NOT_YAML = (yaml.YAMLError, ValueError)  # raised by `parse_yaml`
 
 POINTS_PER_BLOCK = 100_000  # a shapely point needs a few hundred bytes
 MAX_SAMPLING_ATTEMPTS = 50  # after this many attempts without a result, a grid counts as having no suitable place

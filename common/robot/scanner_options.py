@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from common.errors import UserError, first_fault
@@ -14,6 +13,7 @@ from common.geometry.pose_text import parse_pose
 from common.geometry.shapes import Degrees
 from common.limits import Coordinate
 from common.robot.scanner import SCANNERS, Scanner
+from common.yaml_text import NOT_YAML, parse_yaml
 
 UNITS = {
     "fov_deg": "degrees",
@@ -69,7 +69,7 @@ def load_scanner(name: str) -> Scanner:
         return SCANNERS[name]
     path = Path(name)
     try:
-        data: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
+        data = parse_yaml(path.read_text(encoding="utf-8"))
         return _ScannerFile.model_validate(data).scanner()
     except (FileNotFoundError, NotADirectoryError):
         raise UserError(f"no scanner {name!r}: choose one of {', '.join(SCANNERS)}, or give a file") from None
@@ -79,7 +79,7 @@ def load_scanner(name: str) -> Scanner:
         raise UserError(f"scanner {path}: {first_fault(error)}{unit}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"scanner {path}: cannot be read ({error})") from None
-    except (yaml.YAMLError, ValueError) as error:
+    except NOT_YAML as error:
         raise UserError(f"scanner {path}: not valid YAML ({' '.join(str(error).split())})") from None
 
 

@@ -31,6 +31,7 @@ from pydantic_settings import (
 from common.bus.bus import DEFAULT_ENDPOINT, Link
 from common.bus.security import Credentials, read_credentials
 from common.errors import UserError, first_fault, first_problem
+from common.yaml_text import NOT_YAML, parse_yaml
 
 _file_values: ContextVar[dict[str, Any]] = ContextVar("_file_values")
 S = TypeVar("S", bound="ServiceSettings")
@@ -226,11 +227,10 @@ def load_section(cls: type[M], path: Path | None, name: str, **options: object) 
 
 def _load_mapping(path: Path) -> dict[str, Any]:
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+        data = parse_yaml(path.read_text(encoding="utf-8")) or {}
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror})") from None
-    # A date such as 2020-13-45 raises ValueError; 20 000 nested brackets raise RecursionError.
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    except NOT_YAML as error:
         raise UserError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
     if not isinstance(data, dict):
         raise UserError(f"{path}: expected a mapping of settings")

@@ -15,13 +15,13 @@ from mcap.stream_reader import StreamReader
 from pydantic import ValidationError
 
 from common.errors import UserError
-from common.geometry.world import NOT_YAML, World
-from common.geometry.yaml_text import parse_yaml
+from common.geometry.world import World
 from common.messages.definitions import Stamped
 from common.messages.topics import Topic, topic_of
 from common.messages.wire import DecodeError
 from common.robot.robot import Robot
 from common.robot.scanner import Scanner
+from common.yaml_text import NOT_YAML, parse_yaml
 from services.recorder.files.chunks import MAGIC, records_of
 from services.recorder.files.index import messages_in_order, summary_of
 from services.recorder.files.writer import PROFILE

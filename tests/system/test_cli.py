@@ -21,7 +21,7 @@ NO_SESSION = ("--connect", "tcp/127.0.0.1:9")  # the discard port, on which noth
     [
         (("up", "--world", "nowhere"), "give a file or one of corridor, maze, office"),
         (("up", "--model", "exakt", "--port", "0"), "no model 'exakt': give learned, exact"),
-        (("up", "--drive", "sideways", "--port", "0"), "drive: Input should be 'holonomic' or 'differential'"),
+        (("up", "--drive", "sideways", "--port", "0"), "drive: expected 'holonomic' or 'differential', not 'sideways'"),
         (("up", "--config", "{tmp}/wrong.yaml", "--port", "0"), "speed: unknown key"),
         (("up", "--world", "maze", "--estimator", "paper", "--port", "0"), "presage train --world maze"),
         (("demo", "--world", "{tmp}/bad.yaml"), "bad.yaml: not valid YAML"),

@@ -84,6 +84,7 @@ def test_name_defaults_to_that_of_the_file(tmp_path):
     ("text", "message"),
     [
         ("name: [", "not valid YAML"),
+        ("floors:\n  ground: a.yaml\n  ground: b.yaml\n", "not valid YAML (line 3: 'ground' is given twice)"),
         ("[" * 200_000, "bad.yaml: more than 100 levels"),
         ("obstacles:\n" + "- {}\n" * 600_000, "bad.yaml: more than 1000000 values"),
         ("name: x", "boundary: missing"),

@@ -106,12 +106,13 @@ def test_empty_values_count_only_as_arguments(load, monkeypatch):
 @pytest.mark.parametrize(
     ("argv", "file", "words"),
     [
-        (["--size", "101"], "", ["size", "less than or equal to 100", "--size", "PRESAGE_SIZE"]),
-        (["--size", "many"], "", ["size", "integer"]),
+        (["--size", "101"], "", ["size", "must be at most 100", "--size", "PRESAGE_SIZE"]),
+        (["--size", "many"], "", ["size: expected a whole number, not 'many'"]),
         (["--robot", "a/b"], "", ["robot", "--robot", "PRESAGE_ROBOT"]),
         (["--robot", "*"], "", ["robot: '*' is not valid; expected: name of the robot"]),
         (["--config", "nowhere.yaml"], "", ["nowhere.yaml", "cannot be read"]),
         ([], "size: [", ["not valid YAML"]),
+        ([], "size: 1\nlabel: a\nsize: 2\n", ["settings.yaml: not valid YAML (line 3: 'size' is given twice)"]),
         ([], "- 1\n- 2\n", ["a mapping of settings"]),
         ([], "thing: 7\n", ["thing", "a mapping of settings"]),
         ([], "thing: {colour: red}\n", ["colour", "settings.yaml"]),
