@@ -5,7 +5,7 @@
 | - | a goal with `explore` | EXPLORING |
 | EXPLORING, RETURNING | a viewpoint is worth a visit | EXPLORING |
 | EXPLORING, RETURNING | no viewpoint is worth a visit | RETURNING |
-| RETURNING | the robot has arrived and stands | FINISHED |
+| RETURNING | the robot has arrived | FINISHED |
 | RETURNING | the way back stays refused | FAILED |
 
 A viewpoint is given up if it is refused, or if the robot does not move towards it for `STALLED_NS`.
@@ -35,8 +35,6 @@ PAUSE_NS = 2_000_000_000  # how long the robot stands at a goal of a user before
 STALLED_NS = 8_000_000_000  # after this time without a motion of `STALLED_M`, the goal counts as unreachable
 STALLED_M = 0.2
 VIEWPOINT_TOLERANCE_M = 0.1
-HOME_TOLERANCE_M = 0.005  # of the goal at the start; below `RETURNED_M`, so that a robot that reaches it has returned
-RETURNED_M = 0.02  # if the robot stopped late and stands farther than this from the start, it tries again
 SAME_PLACE_M = 0.1  # a new viewpoint this close to the present goal does not replace it
 
 
@@ -102,11 +100,8 @@ class Explorer:
             self.map.graph, poses, self._arrivals, field_of_view, self._pose, home, target, self._unreachable
         )
 
-    def update(self, state: GoalState, stamp_ns: int, *, moving: bool) -> None:
-        """Processes the state of the robot's goal after a scan.
-
-        ``moving``: the latest command is a motion. A robot may stop late, beyond the goal that it has reached.
-        """
+    def update(self, state: GoalState, stamp_ns: int) -> None:
+        """Processes the state of the robot's goal after a scan."""
         if not self.active or not (self.paused or self.goal is not None):
             return
         if state.phase is Phase.UNLOCALISED:
@@ -117,7 +112,7 @@ class Explorer:
             self._note_motion(stamp_ns)
             stalled = stamp_ns - self._last_moved[1] > STALLED_NS
             if self.phase == "returning":
-                self.viewpoint_due |= self._update_return(state, stalled=stalled, moving=moving)
+                self.viewpoint_due |= self._update_return(state, stalled=stalled)
             else:
                 self.viewpoint_due |= self._update_viewpoint(self.goal, state, stalled=stalled)
 
@@ -137,15 +132,14 @@ class Explorer:
         if np.hypot(*(self._pose - place)[:2]) > STALLED_M or not 0 < since_ns <= stamp_ns:
             self._last_moved = self._pose, stamp_ns
 
-    def _update_return(self, state: GoalState, *, stalled: bool, moving: bool) -> bool:
+    def _update_return(self, state: GoalState, *, stalled: bool) -> bool:
         """Ends the exploration if the robot is back, or cannot get back; returns whether it must try again."""
-        reached = state.phase is Phase.REACHED
-        if state.active or (reached and moving):
+        if state.active:
             return False
-        if reached and np.hypot(*(self._pose - self.home)[:2]) <= RETURNED_M:
+        if state.phase is Phase.REACHED:
             self.phase = "finished"
         elif stalled:
-            self.phase = "finished" if reached else "failed"
+            self.phase = "failed"
         return self.active  # a refused return is tried again, because the next attempt may find another path
 
     def _update_viewpoint(self, goal: Goal, state: GoalState, *, stalled: bool) -> bool:
@@ -170,7 +164,7 @@ class Explorer:
         if same and phase == self.phase and under_way:
             return None
         self.phase = phase
-        goal = Goal(stamp_ns=0, seq=self.seq, pose=Pose.of(pose), tolerance=HOME_TOLERANCE_M)
+        goal = Goal(stamp_ns=0, seq=self.seq, pose=Pose.of(pose))
         if viewpoint is not None:
             yaw_tolerance = None if half_field_of_view >= np.pi else half_field_of_view / 2
             goal = goal.model_copy(update={"tolerance": VIEWPOINT_TOLERANCE_M, "yaw_tolerance": yaw_tolerance})

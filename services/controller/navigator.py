@@ -220,7 +220,7 @@ class Navigator:
         moving = is_moving(self._command.velocity)
         self.goal_state.update_progress(belief.stamp_ns, self.decision, moving=moving, limited_by_scan=limited_by_scan)
         if self.explorer is not None:
-            self.explorer.update(self.goal_state, belief.stamp_ns, moving=moving)
+            self.explorer.update(self.goal_state, belief.stamp_ns)
         status = self._add_exploration(self.goal_state.status(belief.stamp_ns, shown_distance))
         if (terms := self.decision.terms) is not None:
             status = status.model_copy(update={"energy": PolicyEnergy(**terms)})
@@ -303,7 +303,9 @@ class Navigator:
             self.policy.interrupt()
             turn = self._turn_to_goal_heading(pose, goal)
             if turn is None:
-                self.goal_state.reach(_arrival(belief, goal))
+                # Not before the robot stands: one that turns while it brakes may pass the goal.
+                if self._has_stood(belief.stamp_ns, 0.0):
+                    self.goal_state.reach(_arrival(belief, goal))
                 return np.zeros(3)
             self.decision = Decision(turn, "at the goal: turning into its heading")
             return turn
@@ -334,10 +336,15 @@ class Navigator:
             return None
         self.policy.interrupt()
         self.decision = Decision(velocity)
-        recent_motion = self._command.motion_until_effect(belief.stamp_ns, delay + STANDING_TIME_S)
-        if not (recent_motion.any() or velocity.any() or self._command.velocity.any()) and docking.arrived(pose):
+        if not velocity.any() and self._has_stood(belief.stamp_ns, STANDING_TIME_S) and docking.arrived(pose):
             self.goal_state.reach(_arrival(belief, goal))
         return velocity
+
+    def _has_stood(self, stamp_ns: int, seconds: float) -> bool:
+        """Whether the base has stood for this time before a stamp, and no command is still to take effect."""
+        delay = delay_until_effect(self.robot, self._scan)
+        motion = self._command.motion_until_effect(stamp_ns, delay + seconds)
+        return not (motion.any() or self._command.velocity.any())
 
     def _interrupt_docking(self) -> None:
         if self._docking is not None:

@@ -8,7 +8,6 @@ from common.geometry import se2
 from common.geometry.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from common.messages.definitions import Drive, Map, Twist
 from common.robot.robot import Robot
-from services.controller.goal_state import Phase
 from services.controller.growing_map import PlannedMap
 from services.controller.navigator import Navigator
 from services.controller.policies.exploration import Viewpoint
@@ -133,20 +132,6 @@ def test_viewpoints_then_the_way_back():
     assert 5.9 < status.exploration.path < 7.5
     assert status.state == "reached"
     assert robot.navigator.take_exploration_state() is None
-
-
-def test_a_robot_that_stops_late_returns_again():
-    robot = exploring_robot()
-    robot.explore((4.0, 2.5))
-    robot.until(lambda _: robot.navigator.explorer.viewpoint_due)
-    robot.explore(None)
-    robot.until(lambda _: robot.navigator.goal_state.phase is Phase.REACHED)
-    robot.pose = robot.pose - [0.06, 0.0, 0.0]
-    robot.until(lambda _: robot.navigator.explorer.viewpoint_due)
-    robot.explore(None)
-    assert robot.step().exploration.phase == "returning"
-    robot.until(lambda status: status.exploration.phase == "finished")
-    assert np.hypot(*(robot.pose - START)[:2]) < 0.01
 
 
 def test_a_goal_of_a_user_takes_precedence():

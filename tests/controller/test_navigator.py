@@ -32,6 +32,13 @@ def test_goal_is_reached(yaw):
     assert path_length([pose for *_, pose in log]) < 1.02 * np.hypot(7, 1)
 
 
+def test_robot_stands_when_the_goal_is_reached():
+    navigator = Navigator(chosen_policy=GeodesicPolicy(Robot(), ROOM), world=ROOM)
+    navigator.on_goal(goal(3, 2, yaw=-2, yaw_tolerance=0.05))
+    log = session(navigator, [1.5, 2.5, 2], [None] * 150, ROOM)
+    assert len({tuple(pose) for _, status, pose in log if status.state == "reached"}) == 1
+
+
 def test_stamps_of_commands():
     command, status = Navigator().step(belief(123, [1, 1, 0]))
     assert command.stamp_ns == status.stamp_ns == 123
@@ -77,7 +84,7 @@ def test_stands_at_the_goal_of_the_best_guess():
     log = session(navigator, [8.495, 2, 0], [None] * 90, ROOM, state="ambiguous")
     assert not any("refused" in status.reason for _, status, _ in log)
     assert np.hypot(*(log[-1][2][:2] - [8.5, 2])) < 0.02
-    ((_, status, _),) = session(navigator, log[-1][2], [None], ROOM, first=90)
+    _, status, _ = session(navigator, log[-1][2], [None] * 5, ROOM, first=90)[-1]
     assert status.state == "reached"
 
 

@@ -149,21 +149,21 @@ def controller_events() -> Iterator[Event]:
     """Goals refused, accepted, reached and cancelled; unsure, repeated and missing beliefs; manual driving."""
     rng = np.random.default_rng(SEED)
     target = np.array([5.2, 1.5])
-    for number in [*range(39), 55, 72, 73, *range(90, 112)]:
+    for number in [*range(48), 64, 81, 82, *range(90, 112)]:
         state = "localising" if number < 4 else "ambiguous" if number in {10, 11} else "tracking"
         position = np.array([3.2, 1.4]) + (target - [3.2, 1.4]) * min(1.0, max(0, number - 4) / 31)
         goal = {1: Goal(stamp_ns=0, seq=1, pose=Pose(x=30.0, y=1.0)),
                 2: Goal(stamp_ns=0, seq=2, pose=Pose(x=5.2, y=1.5), tolerance=0.2),
-                38: Goal(stamp_ns=0, seq=3, pose=Pose(x=9.0, y=1.5)),
-                73: Goal(stamp_ns=0, seq=4, pose=Pose(x=9.0, y=1.5), cancel=True),
+                47: Goal(stamp_ns=0, seq=3, pose=Pose(x=9.0, y=1.5)),
+                82: Goal(stamp_ns=0, seq=4, pose=Pose(x=9.0, y=1.5), cancel=True),
                 90: Goal(stamp_ns=0, seq=5, pose=Pose(x=3.4, y=1.5))}.get(number)  # fmt: skip
         if goal is not None:
             yield Event.of(GOAL, goal)
         scan = scan_at(number, np.array([*position, 0.1]), rng)
         if number in range(92, 104):  # stands under manual control until the goal becomes active again
             yield Event.of(DRIVE, Drive(stamp_ns=0, twist=Twist(vx=-0.3, vy=2.0, wz=0.5) if number < 96 else Twist()))
-        if number in {18, 19, 38, 55, 72}:  # a person in front of the robot, from 38 on closer
-            near = np.where(np.abs(scan.angles()) < 0.3, 0.25 if number < 38 else 0.12, scan.ranges)
+        if number in {18, 19, 47, 64, 81}:  # a person in front of the robot, from 47 on closer
+            near = np.where(np.abs(scan.angles()) < 0.3, 0.25 if number < 47 else 0.12, scan.ranges)
             scan = scan.model_copy(update={"ranges": near.astype(np.float32)})
         yield Event.of(SCAN, scan)
         belief = Belief(
