@@ -21,8 +21,9 @@ from common.robot.scan_geometry import Sweep
 from services.controller.policies import expected_free_energy as efe
 from services.controller.policies.decision import Decision
 from services.controller.policies.expected_free_energy import NATS_PER_METRE, ExpectedFreeEnergy
-from services.controller.policies.motion_model import turn_to_attractor
+from services.controller.policies.motion_model import is_moving, turn_to_attractor
 from services.controller.policies.policy_selection import Surroundings, select_policy
+from services.controller.policies.recovery import BACKING_OFF, back_off
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from common.robot.robot import Robot
     from common.robot.scan_geometry import Sector
     from services.controller.policies.geodesic_field import CostField, FreeSpaceGraph
+    from services.controller.policies.recovery import Recovery
 
 MIN_WEIGHT = 1e-3  # hypotheses with less weight are ignored: without them, the belief would be tracked
 # A hypothesis counts as at least this probable. The goal is only reached once all others are excluded, however
@@ -108,12 +110,19 @@ class ActiveLocaliser:
     """Chooses velocities while the pose is ambiguous or unknown."""
 
     def __init__(
-        self, robot: Robot, graph: FreeSpaceGraph, min_point_distance: float, *, may_turn: bool = True
+        self,
+        robot: Robot,
+        graph: FreeSpaceGraph,
+        min_point_distance: float,
+        recovery: Recovery,
+        *,
+        may_turn: bool = True,
     ) -> None:
         """Keeps ``min_point_distance`` m from the robot's centre to scan points. ``may_turn``: any heading will do."""
         self.may_turn = may_turn
         self.robot = robot.model_copy(update={"max_speed": min(robot.max_speed, MAX_SPEED)})
         self.min_point_distance = min_point_distance
+        self._recovery = recovery
         self.use_graph(graph)
         self.reset()
 
@@ -171,17 +180,22 @@ class ActiveLocaliser:
         surroundings = Surroundings(
             _no_walls, points, static, 0.0, self.min_point_distance, field_of_view=field_of_view, may_turn=self.may_turn
         )
+        if self._recovery.is_active(belief.stamp_ns):
+            action = back_off(velocity, surroundings, self.robot).action
+            return Decision(action, BACKING_OFF, "blocked", recovering=True)
         poses, _ = _likely_hypotheses(belief)
         if len(poses) > 1:
             self._unknown_since_ns = None
             if self._place is not None:
                 self._visited.give_up(self._place[0][:2])
+                self._recovery.watch(belief.stamp_ns, moving=is_moving(velocity))
                 return self._drive_to(poses[0], *self._place, surroundings, velocity, len(poses))
             return Decision(reason=f"{len(poses)} places are possible: choosing where to drive to tell them apart")
         if self._unknown_since_ns is None or belief.stamp_ns < self._unknown_since_ns:
             self._unknown_since_ns = belief.stamp_ns
         if belief.stamp_ns - self._unknown_since_ns < INITIAL_WAIT_NS:
             return Decision(reason=f"the belief is {belief.state}: standing while the estimator searches", state="lost")
+        self._recovery.watch(belief.stamp_ns, moving=is_moving(velocity))
         return self._drive_to_open_space(belief, scan, surroundings, velocity)
 
     def _candidate_places(self, pose: Array) -> tuple[Array, Array]:

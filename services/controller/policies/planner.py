@@ -22,6 +22,7 @@ from services.controller.policies.goal_check import near_wall, refusal_text, wal
 from services.controller.policies.motion_model import STEP_S, delay_until_effect, is_moving, turn_to_attractor
 from services.controller.policies.obstacles import TemporaryObstacles
 from services.controller.policies.policy_selection import PoseBelief, Surroundings, least_distance, select_policy
+from services.controller.policies.recovery import BACKING_OFF, STUCK_AFTER_NS, Recovery, back_off
 from services.controller.policies.scan_information import ScanInformation
 
 if TYPE_CHECKING:
@@ -34,8 +35,6 @@ if TYPE_CHECKING:
 OBSTACLE_GAP_M = 0.06  # between footprint and unmapped obstacles: the scanner's noise, and half a cell
 REPLAN_PERIOD_NS = 400_000_000  # minimum time between two plans when obstacles near the path change
 REPLAN_PERIOD_FAR_NS = 1_500_000_000  # the same when obstacles change elsewhere
-STUCK_AFTER_NS = 3_000_000_000  # time without motion after which the robot backs off
-BACK_OFF_NS = 3_000_000_000  # how long it backs off
 BLIND_AHEAD = "a differential base drives ahead, but the scanner does not see there: mount the scanner facing ahead"
 MIN_PROGRESS_M = 0.004  # near the goal, the robot counts as stuck unless it gets nearer by this much
 UNREACHABLE_M = 100.0  # counts as the distance to a goal to which no path leads
@@ -59,7 +58,10 @@ class GeodesicPolicy:
         self.free = NO_MAP if world is None else FreeSpace.of(world)
         self.graph = FreeSpaceGraph(self.free, robot.radius)
         self.obstacles = TemporaryObstacles(self.free)
-        self.localiser = ActiveLocaliser(robot, self.graph, robot.radius + OBSTACLE_GAP_M, may_turn=not keep_heading)
+        self._recovery = Recovery()
+        self.localiser = ActiveLocaliser(
+            robot, self.graph, robot.radius + OBSTACLE_GAP_M, self._recovery, may_turn=not keep_heading
+        )
         self.field: CostField | None = None  # to the goal, around obstacles unless `ignores_obstacles`
         self.ignores_obstacles = False  # whether the field leads through obstacles, because they leave no path
         self.field_changed = False  # set with each new field, and cleared by the caller that publishes it
@@ -76,8 +78,6 @@ class GeodesicPolicy:
         # Least distance from the goal in m, and the stamp at which the robot got there; None until it is near the goal.
         self._nearest: tuple[float, int] | None = None
         self._obstructed_ns = -STUCK_AFTER_NS  # when an obstacle was last near the robot or the goal
-        self._standing_since_ns: int | None = None
-        self._backing_off_until_ns: int | None = None
 
     def refusal(self, goal: Array) -> str | None:
         """The reason why a goal (2,) m cannot be reached by the map, with the nearest place that can, or None."""
@@ -127,7 +127,8 @@ class GeodesicPolicy:
 
     def interrupt(self) -> None:
         """Stops watching for progress: a robot that does not drive to its goal is not stuck."""
-        self._standing_since_ns = self._backing_off_until_ns = self._nearest = None
+        self._nearest = None
+        self._recovery.reset()
 
     def resume(self) -> None:
         """Does nothing: `interrupt` discarded nothing that has to be restored."""
@@ -166,8 +167,10 @@ class GeodesicPolicy:
         if not len(path):
             return Decision(reason="no way to the goal from here", state="blocked")
         surroundings = self._surroundings(pose, points, moving)
-        if self._backing_off_until_ns is not None and stamp_ns < self._backing_off_until_ns:
-            return self._back_off(pose, velocity, surroundings, path)
+        if self._recovery.is_active(stamp_ns):
+            selected = back_off(velocity, surroundings, self.robot)
+            motion = se2.transform(pose, selected.motion[:, :2])
+            return Decision(selected.action, BACKING_OFF, "blocked", path, motion, recovering=True)
         assert self.field is not None  # noqa: S101 - there is a path
         if (stop := self._stop_short(stamp_ns, pose, self.field.goal, surroundings, path)) is not None:
             return stop
@@ -178,7 +181,7 @@ class GeodesicPolicy:
             selected.action, attractor, self.robot, may_turn=surroundings.may_turn, forward=surroundings.forward
         )
         # Judged by the command that was sent, not by the action: the limits may have stopped the robot.
-        self._watch_progress(stamp_ns, moving=is_moving(velocity))
+        self._recovery.watch(stamp_ns, moving=is_moving(velocity))
         standing = not selected.action.any()
         reason = self._reason(pose, surroundings, hindered=selected.hindered, standing=standing)
         state: DecisionState = "blocked" if reason and standing else "navigating"
@@ -217,12 +220,11 @@ class GeodesicPolicy:
         """Moves so that the pose becomes known. Without `epistemic`, drives to the goal from the best hypothesis."""
         if self._scan is None:
             return Decision(reason=f"standing until localised: the belief is {belief.state}")
+        self._nearest = None  # near the goal, the robot is not stuck while its pose is not known
         if self.epistemic or belief.state != "ambiguous":
-            self.interrupt()
             points = safety.scan_points(self._scan)
             points = points[np.hypot(*points.T) < OBSTACLE_RANGE_M]
             return self.localiser.decide(belief, self._scan, points, velocity, self._field_of_view)
-        self._nearest = None  # a robot that stands at its goal under the best hypothesis is not stuck
         decision = self.decide(belief, velocity)
         decision.reason = decision.reason or f"the belief is {belief.state}: assuming its best hypothesis"
         return decision
@@ -286,15 +288,6 @@ class GeodesicPolicy:
             may_turn=not self.keep_heading,
         )
 
-    def _watch_progress(self, stamp_ns: int, *, moving: bool) -> None:
-        """Starts backing off after `STUCK_AFTER_NS` without motion."""
-        if moving:
-            self._standing_since_ns = None
-        elif self._standing_since_ns is None or stamp_ns < self._standing_since_ns:
-            self._standing_since_ns = stamp_ns
-        elif stamp_ns - self._standing_since_ns > STUCK_AFTER_NS:
-            self._standing_since_ns, self._backing_off_until_ns = None, stamp_ns + BACK_OFF_NS
-
     def _stop_short(
         self, stamp_ns: int, pose: Array, place: Array, surroundings: Surroundings, path: Array
     ) -> Decision | None:
@@ -325,18 +318,6 @@ class GeodesicPolicy:
             return None
         problem = f"is too near to a wall: stopped {distance:.2f} m from it"
         return Decision(reason=self._refusal_text(self._goal, problem), state="blocked", path=path, refused=True)
-
-    def _back_off(self, pose: Array, velocity: Array, surroundings: Surroundings, path: Array) -> Decision:
-        """Recovers: drives towards the direction with the largest gap to walls and obstacles."""
-        angle = np.arange(16) * np.pi / 8
-        targets = 0.4 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        target = targets[int(np.argmax(surroundings.gaps(targets[:, None, :], np.zeros(1))[:, 0]))]
-        selected = select_policy(velocity, target, surroundings, self.robot)
-        action = turn_to_attractor(
-            selected.action, target, self.robot, may_turn=surroundings.may_turn, forward=surroundings.forward
-        )
-        motion = se2.transform(pose, selected.motion[:, :2])
-        return Decision(action, "stuck: backing off", path=path, motion=motion, recovering=True)
 
     def _reason(self, pose: Array, surroundings: Surroundings, *, hindered: bool, standing: bool) -> str:
         """Status text: why the robot does not drive freely, or nothing."""

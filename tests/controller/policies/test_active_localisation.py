@@ -10,6 +10,7 @@ from common.robot.robot import Robot
 from services.controller.policies.active_localisation import ActiveLocaliser
 from services.controller.policies.free_space import FreeSpace
 from services.controller.policies.geodesic_field import FreeSpaceGraph
+from services.controller.policies.recovery import Recovery
 from tests.controller.driving import belief, room
 
 ROBOT = Robot()
@@ -22,7 +23,7 @@ def test_weight_of_the_second_hypothesis(weight, counted):
     hypotheses = [BeliefHypothesis(pose=Pose.of(p), weight=w) for p, w in zip(poses, (1 - weight, weight), strict=True)]
     ambiguous = belief(0, poses[0], "ambiguous").model_copy(update={"hypotheses": hypotheses})
     graph = FreeSpaceGraph(FreeSpace.of(room(10, 4)), ROBOT.radius)
-    motions = ActiveLocaliser(ROBOT, graph, 0.33).prediction_request(ambiguous)
+    motions = ActiveLocaliser(ROBOT, graph, 0.33, Recovery()).prediction_request(ambiguous)
     if counted is None:
         assert motions is None
     else:

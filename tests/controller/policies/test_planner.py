@@ -9,6 +9,8 @@ import pytest
 
 from common.geometry.occupancy_grid import FREE, UNKNOWN, OccupancyGrid
 from common.geometry.world import Obstacle, World
+from common.messages.definitions import BeliefHypothesis, Pose
+from common.messages.requests import PredictReply
 from common.robot.robot import Robot
 from services.controller.policies.planner import GeodesicPolicy
 from services.controller.policies.straight_line import StraightLinePolicy
@@ -185,6 +187,21 @@ def test_backing_off():
     policy.set_goal(np.array([9.0, 1.5]))
     reasons = [policy.decide(belief(k * 66_000_000, pose), np.zeros(3)).reason for k in range(60)]
     assert (reasons[0], reasons[-1]) == ("", "stuck: backing off")
+
+
+@pytest.mark.parametrize("state", ["ambiguous", "lost"])
+def test_backing_off_while_not_localised(state):
+    policy, pose = GeodesicPolicy(Robot(), HALL), np.array([5.0, 1.5, 0.0])
+    policy.set_goal(np.array([9.0, 1.5]))
+    hypotheses = [BeliefHypothesis(pose=Pose(x=x, y=1.5), weight=0.5) for x in (5, 7)]
+    for number in range(75):
+        unsure = belief(number * 66_000_000, pose, state).model_copy(update={"hypotheses": hypotheses})
+        policy.observe(scan(unsure.stamp_ns, pose, HALL), unsure)
+        if (motions := policy.prediction_request(unsure)) is not None:
+            ranges = np.ones(motions.poses()[..., 0].size, np.float32)
+            policy.use_predictions(PredictReply(angles=np.zeros(1, np.float32), ranges=ranges))
+        decision = policy.decide_unlocalised(unsure, np.zeros(3))
+    assert (decision.reason, decision.recovering) == ("stuck: backing off", True)
 
 
 @pytest.mark.parametrize("kind", KINDS)
