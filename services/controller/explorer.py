@@ -35,6 +35,7 @@ PAUSE_NS = 2_000_000_000  # how long the robot stands at a goal of a user before
 STALLED_NS = 8_000_000_000  # after this time without a motion of `STALLED_M`, the goal counts as unreachable
 STALLED_M = 0.2
 VIEWPOINT_TOLERANCE_M = 0.1
+RETURN_TOLERANCE_M = 0.01  # of the goal at the start, to be surely within 2 cm of it
 SAME_PLACE_M = 0.1  # a new viewpoint this close to the present goal does not replace it
 
 
@@ -164,7 +165,7 @@ class Explorer:
         if same and phase == self.phase and under_way:
             return None
         self.phase = phase
-        goal = Goal(stamp_ns=0, seq=self.seq, pose=Pose.of(pose))
+        goal = Goal(stamp_ns=0, seq=self.seq, pose=Pose.of(pose), tolerance=RETURN_TOLERANCE_M)
         if viewpoint is not None:
             yaw_tolerance = None if half_field_of_view >= np.pi else half_field_of_view / 2
             goal = goal.model_copy(update={"tolerance": VIEWPOINT_TOLERANCE_M, "yaw_tolerance": yaw_tolerance})
