@@ -11,6 +11,7 @@ from common.messages.definitions import Belief, Health, Truth
 from common.messages.requests import ConfigReply, ModelReply, ModelRequest, Request
 from common.messages.topics import BELIEF, CONFIG, HEALTH, MODEL, SCAN, TRUTH
 from services.estimator.multi_robot import key_expression
+from tests.conftest import WAIT_TIMEOUT_S
 
 NUMBERS = (1, 2, 3)
 STARTS = {1: "3,1.5,90", 2: "9,1.5,0", 3: "14,1.5,90"}
@@ -87,9 +88,11 @@ def test_one_estimator_for_three_robots(process, bus, link, names, simulate):
             ),
             "healthy",
         )
-        config = bus.query(CONFIG, Request(), ConfigReply, service="estimator", robot=listener.robot)
+        config = bus.query(
+            CONFIG, Request(), ConfigReply, service="estimator", robot=listener.robot, timeout=WAIT_TIMEOUT_S
+        )
         assert f'"robot": "{listener.robot}"' in config.config
-        assert bus.query(MODEL, ModelRequest(), ModelReply, robot=listener.robot).ok
+        assert bus.query(MODEL, ModelRequest(), ModelReply, robot=listener.robot, timeout=WAIT_TIMEOUT_S).ok
 
     # Malformed scans of one robot are counted for that robot and do not affect the others.
     garbage, before = bus.for_robot(names[2]), Inbox()

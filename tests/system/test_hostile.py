@@ -15,6 +15,7 @@ from common.messages.topics import CONFIG, HEALTH, MAX_BYTES, QUERIES, SCAN, TOP
 from common.messages.wire import DecodeError
 from services.recorder.reader import read_recording
 from tests.common.samples import message_of
+from tests.conftest import WAIT_TIMEOUT_S
 
 SERVICES = ("simulator", "estimator", "controller", "recorder")
 EXAMPLES = 80  # per key
@@ -140,7 +141,7 @@ def test_afterwards(system, before):
     first = next_message(bus, SCAN, Scan)
     assert next_message(bus, SCAN, Scan, lambda scan: scan.seq > first.seq + 5)
     for name in SERVICES:
-        assert bus.query(CONFIG, Request(), ConfigReply, service=name).service == name
+        assert bus.query(CONFIG, Request(), ConfigReply, service=name, timeout=WAIT_TIMEOUT_S).service == name
         assert "Traceback" not in running[name].output, running[name].output[-3000:]
     for name, topics in SUBSCRIBED_TOPICS.items():
         health = next_message(bus, HEALTH, Health, lambda h, n=name: h.service == n)

@@ -14,6 +14,7 @@ from common.messages.definitions import Pose, Scan
 from common.messages.requests import PredictReply, PredictRequest
 from common.messages.topics import BELIEF, PREDICT, SCAN
 from common.robot.scanner import SCANNERS
+from tests.conftest import WAIT_TIMEOUT_S
 
 TIMEOUT_S = 60.0
 SCANNER = SCANNERS["tim571"].with_beams(180)
@@ -31,7 +32,7 @@ def estimator(bus, process):
     bus.subscribe(BELIEF, beliefs)
     assert wait_until(lambda: "estimator" in bus.alive(), TIMEOUT_S), running.output
     assert bus.wait_matching(SCAN, TIMEOUT_S)
-    early = bus.query(PREDICT, PredictRequest(poses=np.zeros((1, 3))), PredictReply)
+    early = bus.query(PREDICT, PredictRequest(poses=np.zeros((1, 3))), PredictReply, timeout=WAIT_TIMEOUT_S)
     assert early.reason == "no scan has come yet"
     scan = Scan(
         stamp_ns=1, angle_min=SCANNER.angle_min, angle_increment=SCANNER.angle_increment, range_min=0.05,
@@ -46,7 +47,7 @@ def test_predictions(estimator, bus):
     rng = np.random.default_rng(0)
     poses = np.column_stack([WORLD.sample_free(100, rng, 0.27), rng.uniform(-np.pi, np.pi, 100)])
     request = PredictRequest(poses=poses, beams=61)
-    waited = bus.query(PREDICT, request, PredictReply)
+    waited = bus.query(PREDICT, request, PredictReply, timeout=WAIT_TIMEOUT_S)
     ranges = waited.ranges.reshape(100, 61)
     exact = WORLD.ray_distances(se2.compose(poses, np.array(SCANNER.mount)), waited.angles)
     assert np.median(np.abs(ranges - exact)) < 0.001
@@ -59,12 +60,12 @@ def test_predictions(estimator, bus):
     assert sorted(each.number for each in answers) == list(range(5))
 
     for hostile in (PredictRequest(poses=np.zeros((1001, 3))), PredictRequest(poses=poses, beams=181)):
-        assert not bus.query(PREDICT, hostile, PredictReply).ok
+        assert not bus.query(PREDICT, hostile, PredictReply, timeout=WAIT_TIMEOUT_S).ok
     walls = PredictRequest(poses=np.array([[0.0, 0.0, 0.0], [1e4, -5.0, 7.0], [4.6, 0.9, 1.0]]))
-    assert bus.query(PREDICT, walls, PredictReply).ok
+    assert bus.query(PREDICT, walls, PredictReply, timeout=WAIT_TIMEOUT_S).ok
     not_finite = PredictRequest.model_construct(poses=np.full((1, 3), np.nan), beams=None)
     with pytest.raises(UserError, match=r"refused: PredictRequest\.poses: .* not finite"):
-        bus.query(PREDICT, not_finite, PredictReply)
-    assert bus.query(PREDICT, request, PredictReply) == waited
+        bus.query(PREDICT, not_finite, PredictReply, timeout=WAIT_TIMEOUT_S)
+    assert bus.query(PREDICT, request, PredictReply, timeout=WAIT_TIMEOUT_S) == waited
     assert estimator.stop() == 0
     assert "Traceback" not in estimator.output

@@ -14,7 +14,7 @@ from common.geometry.world import Box, Obstacle
 from common.messages.definitions import Belief, CmdVel, Goal, Pose, Status, Truth, Twist
 from common.messages.requests import ObstacleRequest, Reply
 from common.messages.topics import BELIEF, CMD_VEL, GOAL, OBSTACLE, STATUS, TRUTH
-from tests.conftest import wait_for_message
+from tests.conftest import WAIT_TIMEOUT_S, wait_for_message
 
 TIMEOUT_S = 60.0
 TEST_DRIVER = "driver"  # liveliness token of the test; the simulator waits for it
@@ -33,7 +33,7 @@ def add_barrier(bus, truth):
     """Adds a box across the whole corridor, ``BOX_DISTANCE`` ahead of the robot."""
     box = Box(center=(truth.pose.x + 0.27 + BOX_DISTANCE + 0.2, 2.25), size=(0.4, 4.5))
     request = ObstacleRequest(action="add", name="barrier", obstacle=Obstacle(box=box))
-    assert bus.query(OBSTACLE, request, Reply).ok
+    assert bus.query(OBSTACLE, request, Reply, timeout=WAIT_TIMEOUT_S).ok
 
 
 def drive(bus, truths, answer):
