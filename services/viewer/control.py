@@ -144,7 +144,7 @@ class RobotControl:
             raise UserError(f"the controller did not take the goal within {ANSWER_TIMEOUT_S:g} s")
         if status.state == "blocked":
             raise UserError(status.reason)
-        return ActionResult(ok=True, reason=f"going to ({action.x:.2f}, {action.y:.2f})")
+        return ActionResult(ok=True)  # the page knows on which floor the place is
 
     def _explore(self, robot: str, _action: requests.Explore) -> ActionResult:
         self._check_controller(robot, GOAL)
@@ -183,9 +183,7 @@ class RobotControl:
     def _teleport(self, robot: str, action: requests.Teleport) -> ActionResult:
         pose = Pose(x=action.x, y=action.y, yaw=action.yaw)
         self.send_request(robot, TELEPORT, PoseRequest(pose=pose), Reply)
-        return ActionResult(
-            ok=True, reason=f"carried to ({action.x:.2f}, {action.y:.2f}); the estimator is not informed"
-        )
+        return ActionResult(ok=True)
 
     def _localise(self, robot: str, action: requests.Localise) -> ActionResult:
         if (action.x is None) != (action.y is None):

@@ -100,7 +100,7 @@ def test_goals(page):
     x, y = page.see("[store.frame.truth.x, store.frame.truth.y]")
     goal = (x + (1.5 if x < 9 else -1.5), y)
     page.click(*goal)
-    page.toast()
+    assert page.toast().startswith("Going to (")
     page.wait(f"store.frame.status?.goal && {AWAY.format('store.frame.status.goal')} < 0.1", 10, goal)
     page.wait("store.frame.status.state === 'reached'", 40)
     page.wait(f"{AWAY.format('store.frame.truth')} < 0.35", 5, goal)
@@ -115,7 +115,7 @@ def test_kidnapping(page):
     page.page.keyboard.down("Shift")
     page.click(*there)
     page.page.keyboard.up("Shift")
-    page.toast("carried")
+    page.toast("Carried")
     page.page.locator("#journal b", has_text="carried").first.wait_for(timeout=1000 * WAIT_TIMEOUT_S)
     found = f"store.frame.belief?.state === 'tracking' && {AWAY.format('store.frame.belief')} < 0.6"
     page.wait(f"{found} && store.frame.error < 0.1", argument=there)

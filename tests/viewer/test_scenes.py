@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 
 import numpy as np
@@ -177,6 +178,7 @@ def test_floors(look):
     place = [first[0][0] + 2.0, first[0][1] + 1.2]
     seen.click(*place)
     seen.wait("Math.abs(store.frame.status.goal.x - arg) < 0.1", argument=place[0])
+    assert re.fullmatch(r"Going to \(2\.\d\d, 1\.\d\d\) on floor 'first'", seen.toast())
     choice.select_option("robot’s floor")
     assert seen.see("view.floor.name") == "ground"
     seen.see("presage.actions.teleport({ x: arg[0], y: arg[1], yaw: 0 })", place)

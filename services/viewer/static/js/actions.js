@@ -1,8 +1,7 @@
 // The requests that a visitor can send, and the messages that show their results.
 
-import { moved } from "./geometry.js";
+import { moved, placeText } from "./geometry.js";
 
-const at = ({ x, y }) => `${x.toFixed(2)}, ${y.toFixed(2)} m`;
 const rounded = (pose) => Object.fromEntries(Object.entries(pose).filter(([, v]) => Number.isFinite(v)).map(([k, v]) => [k, Math.round(v * 1e4) / 1e4]));
 
 export class Actions {
@@ -21,12 +20,16 @@ export class Actions {
     return reply;
   }
 
+  place(pose) {
+    return placeText(this.store.world?.floors ?? [], pose);
+  }
+
   watch(robot) {
     return this.request("watch", { robot }, "", { quiet: true });
   }
 
   goal(pose) {
-    return this.request("goal", rounded(pose), `Goal set: ${at(pose)}`);
+    return this.request("goal", rounded(pose), `Going to ${this.place(pose)}`);
   }
 
   cancel() {
@@ -38,7 +41,7 @@ export class Actions {
   }
 
   teleport(pose) {
-    return this.request("teleport", rounded(pose), `Carried to ${at(pose)}; the estimator is not informed`);
+    return this.request("teleport", rounded(pose), `Carried to ${this.place(pose)}; the estimator is not informed`);
   }
 
   localise() {

@@ -1,6 +1,7 @@
 // The floor of a building that the map shows: the robot's, or the one that the visitor chose.
 
 import { $, h } from "./dom.js";
+import { floorAt } from "./geometry.js";
 
 const ALL = "*"; // no name of a floor
 
@@ -46,11 +47,6 @@ export class Floors {
     const { belief, truth } = this.store.frame ?? {};
     if (belief && belief.state !== "tracking") return this.view.floor; // which floor is not known: keep the last
     const pose = belief ?? truth;
-    return (pose && this.floors.find((floor) => contains(floor, pose))) ?? this.view.floor;
+    return (pose && floorAt(this.floors, pose)) ?? this.view.floor;
   }
-}
-
-function contains(floor, { x, y }) {
-  const xs = floor.boundary.map((corner) => corner[0]), ys = floor.boundary.map((corner) => corner[1]);
-  return Math.min(...xs) <= x && x <= Math.max(...xs) && Math.min(...ys) <= y && y <= Math.max(...ys);
 }

@@ -100,3 +100,18 @@ export function boundsOf(points) {
   const xs = points.map((p) => p[0]), ys = points.map((p) => p[1]);
   return [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
 }
+
+/** The floor of a building on which a place (m in map) is; undefined between floors, and without any. */
+export function floorAt(floors, { x, y }) {
+  return floors.find(({ boundary }) => {
+    const [x0, y0, x1, y1] = boundsOf(boundary);
+    return x0 <= x && x <= x1 && y0 <= y && y <= y1;
+  });
+}
+
+/** A place (m in map) for messages; on a floor, its name and the place in its frame. */
+export function placeText(floors, { x, y }) {
+  const floor = floorAt(floors, { x, y }), [dx, dy] = floor?.offset ?? [0, 0];
+  const text = `(${[x - dx, y - dy].map((value) => value.toFixed(2)).join(", ")})`;
+  return floor ? `${text} on floor '${floor.name}'` : text;
+}
