@@ -120,7 +120,7 @@ class PreciseEstimator:
         self._was_tracking = False
         self._unknown_place = UnknownPlace()
         self._local_map = LocalMap(self.mount)
-        self._precision = Precision.of_map(self._map_cell)
+        self._precision = Precision.before_first_scan(self._map_cell)
         self._scans_since_search, self._search_interval = 0, 1
 
         # Of the last scan.
@@ -201,7 +201,7 @@ class PreciseEstimator:
 
     def _view(self, observation: Observation) -> View:
         """The scan with the noise and the map's errors as learned so far, corrected for motion and thinned."""
-        likelihood = self._precision.likelihood(self.likelihood, observation.ranges, observation.angles)
+        likelihood = self._precision.update_noise(self.likelihood, observation.ranges, observation.angles)
         view = View(
             self.model,
             likelihood,
@@ -211,8 +211,8 @@ class PreciseEstimator:
             observation.range_max,
             self._optimiser,
             self._precision.map_error,
-            self._precision.shared_error,
-            self._precision.changed,
+            self._precision.correlated_fraction,
+            self._precision.changed_fraction,
             self._precision.offset,
         )
         return self._correct_motion(
@@ -503,7 +503,7 @@ class PreciseEstimator:
         significant = SIGNIFICANT_MAP_ERROR * view.likelihood.sigma
         if error < max(view.map_error, significant) and abs(offset - view.map_offset) < significant:
             return view
-        view = replace(view, map_error=error, shared_error=precision.shared_error, map_offset=offset)
+        view = replace(view, map_error=error, correlated_fraction=precision.correlated_fraction, map_offset=offset)
         self.modes, self._start = [], start
         self._search_for_hypotheses(view)
         return view

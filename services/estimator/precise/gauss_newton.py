@@ -30,7 +30,8 @@ SETTLED_STEP = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: this near, F is quadra
 COARSE_SIGMA_M, MEDIUM_SIGMA_M = 0.3, 0.1
 FOLLOWING_SCHEDULE_M = (0.05, 0.0, 0.0, 0.0, 0.0)  # the same step by step, in a descent from a predicted pose
 MAX_POLISHING_STEPS = 4
-CORRELATED_M = 2.0  # along a surface, on which the errors of a map are alike
+# The errors of a map are counted as equal over this length of a surface, and as independent beyond (a guess).
+CORRELATION_LENGTH_M = 2.0
 DAMPING = np.diag([1.0, 1.0, 1.0]) * 1e-6  # 1/m², 1/rad²: no step along directions without information
 
 
@@ -99,8 +100,8 @@ class View:
     range_max: float  # m
     optimiser: Optimiser = field(default_factory=GaussNewton)
     map_error: float = 0.0  # m, standard deviation beyond what the model states
-    shared_error: float = 0.0  # share of the variance of the map's error that is alike for neighbouring beams
-    changed: float = 0.25  # share of surfaces that the map does not show as they are
+    correlated_fraction: float = 0.0  # of the variance of the map's error: alike for beams on the same segment
+    changed_fraction: float = 0.25  # fraction of the beams that hit no surface of the map
     map_offset: float = 0.0  # m, mean distance of the real surfaces behind those that the model predicts
     _last: list[_PredictedScans] = field(default_factory=list, init=False, repr=False)
 
@@ -166,12 +167,12 @@ class View:
 
     @cached_property
     def _correlation(self) -> float:
-        """Factor on the covariance of the model's error, because part of it is alike for neighbouring beams."""
+        """Factor on the covariance of the model's error, because part of it is alike along a surface."""
         if len(self.points) < 2:
             return 1.0
         spacing = float(np.median(np.hypot(*np.diff(self.points, axis=0).T)))
-        alike = max(1.0, CORRELATED_M / max(spacing, 1e-3))  # beams
-        return 1 + self.shared_error * (alike - 1)
+        alike = max(1.0, CORRELATION_LENGTH_M / max(spacing, 1e-3))  # beams
+        return 1 + self.correlated_fraction * (alike - 1)
 
     def surface_evidence(
         self, poses: Array, extra_sigma: float = 0.0, skip: npt.NDArray[np.bool_] | None = None
@@ -187,7 +188,7 @@ class View:
                 at.borders,
                 self.surfaces,
                 self.likelihood,
-                self.changed,
+                self.changed_fraction,
                 extra_sigma,
                 skip,
             )

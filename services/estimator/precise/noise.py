@@ -31,6 +31,6 @@ def estimate_noise(ranges: Array, angles: Array) -> float:
     return max(MIN_SIGMA_M, float(NORMAL_MAD * np.median(np.abs(bend)) / np.sqrt(2 + turn**2)))
 
 
-def robust_excess(errors: Array, stated: Array) -> float:
-    """Variance in m² of errors (K,) beyond what is ``stated``, (K,) or (), however large some of them are."""
-    return (NORMAL_MAD * float(np.median(np.abs(errors)))) ** 2 - float(np.median(stated))
+def robust_excess(errors: Array, expected_variance: Array) -> float:
+    """Variance in m² of errors (K,) beyond ``expected_variance`` (K,) or (), by medians, so outliers hardly matter."""
+    return (NORMAL_MAD * float(np.median(np.abs(errors)))) ** 2 - float(np.median(expected_variance))

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from services.estimator.shared.generative_models import Expected
 
 
-# Probability of each state for a beam that does not end where the map has a surface; the first is never used.
-CHANGED = np.array([0.0, 0.6, 0.2, 0.2])
+# Probability of each state (a guess) if a beam does not end at the surface that the map shows; the first is not used.
+CHANGED_STATE_PRIOR = np.array([0.0, 0.6, 0.2, 0.2])
 COINCIDENCE = 0.3  # probability that something new is within `NEAR_SIGMAS` of a surface of the map
 NEAR_SIGMAS = 3.0
 BORDER_M = 0.1  # where the map's next range is farther off the plane of the surface before, another surface begins
@@ -57,7 +57,7 @@ class SurfaceEvidence:
         borders: npt.NDArray[np.bool_],
         surfaces: ScanSurfaces,
         likelihood: Likelihood,
-        changed: float,
+        changed_fraction: float,
         extra_sigma: float = 0.0,
         skip: npt.NDArray[np.bool_] | None = None,
     ) -> SurfaceEvidence:
@@ -65,14 +65,14 @@ class SurfaceEvidence:
 
         ``behind`` (N, B) m are the ranges to the next surface behind the expected one; ``borders`` (N, B) is true where
         the map shows another surface than at the beam before. Beams in ``skip`` (B,) do not count as evidence, but are
-        explained all the same. ``changed`` is the share of surfaces that the map does not show as they are.
+        explained all the same. ``changed_fraction`` is the fraction of the beams that hit no surface of the map.
         """
         count = len(expected.ranges)
         total, explained, weights = np.empty(count), np.empty(count), np.empty(expected.ranges.shape)
         skipped = np.zeros(len(ranges), np.bool_) if skip is None else skip
         sigma = math.hypot(likelihood.sigma, extra_sigma)
-        prior = changed * CHANGED
-        prior[0] = 1 - changed
+        prior = changed_fraction * CHANGED_STATE_PRIOR
+        prior[0] = 1 - changed_fraction
         _forward_backward(
             ranges,
             expected.ranges,

@@ -16,7 +16,7 @@ from tests.estimator.models import ROOM
 
 MOUNT = np.array([0.2, 0.05, 0.3])
 ANGLES = np.deg2rad(np.linspace(-135, 135, 622))
-STATED = 0.02  # m, noise
+CONFIGURED_SIGMA_M = 0.02
 
 
 class WrongMap(RayCaster):
@@ -31,12 +31,12 @@ class WrongMap(RayCaster):
 
 
 def learned(model, noise, seed):
-    """The map's error in m as learned from 20 scans with ``noise`` m that is stated as 2 cm."""
+    """The map's error in m as learned from 20 scans with ``noise`` m that is configured as 2 cm."""
     rng, precision = np.random.default_rng(seed), Precision()
     for pose in ROOM.sample_poses(20, rng, 0.3):
         clean = ROOM.ray_distances(se2.compose(pose, MOUNT)[None], ANGLES)[0]
         ranges = clean + noise * rng.standard_normal(len(clean))
-        likelihood = precision.likelihood(Likelihood(sigma=STATED), ranges, ANGLES)
+        likelihood = precision.update_noise(Likelihood(sigma=CONFIGURED_SIGMA_M), ranges, ANGLES)
         precision.learn_map_error(
             View(model, likelihood, MOUNT, ANGLES, ranges, 25.0, map_error=precision.map_error), pose
         )
@@ -47,7 +47,7 @@ def learned(model, noise, seed):
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=5)
 def test_noise_is_no_error_of_the_map(noise, seed):
-    """However large the noise is, and however it was stated."""
+    """However large the noise is, and whatever was configured."""
     assert learned(RayCaster(ROOM), noise, seed) < 0.15 * noise
 
 
@@ -61,12 +61,12 @@ def test_error_of_the_map(noise, seed):
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.floats(-1, 1), st.floats(0.01, 1)), min_size=2, max_size=20))
 def test_covariance_of_all_pairs(beams):
-    """The fast sum over pieces is that over all pairs of two different beams on the same piece."""
-    pieces, errors, weights = (np.array(each) for each in zip(*sorted(beams), strict=True))
+    """The fast sum over segments equals that over all pairs of two different beams on the same segment."""
+    segments, errors, weights = (np.array(each) for each in zip(*sorted(beams), strict=True))
     total = norm = 0.0
     for i in range(len(beams)):
         for j in range(len(beams)):
-            if i != j and pieces[i] == pieces[j]:
+            if i != j and segments[i] == segments[j]:
                 total += weights[i] * weights[j] * errors[i] * errors[j]
                 norm += weights[i] * weights[j]
-    assert error_covariance(errors, pieces, weights) == pytest.approx(total / norm if norm else 0.0, abs=1e-6)
+    assert error_covariance(errors, segments, weights) == pytest.approx(total / norm if norm else 0.0, abs=1e-6)

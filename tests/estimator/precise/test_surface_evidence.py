@@ -13,7 +13,7 @@ from common.geometry.world import World
 from services.estimator.precise import surface_evidence
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.scan_surfaces import ScanSurfaces
-from services.estimator.precise.surface_evidence import CHANGED, SurfaceEvidence, find_borders
+from services.estimator.precise.surface_evidence import CHANGED_STATE_PRIOR, SurfaceEvidence, find_borders
 from services.estimator.shared.generative_models import Expected, RayCaster
 
 RANGE_MAX = 25.0
@@ -24,8 +24,8 @@ WALL = np.array([[3.0, 3.0, 0.0]])  # sees one wall and the ends of two more
 CORNER = np.array([[3.0, 3.0, np.pi / 4]])
 COLUMN = [{"box": {"center": (4.5, 3.0), "size": (0.6, 0.6)}}]
 BEAMS = 5
-SHARE = 0.25  # of surfaces that the map does not show as they are
-PRIOR = np.array([1 - SHARE, *SHARE * CHANGED[1:]])
+CHANGED_FRACTION = 0.25  # of the beams
+PRIOR = np.array([1 - CHANGED_FRACTION, *CHANGED_FRACTION * CHANGED_STATE_PRIOR[1:]])
 
 
 def surfaces_of(ranges, sigma=SIGMA_M):
@@ -79,7 +79,9 @@ def evidence_in(world, ranges, angles, sigma=SIGMA_M, bare=None):
     behind = bare.ray_distances(WALL, angles) if bare else np.full((1, len(angles)), np.inf)
     borders = find_borders(expected, WALL, angles)
     surfaces = ScanSurfaces.of(ranges, angles, Likelihood(sigma))
-    return SurfaceEvidence.of(ranges, RANGE_MAX, expected, behind, borders, surfaces, Likelihood(sigma), SHARE)
+    return SurfaceEvidence.of(
+        ranges, RANGE_MAX, expected, behind, borders, surfaces, Likelihood(sigma), CHANGED_FRACTION
+    )
 
 
 @pytest.mark.parametrize(
@@ -153,7 +155,7 @@ def test_forward_and_backward_algorithm(seed):
     made = ScanSurfaces(density, starts, ideal, np.zeros(BEAMS, np.bool_), edges, change)
     expected = Expected(surface[None], scale[None], np.zeros((1, BEAMS, 3)))
     found = SurfaceEvidence.of(
-        ranges, RANGE_MAX, expected, behind[None], borders[None], made, likelihood, SHARE, skip=skip
+        ranges, RANGE_MAX, expected, behind[None], borders[None], made, likelihood, CHANGED_FRACTION, skip=skip
     )
     assert found.log_likelihood[0] == pytest.approx(total, abs=1e-9)
     assert found.weights[0] == pytest.approx(weights, abs=1e-9)
