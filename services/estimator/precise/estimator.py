@@ -655,12 +655,12 @@ def _log_ideal(view: View, skip: npt.NDArray[np.bool_]) -> float:
 
     It is the reference for the likelihoods that the next two functions return.
     """
-    return float(view.surfaces.ideal[~skip].sum())
+    return float(view.surfaces.known_log_density[~skip].sum())
 
 
 def _log_anywhere(view: View, skip: npt.NDArray[np.bool_]) -> float:
     """Log likelihood in nats, minus `_log_ideal`, at a place of which no surface is known."""
-    return float((view.surfaces.density - view.surfaces.ideal)[~skip].sum())
+    return float((view.surfaces.log_density - view.surfaces.known_log_density)[~skip].sum())
 
 
 def _log_at_poses(view: View, poses: Array, skip: npt.NDArray[np.bool_], surroundings: Array) -> tuple[Array, Array]:

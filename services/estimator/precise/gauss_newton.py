@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from services.estimator.shared.generative_models import Expected, GenerativeModel
 
 MAX_STEP = np.array([0.5, 0.5, 0.3])  # m, m, rad: beyond this distance the linearisation is not valid
-SETTLED_STEP = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: this near, F is quadratic and needs no further evaluation
+SETTLED_STEP = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: after a smaller step, a descent ends
 # Added in quadrature to every beam's standard deviation during a descent, so that the minimum is wide at first.
 COARSE_SIGMA_M, MEDIUM_SIGMA_M = 0.3, 0.1
-FOLLOWING_SCHEDULE_M = (0.05, 0.0, 0.0, 0.0, 0.0)  # the same step by step, in a descent from a predicted pose
+FOLLOWING_SCHEDULE_M = (0.05, 0.0, 0.0, 0.0, 0.0)  # the same for each step of a descent from a predicted pose
 MAX_POLISHING_STEPS = 4
 # The errors of a map are counted as equal over this length of a surface, and as independent beyond (a guess).
 CORRELATION_LENGTH_M = 2.0
@@ -36,23 +36,23 @@ DAMPING = np.diag([1.0, 1.0, 1.0]) * 1e-6  # 1/m², 1/rad²: no step along direc
 
 
 class Optimiser(Protocol):
-    """Finds poses at which a scan has little free energy. F is ``evidence.accuracy``, plus ``prior.energy(poses)``."""
+    """Minimises the free energy F of a scan: ``evidence.accuracy``, plus ``prior.energy(poses)`` with a prior."""
 
     def descend(
         self, view: View, poses: Array, prior: Prior | None, schedule: tuple[float, ...]
     ) -> tuple[Array, Evidence]:
         """Returns the minima of F near ``poses`` (N, 3), up to half a metre away, and the evidence there.
 
-        ``schedule`` has the deviation in m to add in quadrature to every beam's, step by step: wide at first, so that
-        the minimum is wide.
+        ``schedule`` has a standard deviation in m for each step, which is added in quadrature to every beam's: large
+        at first, so that the minimum is wide.
         """
         ...
 
 
 class GaussNewton:
-    """The default optimiser: expectation maximisation, so only beams that end at surfaces of the map count.
+    """The default optimiser: expectation maximisation over the states of the beams (surface_evidence.py).
 
-    Each step minimises F with the states of the beams held constant.
+    Each step minimises F with each beam weighted by its probability of ending at the surface that the map shows.
     """
 
     def descend(
@@ -75,22 +75,22 @@ class _PredictedScans:
     """What the model predicts at some poses, and the evidence that was computed from it."""
 
     poses: Array  # (N, 3)
-    stated: Expected  # as the model predicts
-    expected: Expected  # the same with the map's error
-    behind: Array  # (N, B) m, ranges behind the surfaces that the scan passed through
+    expected: Expected  # with the error that the model states
+    with_map_error: Expected  # with the learned error of the map as well
+    behind: Array  # (N, B) m, to the map's next surface where the scan passes through the first, else inf
     borders: npt.NDArray[np.bool_]  # (N, B) see find_borders
     evidence: dict[tuple[float, bytes | None], SurfaceEvidence] = field(default_factory=dict)
 
     def first(self, count: int) -> _PredictedScans:
         """The same at the first ``count`` poses."""
         rows = slice(count)
-        stated, expected = self.stated.part(rows), self.expected.part(rows)
-        return _PredictedScans(self.poses[rows], stated, expected, self.behind[rows], self.borders[rows])
+        expected, with_map_error = self.expected.part(rows), self.with_map_error.part(rows)
+        return _PredictedScans(self.poses[rows], expected, with_map_error, self.behind[rows], self.borders[rows])
 
 
 @dataclass(frozen=True)
 class View:
-    """One scan, and what it takes to compare it with poses: the model and its errors, likelihood and optimiser."""
+    """One scan, with all that its evidence for a pose depends on: the model, its errors and the likelihood."""
 
     model: GenerativeModel
     likelihood: Likelihood
@@ -99,7 +99,7 @@ class View:
     ranges: Array  # (B,) m
     range_max: float  # m
     optimiser: Optimiser = field(default_factory=GaussNewton)
-    map_error: float = 0.0  # m, standard deviation beyond what the model states
+    map_error: float = 0.0  # m, standard deviation of the map's error beyond what the model states
     correlated_fraction: float = 0.0  # of the variance of the map's error: alike for beams on the same segment
     changed_fraction: float = 0.25  # fraction of the beams that hit no surface of the map
     map_offset: float = 0.0  # m, mean distance of the real surfaces behind those that the model predicts
@@ -153,14 +153,14 @@ class View:
     @cached_property
     def surfaces(self) -> ScanSurfaces:
         """The surfaces that the scan shows."""
-        return ScanSurfaces.of(self.ranges, self.angles, self.likelihood)
+        return ScanSurfaces.from_scan(self.ranges, self.angles, self.likelihood)
 
     def expect(self, lasers: Array) -> Expected:
         """The scans that the model predicts at laser poses (N, 3), with its surfaces moved back by the map's offset."""
         return moved_back(self.model.expect(lasers, self.angles), self.map_offset)
 
     def _with_map_error(self, expected: Expected) -> Expected:
-        """Adds the map's error, which is across a surface and so larger along beams that graze it."""
+        """Adds the map's error, which is perpendicular to a surface and so larger along beams that graze it."""
         if not self.map_error:
             return expected
         return replace(expected, scale=np.hypot(expected.scale, self.map_error * expected.slope))
@@ -171,19 +171,19 @@ class View:
         if len(self.points) < 2:
             return 1.0
         spacing = float(np.median(np.hypot(*np.diff(self.points, axis=0).T)))
-        alike = max(1.0, CORRELATION_LENGTH_M / max(spacing, 1e-3))  # beams
-        return 1 + self.correlated_fraction * (alike - 1)
+        beams = max(1.0, CORRELATION_LENGTH_M / max(spacing, 1e-3))  # on one correlation length
+        return 1 + self.correlated_fraction * (beams - 1)
 
     def surface_evidence(
         self, poses: Array, extra_sigma: float = 0.0, skip: npt.NDArray[np.bool_] | None = None
     ) -> SurfaceEvidence:
-        """Returns the evidence by surfaces at base_link poses (N, 3); beams in ``skip`` (B,) do not count."""
+        """Returns the evidence by surfaces at base_link poses (N, 3), see `SurfaceEvidence.from_scan` for ``skip``."""
         at, key = self._predicted(poses), (extra_sigma, None if skip is None else skip.tobytes())
         if key not in at.evidence:
-            at.evidence[key] = SurfaceEvidence.of(
+            at.evidence[key] = SurfaceEvidence.from_scan(
                 self.ranges,
                 self.range_max,
-                at.expected,
+                at.with_map_error,
                 at.behind,
                 at.borders,
                 self.surfaces,
@@ -196,22 +196,22 @@ class View:
 
     def expected(self, pose: Array) -> Expected:
         """The scan that the model predicts at one ``pose`` (3,)."""
-        return self._predicted(pose[None]).stated
+        return self._predicted(pose[None]).expected
 
     def _predicted(self, poses: Array) -> _PredictedScans:
         """The scans predicted at poses (N, 3).
 
-        Keeps the last result, because several kinds of evidence are computed at the same poses, or the first of them.
+        Caches the last result, because several kinds of evidence are computed at the same poses, or at the first few.
         """
         if not self._last or not np.array_equal(self._last[0].poses[: len(poses)], poses):
             lasers = se2.compose(poses, self.mount)
-            stated = self.expect(lasers)
-            expected = self._with_map_error(stated)
+            expected = self.expect(lasers)
+            with_map_error = self._with_map_error(expected)
             with np.errstate(invalid="ignore"):
                 passed = self.ranges > expected.ranges + self.likelihood.deviation(expected.ranges)
             behind = self.model.expect_behind(lasers, self.angles, np.where(passed, expected.ranges, np.inf))
-            borders = find_borders(stated, lasers, self.angles)
-            self._last[:] = [_PredictedScans(np.array(poses), stated, expected, behind, borders)]
+            borders = find_borders(expected, lasers, self.angles)
+            self._last[:] = [_PredictedScans(np.array(poses), expected, with_map_error, behind, borders)]
         elif len(poses) < len(self._last[0].poses):
             self._last[:] = [self._last[0].first(len(poses))]
         return self._last[0]
@@ -223,13 +223,16 @@ class View:
         derivatives of each beam.
         """
         lasers = se2.compose(poses, self.mount)
-        expected = self._with_map_error(self.expect(lasers)) if attention is None else self._predicted(poses).expected
+        if attention is None:
+            expected = self._with_map_error(self.expect(lasers))
+        else:
+            expected = self._predicted(poses).with_map_error
         at_laser = self.likelihood.evaluate(self.ranges, self.range_max, expected, extra_sigma, attention)
         return self._at_base(at_laser, poses, lasers)
 
     def evidence_of_each_surface(self, pose: Array) -> Evidence:
-        """Returns the evidence at one ``pose`` (3,) of each of the N surfaces of the scan that the map shows."""
-        expected, surface = self._predicted(pose[None]).expected, np.cumsum(self.surfaces.starts)
+        """Returns the evidence at ``pose`` (3,) from each surface of the scan alone, for the N that the map shows."""
+        expected, surface = self._predicted(pose[None]).with_map_error, np.cumsum(self.surfaces.starts)
         weights = self.surface_evidence(pose[None]).weights * ~self.surfaces.small
         shown = np.unique(surface[weights[0] > 0])
         first, last = np.searchsorted(surface, shown), np.searchsorted(surface, shown, "right")

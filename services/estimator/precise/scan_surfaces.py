@@ -1,7 +1,7 @@
 """Splits a scan into the surfaces that it shows, and predicts each range from its neighbours on the same surface.
 
-A surface that the map lacks is as smooth as one in the map. It surprises only where it begins. So a new cupboard is one
-surprise, however many beams it stops.
+A surface that the map lacks is as smooth as one in the map, so only its first beam is improbable. A new cupboard is
+therefore one improbable event, however many beams end at it.
 """
 
 from __future__ import annotations
@@ -19,17 +19,18 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from services.estimator.precise.likelihood import Likelihood
 
-MAX_SIGMAS = 4.0  # a range farther from its prediction begins another surface
+# Values without a source are guesses.
+MAX_SIGMAS = 4.0  # at a range farther from its prediction, another surface starts
 CORNER_SIGMAS = 2.5  # a range farther from its prediction may lie behind a corner, where the direction is unknown again
-CORNER_PROBABILITY = 0.1  # that it does
+CORNER_PROBABILITY = 0.1  # of a corner there
 MAX_SLOPE = 2.0  # standard deviation of dr / (r d angle) where a surface begins
-CURVATURE = 0.2  # standard deviation of the change of slope per radian of the scan, as a share of 1 / r
-JUMP_M = 0.2  # typical jump of the range from one surface to the next, for half of the jumps
-FAR_M = 10.0  # typical distance over which the other half is spread
-NO_RETURN = 0.05  # probability that a surface begins from which no beam returns
-CHANGES_PER_RAD = 1.0  # changes to another object along a scan, although no other surface seems to begin
+CURVATURE = 0.2  # standard deviation of the change of slope per radian of the scan, relative to 1 / r
+JUMP_M = 0.2  # standard deviation of the jump of the range between two surfaces, for half of the jumps
+FAR_M = 10.0  # the ranges after the other half are spread over this distance
+NO_RETURN = 0.05  # probability that a surface that starts returns no beams
+SWITCHES_PER_RAD = 1.0  # along a scan, from one object to another, although both look like one surface
 MIN_BEAMS = 3  # on a surface; fewer are often dust, or mixed pixels
-OUTLIER = 0.01  # share of single beams with arbitrary ranges
+OUTLIER = 0.01  # probability that a single beam has an arbitrary range
 EDGE_M = 0.02  # an edge of the map may be misplaced by this, and by one beam more
 
 jit = numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -39,30 +40,33 @@ jit = numba.njit(cache=True, nogil=True, error_model="numpy")
 class ScanSurfaces:
     """The surfaces of one scan."""
 
-    density: Array  # (B,) nats, ln p(range | the beams before it)
-    starts: npt.NDArray[np.bool_]  # (B,) whether another surface begins at this beam
-    ideal: Array  # (B,) nats, ln p(range) if the surface had been known
+    log_density: Array  # (B,) nats, ln p(range | the beams before it)
+    starts: npt.NDArray[np.bool_]  # (B,) whether another surface starts at this beam
+    known_log_density: Array  # (B,) nats, ln p(range) if the surface and its corners had been known
     small: npt.NDArray[np.bool_]  # (B,) beams on surfaces of fewer than `MIN_BEAMS` beams
-    edges: npt.NDArray[np.int64]  # (B,) beams by which the map may misplace an edge near this one; 0: no edge
-    change: float  # probability that the next beam on the same surface meets another object
+    edge_tolerance: npt.NDArray[np.int64]  # (B,) beams by which an edge near this one may be misplaced; 0 elsewhere
+    switch_probability: float  # that the next beam on the same surface meets another object
 
     @classmethod
-    def of(cls, ranges: Array, angles: Array, likelihood: Likelihood) -> ScanSurfaces:
+    def from_scan(cls, ranges: Array, angles: Array, likelihood: Likelihood) -> ScanSurfaces:
         """Splits a scan (B,) m along ``angles`` (B,) rad."""
         count = len(ranges)
-        density, starts, ideal = np.zeros(count), np.zeros(count, np.bool_), np.zeros(count)
-        _split(ranges, angles, likelihood.sigma, likelihood.relative, density, starts, ideal)
+        log_density, starts, known_log_density = np.zeros(count), np.zeros(count, np.bool_), np.zeros(count)
+        _split(ranges, angles, likelihood.sigma, likelihood.relative, log_density, starts, known_log_density)
         increment = abs(float(angles[-1] - angles[0])) / max(1, count - 1)
         surface = np.cumsum(starts)
         small = np.bincount(surface)[surface] < MIN_BEAMS if count else starts
-        edges = np.zeros(count, np.int64)
-        _mark_edges(ranges, starts, increment, edges)
-        return cls(density, starts, ideal, small, edges, min(0.5, CHANGES_PER_RAD * increment))
+        edge_tolerance = np.zeros(count, np.int64)
+        _mark_edges(ranges, starts, increment, edge_tolerance)
+        switch_probability = min(0.5, SWITCHES_PER_RAD * increment)
+        return cls(log_density, starts, known_log_density, small, edge_tolerance, switch_probability)
 
 
 @jit
-def _mark_edges(ranges: Array, starts: npt.NDArray[np.bool_], increment: float, edges: npt.NDArray[np.int64]) -> None:
-    """Fills ``edges`` of `ScanSurfaces`."""
+def _mark_edges(
+    ranges: Array, starts: npt.NDArray[np.bool_], increment: float, edge_tolerance: npt.NDArray[np.int64]
+) -> None:
+    """Fills ``edge_tolerance`` of `ScanSurfaces`."""
     last = -1
     for b in range(ranges.shape[0]):
         if np.isnan(ranges[b]) or ranges[b] == -np.inf:
@@ -71,7 +75,7 @@ def _mark_edges(ranges: Array, starts: npt.NDArray[np.bool_], increment: float, 
             near = min(ranges[b], ranges[last])  # the edge belongs to the nearer of the two surfaces
             reach = 1 + int(EDGE_M / (near * increment))
             for at in range(max(0, last + 1 - reach), min(ranges.shape[0], b + reach)):
-                edges[at] = max(edges[at], reach)
+                edge_tolerance[at] = max(edge_tolerance[at], reach)
         last = b
 
 
@@ -88,13 +92,13 @@ def _split(
     angles: Array,
     sigma: float,
     relative: float,
-    density: Array,
+    log_density: Array,
     starts: npt.NDArray[np.bool_],
-    ideal: Array,
+    known_log_density: Array,
 ) -> None:
-    """Fills density, starts and ideal of `ScanSurfaces`.
+    """Fills ``log_density``, ``starts`` and ``known_log_density`` of `ScanSurfaces`.
 
-    A Kalman filter follows u = 1 / r and its derivative u' by the angle; p is their covariance, a the predicted one.
+    A Kalman filter estimates u = 1 / r and its derivative u' by the angle; p is their covariance, a the predicted one.
     Along a straight wall u'' = -u exactly.
     """
     u, du, p00, p01, p11 = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -105,7 +109,7 @@ def _split(
             continue
         if r == np.inf:
             starts[b] = returned or last < 0
-            density[b] = math.log(NO_RETURN if starts[b] else 1 - NO_RETURN)
+            log_density[b] = math.log(NO_RETURN if starts[b] else 1 - NO_RETURN)
             last, returned = b, False
             continue
         s = math.sqrt(sigma * sigma + relative * relative * r * r)
@@ -123,29 +127,29 @@ def _split(
             square = error * error / variance
             if u > 1e-3 and square < MAX_SIGMAS**2:
                 # The direction of a surface costs nothing, because in a building it is that of other surfaces.
-                density[b] = math.log((1 - OUTLIER) * math.exp(-0.5 * square) * peak + OUTLIER / FAR_M)
-                ideal[b] = density[b]
+                log_density[b] = math.log((1 - OUTLIER) * math.exp(-0.5 * square) * peak + OUTLIER / FAR_M)
+                known_log_density[b] = log_density[b]
                 k0, k1 = a00 / variance, a01 / variance
                 u, du = u + k0 * error, du + k1 * error
                 p00, p01, p11 = (1 - k0) * a00, (1 - k0) * a01, a11 - k1 * a01
                 if square > CORNER_SIGMAS**2:
                     p11 += (MAX_SLOPE * u) ** 2
-                    density[b] += math.log(CORNER_PROBABILITY)
+                    log_density[b] += math.log(CORNER_PROBABILITY)
                 starts[b] = False
             elif b + 1 < ranges.shape[0] and _continues(ranges[b + 1], angles[b + 1] - angles[b], u, du, variance):
-                # A single beam that met something else, such as dust, is no surface.
-                density[b] = ideal[b] = math.log(OUTLIER / FAR_M)
+                # A single beam that ends elsewhere, as at dust, is no surface.
+                log_density[b] = known_log_density[b] = math.log(OUTLIER / FAR_M)
                 starts[b] = False
                 p00, p01, p11 = a00, a01, a11
             else:
                 wide = JUMP_M * JUMP_M + s * s
                 jump = r - 1 / u if u > 1e-3 else np.inf
                 near = math.exp(-0.5 * jump * jump / wide) / math.sqrt(2 * math.pi * wide)
-                density[b] = math.log(0.5 * near + 0.5 / FAR_M)
+                log_density[b] = math.log(0.5 * near + 0.5 / FAR_M)
         else:
-            density[b] = math.log(1 / FAR_M)
+            log_density[b] = math.log(1 / FAR_M)
         if starts[b]:
-            ideal[b] = math.log((1 - OUTLIER) * peak) - 0.5
+            known_log_density[b] = math.log((1 - OUTLIER) * peak) - 0.5
             u, du = 1 / r, 0.0
             p00, p01, p11 = m * m, 0.0, (MAX_SLOPE * u) ** 2
         last, returned = b, True

@@ -1,11 +1,16 @@
 """Evidence of a scan for poses, by surfaces instead of by beams.
 
-Each beam is in one of four states: it ends at the surface that the map shows, at something new in front of it, at
-something behind it that the map lacks, or at the next surface of the map behind one that was removed. The states are a
-Markov chain along the scan, since neighbouring beams mostly meet the same surface. Where the scan or the map shows
-another surface, the states are independent: a removed chair says nothing about the wall beside it. The forward
-algorithm sums over all sequences of states, and the backward algorithm gives the probability of each state (Rabiner
-1989, section III).
+Each beam is in one of four states:
+
+- 0, mapped: it ends at the surface that the map shows;
+- 1, new: at something in front of that surface;
+- 2, unmapped: at something behind that surface which the map lacks;
+- 3, removed: at the map's next surface, because the first one was removed.
+
+The states are a Markov chain along the scan, since neighbouring beams mostly meet the same surface. Where another
+surface starts in the scan or in the map, the states are independent: a removed chair says nothing about the wall beside
+it. The forward algorithm sums over all sequences of states, and the backward algorithm gives the probability of each
+state (Rabiner 1989, section III).
 """
 
 from __future__ import annotations
@@ -30,11 +35,12 @@ if TYPE_CHECKING:
 
 # Probability of each state (a guess) if a beam does not end at the surface that the map shows; the first is not used.
 CHANGED_STATE_PRIOR = np.array([0.0, 0.6, 0.2, 0.2])
-COINCIDENCE = 0.3  # probability that something new is within `NEAR_SIGMAS` of a surface of the map
+COINCIDENCE = 0.3  # probability (a guess) that something new is within `NEAR_SIGMAS` of a surface of the map
 NEAR_SIGMAS = 3.0
-BORDER_M = 0.1  # where the map's next range is farther off the plane of the surface before, another surface begins
-PLAUSIBLE_SIGMAS = 2.0  # a larger error makes it less plausible that a beam ends at a surface of the map
-PLAUSIBLE_MEAN = 0.04  # nats, mean of what Gaussian errors lose by this
+# If the map's range at the next beam is farther from the straight continuation of the surface, another surface starts.
+BORDER_M = 0.1
+PLAUSIBLE_SIGMAS = 2.0  # a larger error makes it less probable that a beam ends at a surface of the map
+PLAUSIBLE_MEAN = 0.04  # nats, mean loss of Gaussian errors by that, which is added back
 
 jit = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -43,12 +49,12 @@ jit = numba.njit(cache=True, nogil=True, error_model="numpy")
 class SurfaceEvidence:
     """Evidence of one scan at N poses."""
 
-    log_likelihood: Array  # (N,) nats, of the beams that are counted
-    explained: Array  # (N,) expected share of the beams that end at a surface of the map
+    log_likelihood: Array  # (N,) nats, of the beams that are not skipped
+    explained: Array  # (N,) expected fraction of the beams that end at a surface of the map, the first or the next
     weights: Array  # (N, B) probability that a beam ends at the first surface of the map
 
     @classmethod
-    def of(
+    def from_scan(
         cls,
         ranges: Array,
         range_max: float,
@@ -61,11 +67,12 @@ class SurfaceEvidence:
         extra_sigma: float = 0.0,
         skip: npt.NDArray[np.bool_] | None = None,
     ) -> SurfaceEvidence:
-        """Compares a scan (B,) m with what is expected.
+        """Compares a scan (B,) m with the scans that are expected at N poses.
 
-        ``behind`` (N, B) m are the ranges to the next surface behind the expected one; ``borders`` (N, B) is true where
-        the map shows another surface than at the beam before. Beams in ``skip`` (B,) do not count as evidence, but are
-        explained all the same. ``changed_fraction`` is the fraction of the beams that hit no surface of the map.
+        ``behind`` (N, B) m are the ranges to the map's next surface behind the expected one; ``borders`` (N, B) is true
+        where the map shows another surface than at the beam before. Beams in ``skip`` (B,) do not count for the
+        likelihood, but for ``explained`` and ``weights``. ``changed_fraction`` is the fraction of the beams that hit no
+        surface of the map.
         """
         count = len(expected.ranges)
         total, explained, weights = np.empty(count), np.empty(count), np.empty(expected.ranges.shape)
@@ -82,13 +89,13 @@ class SurfaceEvidence:
             sigma,
             likelihood.relative,
             range_max,
-            surfaces.density,
-            surfaces.ideal,
+            surfaces.log_density,
+            surfaces.known_log_density,
             surfaces.starts,
-            surfaces.edges,
+            surfaces.edge_tolerance,
             skipped,
             prior,
-            surfaces.change,
+            surfaces.switch_probability,
             total,
             explained,
             weights,
@@ -97,69 +104,74 @@ class SurfaceEvidence:
 
 
 @jit
-def _log_density(error: float, noise: float, model: float, ideal: float, begins: np.bool_) -> float:
+def _log_density(
+    error: float, noise_variance: float, model_variance: float, known_log_density: float, starts_surface: np.bool_
+) -> float:
     """Log density of a range that differs by ``error`` m from that of a surface of the map.
 
-    ``noise`` and ``model`` are the variances in m² of the scanner's and of the map's error. Beyond the first beam on a
-    surface, the beams before it predict the range better than a map with errors does (density ``ideal``, because the
-    map shows the corners). The map only says whether it is plausible. Its error is alike along a surface, so each beam
-    says so only by the share of the scanner's noise.
+    The variances in m² are those of the scanner's and of the map's error. After the first beam on a surface, the beams
+    before predict a range better than a map with errors, so its density is ``known_log_density``, reduced if the range
+    is too far from the map. The map's error is alike along a surface and would be counted at each beam, so the
+    reduction is multiplied by the scanner's fraction of the variance.
     """
-    variance = noise + model
+    variance = noise_variance + model_variance
     square = error * error / variance
-    if begins:
+    if starts_surface:
         return math.log((1 - OUTLIER) * math.exp(-0.5 * square) / math.sqrt(2 * math.pi * variance) + OUTLIER / FAR_M)
     excess = 0.5 * max(0.0, square - PLAUSIBLE_SIGMAS**2) - PLAUSIBLE_MEAN
-    return float(max(ideal - excess * noise / variance, math.log(OUTLIER / FAR_M)))
+    return float(max(known_log_density - excess * noise_variance / variance, math.log(OUTLIER / FAR_M)))
 
 
 @jit
 def _emit(
     r: float,
     surface: float,
-    behind: float,
+    next_surface: float,
     scale: float,
     sigma: float,
     relative: float,
     range_max: float,
-    own: float,
-    ideal: float,
-    begins: np.bool_,
+    unmapped_log_density: float,
+    known_log_density: float,
+    starts_surface: np.bool_,
     log_densities: Array,
 ) -> None:
-    """Fills the log density (4,) in nats of a range in each state.
+    """Fills ``log_densities`` (4,) in nats of a range ``r`` in each state.
 
-    ``own`` is that on a surface that the map lacks, ``ideal`` on one that it shows; ``begins`` is true at the
-    first beam on a surface of the scan.
+    ``surface`` and ``next_surface`` are the ranges in m to the map's first and next surface. The log density is
+    ``unmapped_log_density`` on a surface that the map lacks, and ``known_log_density`` on one that it shows exactly.
+    ``starts_surface`` is true at the first beam on a surface of the scan.
     """
     outlier = math.log(OUTLIER / FAR_M)
     log_densities[:] = outlier
-    if scale == np.inf:  # the map knows nothing beyond
+    if scale == np.inf:  # the map is unknown beyond this range
         if r > surface:
-            log_densities[:] = own
-        log_densities[1] = own
+            log_densities[:] = unmapped_log_density
+        log_densities[1] = unmapped_log_density
         return
     if r == np.inf:
         log_densities[0] = math.log(NO_RETURN if surface < range_max else 1 - NO_RETURN)
-        log_densities[1] = log_densities[2] = own
-        log_densities[3] = math.log(NO_RETURN if behind < range_max else 1 - NO_RETURN)
+        log_densities[1] = log_densities[2] = unmapped_log_density
+        log_densities[3] = math.log(NO_RETURN if next_surface < range_max else 1 - NO_RETURN)
         return
     error, near, coincidence = -np.inf, False, 0.0
-    model = scale * scale
+    model_variance = scale * scale
     if surface < range_max:
-        noise = sigma * sigma + relative * relative * surface * surface
+        noise_variance = sigma * sigma + relative * relative * surface * surface
         error = r - surface
-        near = error * error < NEAR_SIGMAS**2 * (noise + model)
+        near = error * error < NEAR_SIGMAS**2 * (noise_variance + model_variance)
         if near:
-            coincidence = math.log(COINCIDENCE) * noise / (noise + model)
-        log_densities[0] = _log_density(error, noise, model, ideal, begins)
+            coincidence = math.log(COINCIDENCE) * noise_variance / (noise_variance + model_variance)
+        log_densities[0] = _log_density(error, noise_variance, model_variance, known_log_density, starts_surface)
     if error < 0 or near:
-        log_densities[1] = own + coincidence
+        log_densities[1] = unmapped_log_density + coincidence
     if error > 0 or near:
-        log_densities[2] = own + coincidence
-    if behind < range_max:
-        noise = sigma * sigma + relative * relative * behind * behind
-        log_densities[3] = _log_density(r - behind, noise, model, ideal, begins)
+        log_densities[2] = unmapped_log_density + coincidence
+    if next_surface < range_max:
+        noise_variance = sigma * sigma + relative * relative * next_surface * next_surface
+        log_densities[3] = _log_density(
+            r - next_surface, noise_variance, model_variance, known_log_density, starts_surface
+        )
 
 
 @jit
@@ -172,13 +184,13 @@ def _forward_backward(
     sigma: float,
     relative: float,
     range_max: float,
-    own: Array,
-    ideal: Array,
+    unmapped_log_density: Array,
+    known_log_density: Array,
     starts: npt.NDArray[np.bool_],
-    edges: npt.NDArray[np.int64],
+    edge_tolerance: npt.NDArray[np.int64],
     skip: npt.NDArray[np.bool_],
     prior: Array,
-    change: float,
+    switch_probability: float,
     total: Array,
     explained: Array,
     weights: Array,
@@ -192,11 +204,11 @@ def _forward_backward(
         weights[k] = 0.0
         for n in range(size):
             b = used[n]
-            keep[n] = 0.0 if starts[b] else 1 - change
+            keep[n] = 0.0 if starts[b] else 1 - switch_probability
             if n > 0 and borders[k, used[n - 1] + 1 : b + 1].any():
-                # Whether the map's next surface is there is independent; something new in front may cover both.
+                # At the map's next surface the state is drawn again, but a new object may stand in front of both.
                 keep[n, 0], keep[n, 2], keep[n, 3] = 0.0, 0.0, 0.0
-            at, surface = _nearest_surface(ranges[b], expected[k], b, edges[b])
+            at, surface = _nearest_surface(ranges[b], expected[k], b, edge_tolerance[b])
             _emit(
                 ranges[b],
                 surface,
@@ -205,8 +217,8 @@ def _forward_backward(
                 sigma,
                 relative,
                 range_max,
-                own[b],
-                ideal[b],
+                unmapped_log_density[b],
+                known_log_density[b],
                 starts[b],
                 emitted[n],
             )
@@ -226,9 +238,9 @@ def _forward_backward(
 
 @jit
 def _nearest_surface(r: float, expected: Array, b: int, reach: int) -> tuple[int, float]:
-    """The expected range nearest to r (m), and its beam, if edges may be misplaced by ``reach`` beams.
+    """The beam whose surface in the map is nearest to r (m) in the direction of beam b, and its range there.
 
-    Up to there, the surfaces that the map shows at the neighbouring beams continue straight.
+    An edge may be misplaced by ``reach`` beams, so the surfaces at the neighbouring beams are continued straight.
     """
     beam, best = b, expected[b]
     for step in (-1, 1):
@@ -266,7 +278,7 @@ def _step_forward(forward: Array, emitted: Array, prior: Array, keep: Array, n: 
 
 @jit
 def _step_backward(backward: Array, emitted: Array, prior: Array, keep: Array) -> None:
-    """Updates the likelihood (4,) of the beams that follow, for each state, by one more beam."""
+    """Updates ``backward`` (4,), the likelihood of the beams that follow for each state, by one more beam."""
     drawn, norm = 0.0, 0.0
     for i in range(len(prior)):
         backward[i] *= emitted[i]

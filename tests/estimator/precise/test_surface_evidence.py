@@ -29,7 +29,7 @@ PRIOR = np.array([1 - CHANGED_FRACTION, *CHANGED_FRACTION * CHANGED_STATE_PRIOR[
 
 
 def surfaces_of(ranges, sigma=SIGMA_M):
-    return ScanSurfaces.of(ranges, ANGLES, Likelihood(sigma))
+    return ScanSurfaces.from_scan(ranges, ANGLES, Likelihood(sigma))
 
 
 def scan(laser, obstacles=(), sigma=SIGMA_M, seed=0):
@@ -51,7 +51,7 @@ def test_lone_beam():
     ranges[120] = 1.0
     found = surfaces_of(ranges)
     assert found.starts.sum() == 3
-    assert found.density[120] == found.ideal[120]
+    assert found.log_density[120] == found.known_log_density[120]
 
 
 def test_surfaces_without_return():
@@ -60,14 +60,14 @@ def test_surfaces_without_return():
     ranges[130] = np.nan
     found = surfaces_of(ranges)
     assert np.flatnonzero(found.starts[70:140]).tolist() == [10, 50]
-    assert found.density[130] == found.ideal[130] == 0
+    assert found.log_density[130] == found.known_log_density[130] == 0
 
 
 @pytest.mark.parametrize("sigma", [0.003, 0.03])
 def test_a_wall_predicts_itself(sigma):
     """Only its beginning surprises; the rest of a straight wall is as likely as if it had been known."""
     found = surfaces_of(scan(WALL, sigma=sigma)[40:200], sigma)
-    surprise = found.ideal - found.density
+    surprise = found.known_log_density - found.log_density
     assert found.starts.sum() == 1
     assert surprise[0] > 1
     assert np.abs(surprise[10:]).mean() < 0.1
@@ -78,8 +78,8 @@ def evidence_in(world, ranges, angles, sigma=SIGMA_M, bare=None):
     expected = RayCaster(world).expect(WALL, angles)
     behind = bare.ray_distances(WALL, angles) if bare else np.full((1, len(angles)), np.inf)
     borders = find_borders(expected, WALL, angles)
-    surfaces = ScanSurfaces.of(ranges, angles, Likelihood(sigma))
-    return SurfaceEvidence.of(
+    surfaces = ScanSurfaces.from_scan(ranges, angles, Likelihood(sigma))
+    return SurfaceEvidence.from_scan(
         ranges, RANGE_MAX, expected, behind, borders, surfaces, Likelihood(sigma), CHANGED_FRACTION
     )
 
@@ -154,7 +154,7 @@ def test_forward_and_backward_algorithm(seed):
     total, weights = by_enumeration(np.exp(emitted), starts, borders, change, skip)
     made = ScanSurfaces(density, starts, ideal, np.zeros(BEAMS, np.bool_), edges, change)
     expected = Expected(surface[None], scale[None], np.zeros((1, BEAMS, 3)))
-    found = SurfaceEvidence.of(
+    found = SurfaceEvidence.from_scan(
         ranges, RANGE_MAX, expected, behind[None], borders[None], made, likelihood, CHANGED_FRACTION, skip=skip
     )
     assert found.log_likelihood[0] == pytest.approx(total, abs=1e-9)
@@ -175,7 +175,7 @@ def test_beams_near_edges():
     """An edge at 2 m may be misplaced by 2 cm and one beam; each of these 240 beams covers 17 mm there."""
     ranges = np.full(len(ANGLES), 5.0)
     ranges[100:140] = 2.0
-    edges = ScanSurfaces.of(ranges, ANGLES, Likelihood(SIGMA_M)).edges
+    edges = ScanSurfaces.from_scan(ranges, ANGLES, Likelihood(SIGMA_M)).edge_tolerance
     assert np.flatnonzero(edges).tolist() == [98, 99, 100, 101, 138, 139, 140, 141]
     assert set(edges[edges > 0]) == {2}
 
@@ -185,15 +185,15 @@ def test_corners_of_the_map():
     angles = np.linspace(-np.pi, np.pi, 400, endpoint=False)
     world = World(name="square", boundary=SQUARE)
     ranges = world.ray_distances(WALL, angles)[0] + SIGMA_M * np.random.default_rng(0).standard_normal(400)
-    surfaces = ScanSurfaces.of(ranges, angles, Likelihood(SIGMA_M))
-    assert surfaces.density.sum() < surfaces.ideal.sum() - 20
-    assert evidence_in(world, ranges, angles).log_likelihood[0] > surfaces.ideal.sum() - 10
+    surfaces = ScanSurfaces.from_scan(ranges, angles, Likelihood(SIGMA_M))
+    assert surfaces.log_density.sum() < surfaces.known_log_density.sum() - 20
+    assert evidence_in(world, ranges, angles).log_likelihood[0] > surfaces.known_log_density.sum() - 10
 
 
 def test_unused_beams():
     """A beam that measured nothing is no evidence, and has no weight."""
     ranges, rng = scan(WALL), np.random.default_rng(1)
-    away_from_edges = np.flatnonzero(surfaces_of(ranges).edges == 0)
+    away_from_edges = np.flatnonzero(surfaces_of(ranges).edge_tolerance == 0)
     ranges[rng.choice(away_from_edges, 20, replace=False)] = np.nan
     used = ~np.isnan(ranges)
     world = World(name="square", boundary=SQUARE, obstacles=COLUMN)
