@@ -58,25 +58,25 @@ if TYPE_CHECKING:
 
 START_COVARIANCE = np.diag([0.25, 0.25, 0.09])  # of a pose given without one
 MAX_SEARCH_INTERVAL = 150  # scans between two searches without success; the interval doubles from 1
-# Probability that a match with the local map is wrong, and the right motion one of many that fit the map: 14 nats.
+# Probability (a guess) that a match with the local map is wrong, and the right motion one of many that fit the map.
 WRONG_MATCH = 1e-6
-# As a share of the scanner's noise: smaller errors of the map cannot be told from the noise of one scan.
+# Smaller errors of the map, divided by the scanner's noise, cannot be told from the noise of one scan (a guess).
 SIGNIFICANT_MAP_ERROR = 0.25
-# Share of the beams at surfaces which the map lacks that happen to end at one of its surfaces, at most: at nine of ten
-# wrong poses in buildings of development, the map explained less than 5 to 9 %.
+# Of the beams at surfaces that the map lacks, at most this fraction ends at one of its surfaces by chance. The map
+# explained less than 5 to 9 % of the scan at nine of ten wrong poses in the buildings used for development.
 EXPLAINED_BY_CHANCE = 0.1
-UNKNOWN_SIGMA_M = 100.0  # published where the model does not know what to expect
+UNKNOWN_SIGMA_M = 100.0  # published where the map is unknown
 TARGET_BEAMS = 2000  # a scan with at least twice as many is thinned, because the time of a search grows with the beams
 
 
 @dataclass(frozen=True)
 class ScanMatch:
-    """Where a scan fits the map, near the poses to which the hypotheses have moved."""
+    """The poses at which a scan fits the map, near the predicted pose of each hypothesis."""
 
-    motions: list[list[MotionCandidate]]  # since the last scan, of each hypothesis; the last one is the widest
+    motions: list[list[MotionCandidate]]  # for each hypothesis, since the last scan; the last one is the widest
     poses: Array  # (N, 3), one per hypothesis
     evidence: Evidence  # at these poses
-    local_pose: Array | None = None  # (3,) in the local frame, if the local map gave the motion
+    local_pose: Array | None = None  # (3,) in the local frame, if the motion comes from the local map
 
 
 class PreciseEstimator:
@@ -96,7 +96,7 @@ class PreciseEstimator:
         optimiser: Optimiser | None = None,
         map_cell: float = 0.0,
     ) -> None:
-        """``mount`` (3,) is the laser in base_link; ``rng`` places the starts of a search near a given pose.
+        """``mount`` (3,) is the laser in base_link; ``rng`` draws the starts of a search near a given pose.
 
         The belief stays within ``bounds``, the map's x0, y0, x1, y1 in m. ``map_cell`` is the edge in m of the cells of
         a grid whose surfaces the model predicts at the front of the cells; 0 if it has learned where they are.
@@ -123,17 +123,17 @@ class PreciseEstimator:
         self._precision = Precision.before_first_scan(self._map_cell)
         self._scans_since_search, self._search_interval = 0, 1
 
-        # Of the last scan.
+        # The last scan
         self._stamp: float | None = None
         self._odom: Array | None = None
-        self._explained = 1.0  # share of its beams
+        self._explained = 1.0  # fraction of its beams that end at surfaces of the map
         self._last: LocalScan | None = None
 
-        # Of the present scan.
+        # The present scan
         self._scan: tuple[View, Observation] | None = None
         self._local_pose = np.zeros(3)  # in the frame of the local map
-        self._old_beams = np.zeros(0, np.bool_)  # that end at surfaces seen before
-        self._log_change = 0.0  # nats, log probability of what has changed since the scan before
+        self._old_beams = np.zeros(0, np.bool_)  # (B,) no new evidence, as their surfaces were seen before
+        self._log_change = 0.0  # nats, log probability of the changes since the last scan
 
     def use_model(self, model: GenerativeModel, seeds: Seeds) -> None:
         """Replaces the model by one learned from real scans in the same frame, between two scans. The belief stays."""
@@ -160,13 +160,14 @@ class PreciseEstimator:
         if explained < self.settings.min_explained_share:
             match = self._match_local_map(view, match)
         if observation.time_increment and any(each.excess(match.poses[0]) == 0 for each in motions[0][:-1]):
-            # If the match is none of the predicted motions, the robot may have been carried off, and not have moved
-            # during the scan.
+            # Only if the match is one of the predicted motions: otherwise the robot may have been carried to another
+            # place, and may have stood still during the scan.
             view, match = self._correct_motion_again(view, observation, match, period)
         # Fusion of match and motion prior
-        shares = view.surface_evidence(match.poses).explained
+        explained_at = view.surface_evidence(match.poses).explained
         modes = [
-            self._fuse(view, k, match, float(share), motions[k][-1], observation) for k, share in enumerate(shares)
+            self._fuse(view, k, match, float(explained_at[k]), motions[k][-1], observation)
+            for k in range(len(explained_at))
         ]
         modes += self._find_alternatives(view, modes[0], match.motions[0])
         # Weights, also of the unknown place
@@ -195,7 +196,7 @@ class PreciseEstimator:
         return self._finish_scan(view, observation)
 
     def predict(self, poses: Array, angles: Array) -> Predicted:
-        """Predicts scans (see PoseEstimator); sigma combines the scanner's noise and the model's stated error."""
+        """Predicts scans (see PoseEstimator); sigma combines the scanner's noise and the error the model states."""
         expected = self.model.expect(se2.compose(poses, self.mount), angles)
         return self._predicted(moved_back(expected, self._precision.offset))
 
@@ -225,7 +226,7 @@ class PreciseEstimator:
         return replace(view, angles=corrected.angles, ranges=corrected.ranges).thinned(TARGET_BEAMS)
 
     def _velocity(self, mode: Mode, observation: Observation) -> Array | None:
-        """Velocity (3,) in base_link by the last poses, else by odometry; None if unknown."""
+        """Velocity (3,) in base_link from the last poses or else from odometry, or None if it is unknown."""
         odom = self._odometry_since_last_scan(observation)
         if mode.velocity is not None or odom is None:
             return mode.velocity
@@ -254,8 +255,8 @@ class PreciseEstimator:
     ) -> tuple[ScanMatch, float]:
         """Matches the scan to the map near the predicted pose of each hypothesis.
 
-        If the map explains much less than before, searches a wider area. Also returns the share of beams that the map
-        explains at the first pose.
+        If the map explains much less than before, searches a wider area. Also returns the fraction of the beams that
+        the map explains at the first pose.
         """
         widest = _prior_of([each[-1] for each in motions])
         poses, evidence = view.descend(np.array([each[-2].mean for each in motions]), widest)
@@ -272,7 +273,10 @@ class PreciseEstimator:
         return ScanMatch(motions, poses, evidence), float(explained)
 
     def _match_local_map(self, view: View, match: ScanMatch) -> ScanMatch:
-        """Matches the scan again, with the motion that the local map gives, unless it gives none or the map another."""
+        """Matches the scan to the map again, near the motion that scan matching to the local map gives.
+
+        Returns ``match`` unchanged if the local map gives no motion, or if the scan fits the map far better there.
+        """
         candidates = match.motions[0]
         starts = np.array([*(each.mean for each in candidates), match.poses[0]])
         found = self._local_map.match(starts, view.points, candidates[-1])
@@ -284,7 +288,7 @@ class PreciseEstimator:
         motions = [replace(moved, mean=se2.compose(mode.pose, step)) for mode in self.modes]
         poses, evidence = view.descend(np.array([each.mean for each in motions]), _prior_of(motions))
         by_local_map = ScanMatch([[each] for each in motions], poses, evidence, found.pose)
-        # Recent scans mislead where people move all around the robot, the map where much has changed.
+        # The local map is wrong where people move all around the robot, the map where much has changed.
         both = np.stack([match.poses[0], poses[0]])
         map_evidence, local_evidence = _log_at_poses(
             view, both, view.surfaces.small, np.tile(self.modes[0].surroundings, (2, 1))
@@ -309,18 +313,18 @@ class PreciseEstimator:
         widest: MotionCandidate,
         observation: Observation,
     ) -> Mode:
-        """Fuses the k-th hypothesis with the scan, of which the map explains the share ``explained`` there.
+        """Fuses the k-th hypothesis with the scan, of whose beams the map explains the fraction ``explained``.
 
-        A motion of which the robot is hardly capable, within the ``widest`` candidate, is evidence against the
-        hypothesis: the robot may have been carried off instead. If the stamp is earlier than that of the last scan,
-        as when a replay starts again, the duration of the motion is unknown, and no motion is such evidence.
+        A motion of which the robot is hardly capable, according to the ``widest`` candidate, is evidence against the
+        hypothesis: the robot may have been carried there instead. Where the stamp is earlier than that of the last
+        scan, as when a replay starts again, the duration of the motion is unknown, and this evidence is left out.
         """
         mode, period = self.modes[k], self._period(observation.stamp)
         candidates, pose, evidence = match.motions[k], match.poses[k], match.evidence
         unobserved = self._remove_unobserved(view, mode, pose, evidence, k)
-        # Where the map explains few beams, they may all be there by chance, and say nothing about the pose.
-        evidence.scale(k, _share_not_by_chance(explained))
-        # A match with the local map, the only candidate then, gives the motion in the unobserved directions, too.
+        # Where the map explains few beams, all of them may do so by chance, which is no information about the pose.
+        evidence.scale(k, _fraction_not_by_chance(explained))
+        # A match with the local map is the only candidate, and gives the motion in the unobserved directions, too.
         unknown_motion = len(unobserved) > 0 and len(candidates) > 1
         if unknown_motion and self._odometry_since_last_scan(observation) is None:
             *candidates, widest = (
@@ -342,13 +346,13 @@ class PreciseEstimator:
     def _remove_unobserved(self, view: View, mode: Mode, pose: Array, evidence: Evidence, k: int) -> Array:
         """Returns the unit vectors (K, 3) of x, y, yaw that a scan at ``pose`` (3,) does not observe.
 
-        Usually none, and one along a corridor. Where hardly a beam meets a surface, all three. Removes the k-th
-        ``evidence`` along them, and that of the few beams that face along a corridor, in place.
+        There are usually none, one along a corridor, and three where hardly any beam meets a surface. Removes the k-th
+        ``evidence`` along them, and that of the few beams on surfaces across a corridor, in place.
         """
         min_beams = self.settings.min_constraining_share * len(view.angles)
         (weakest, strongest), ratio = principal_directions(evidence.curvature[k])
         if mode.unobserved_scans:
-            # The pose may be metres off, so a ripple or a beam that happens to fit must not pass for a feature.
+            # The pose may be metres off, so a ripple or a beam that fits by chance must not count as a feature.
             min_beams *= 3
         elif not is_unobserved(ratio, self.model.ripple):
             return np.zeros((0, 3))
@@ -365,9 +369,9 @@ class PreciseEstimator:
         return unobserved
 
     def _find_alternatives(self, view: View, best: Mode, candidates: list[MotionCandidate]) -> list[Mode]:
-        """Other hypotheses within the motion prior that fit the scan, if it has made the ``best`` one far more certain.
+        """Other hypotheses within the motion prior that fit the scan, if it made the ``best`` one far more certain.
 
-        Before, the robot may have been at many poses, and the descent from one of them finds the nearest match only.
+        The pose was uncertain before this scan, and a descent from one pose finds only the nearest match.
         """
         before = self.modes[0]
         doubt = 1 - self._probability_of_being_near(before)
@@ -380,10 +384,9 @@ class PreciseEstimator:
         return [replace(mode, log_evidence=at_best + mode.log_evidence) for mode in found]
 
     def _weigh_hypotheses(self, view: View, modes: list[Mode], local: Array | None, period: float) -> None:
-        """Weighs hypotheses by how well the map predicts those surfaces of the scan that are new to the robot.
+        """Weighs hypotheses by how well the map predicts those surfaces of the scan that were not seen before.
 
-        Surfaces that were seen before are no evidence again. ``local`` (3,) is the pose in the local frame, if the
-        local map gave it.
+        ``local`` (3,) is the pose in the local frame, or None if the motion does not come from the local map.
         """
         if local is None:
             local = self._local_map.to_local(modes[0].pose)
@@ -392,11 +395,11 @@ class PreciseEstimator:
         seen, appeared = self._local_map.find_old_beams(local, view, states.weights[0] > 0.5)
         old, small = seen | appeared | view.surfaces.small, view.surfaces.small
 
-        # Changes are as probable at all hypotheses. A sudden one more is a reason to search soon.
+        # Changes are equally probable at all hypotheses. If there are suddenly more of them, a search is due soon.
         changes = self._local_map.count_changes(self._last, LocalScan(local, view), period) if self._last else 0
-        log_of_one = float(np.log(min(0.5, self.settings.change_rate * period)))
-        log_change = changes * log_of_one + _log_anywhere(view, ~appeared | seen | small)
-        if log_change <= self._log_change + log_of_one:
+        log_one_change = float(np.log(min(0.5, self.settings.change_rate * period)))
+        log_change = changes * log_one_change + _log_unmapped(view, ~appeared | seen | small)
+        if log_change <= self._log_change + log_one_change:
             self._search_interval = 1
 
         present, surroundings = _log_at_poses(view, poses, old, np.array([mode.surroundings for mode in modes]))
@@ -413,19 +416,19 @@ class PreciseEstimator:
 
         kidnapping = max(mode.log_evidence for mode in self.modes) + float(np.log(self.settings.unknown_probability))
         self._unknown_place.allow_kidnapping(kidnapping, self.settings.unmapped_share)
-        # Alternatives found for this scan come last in `modes`; they have no hypothesis before.
+        # Alternatives found for this scan come last in `modes`, and have no counterpart in `self.modes`.
         pairs = zip(self.modes, modes, strict=False)
         self._unknown_place.allow_mismatch(max(self._log_mismatch(before, after) for before, after in pairs))
-        # Either the surroundings have changed, or the robot was carried off and all surfaces are new.
-        self._unknown_place.present = max(_log_anywhere(view, old) + log_change, _log_anywhere(view, small))
+        # Either the surroundings have changed, or the robot was carried to another place and all surfaces are new.
+        self._unknown_place.present = max(_log_unmapped(view, old) + log_change, _log_unmapped(view, small))
         self._set_hypotheses(modes)
-        if not np.array_equal(self.modes[0].pose, modes[0].pose):  # another hypothesis is the best now
+        if not np.array_equal(self.modes[0].pose, modes[0].pose):  # another hypothesis is best now
             self._local_map.place(local, self.modes[0].pose)
 
     def _log_mismatch(self, before: Mode, after: Mode) -> float:
-        """Evidence in nats that a scan was matched at the wrong pose, among those probable ``before`` it.
+        """Evidence in nats that the scan was matched at a wrong pose.
 
-        If the scan has made an uncertain pose certain, the probability gained may be due to a wrong match.
+        If it has made a pose certain that was uncertain ``before``, the probability gained may be due to a wrong match.
         """
         gained = self._probability_of_being_near(after) - self._probability_of_being_near(before)
         return before.log_evidence + (float(np.log(gained)) if gained > 0 else -np.inf)
@@ -436,13 +439,13 @@ class PreciseEstimator:
     def _set_hypotheses(self, modes: list[Mode]) -> None:
         """Sets the hypotheses and their weights."""
         unknown = self._unknown_place
-        least = max(mode.log_weight for mode in modes) + float(np.log(self.settings.unknown_probability))
-        log_unknown = max(unknown.log_evidence + unknown.present, least)
+        min_log_unknown = max(mode.log_weight for mode in modes) + float(np.log(self.settings.unknown_probability))
+        log_unknown = max(unknown.log_evidence + unknown.present, min_log_unknown)
         self.modes, unknown.weight = weigh(modes, log_unknown, self.settings.max_hypotheses)
         self._explained = self.modes[0].explained
 
     def _add_key_scan(self, view: View) -> None:
-        """Makes the present scan a key scan: its evidence counts from now on, and its surfaces are known."""
+        """Makes the present scan a key scan: keeps its evidence, and adds its surfaces to the local map."""
         best, log_unknown = self.modes[0], self._unknown_place.log_evidence
         mapped = view.surface_evidence(best.pose[None]).weights[0] > 0.5
         if self._probability() >= self.settings.tracking_probability:
@@ -461,14 +464,14 @@ class PreciseEstimator:
         best = self.modes[0]
         if self._probability() < self.settings.tracking_probability:
             return True
-        # What another place must overcome: the volume of all poses, in volumes of the poses at one place.
+        # Prior against another place: the volume of all poses, divided by that of the poses at one place.
         information = best.curvature + np.linalg.inv(self.seeds.spread)
         log_places = np.log(self.seeds.volume) + 0.5 * (np.linalg.slogdet(information)[1] - 3 * np.log(2 * np.pi))
         unknown = max(self._unknown_place.log_evidence, *(key.log_unknown for key in self._local_map.scans))
         return bool(best.log_weight <= unknown - log_places)
 
     def _is_search_due(self) -> bool:
-        """Whether to search now: at each key scan while not tracking, otherwise ever more rarely."""
+        """Whether to search now: at each key scan while not tracking, otherwise at growing intervals."""
         if self._probability() < self.settings.tracking_probability and self._is_key_scan_due():
             return True
         return self._scans_since_search >= self._search_interval
@@ -482,19 +485,19 @@ class PreciseEstimator:
         if self._start is not None:
             start, self._start = self._start, None
             found = search_near(view, *start, self.seeds, self.settings, self._rng)
-            if not self._begin_with(
+            if not self._start_with(
                 view, found, self.settings.unknown_probability, self.settings.all_changed_probability
             ):
                 self._add_hypotheses(self._search_everywhere(view), view)
         elif not self.modes:
-            self._begin_with(view, self._search_everywhere(view), 1.0)
+            self._start_with(view, self._search_everywhere(view), 1.0)
         else:
             self._add_hypotheses(self._search_everywhere(view), view)
 
     def _search_with_map_error(self, view: View, start: tuple[Array, Array] | None) -> View:
-        """Searches again if the first scan contradicts what was assumed of the map's errors.
+        """Searches again if the map's errors at the first scan are larger than assumed, or the offset differs.
 
-        Returns the view with the map's errors.
+        Returns the view with these errors.
         """
         precision = replace(self._precision)
         if not precision.scans:
@@ -509,38 +512,38 @@ class PreciseEstimator:
         return view
 
     def _search_everywhere(self, view: View) -> list[Mode]:
-        """Hypotheses in the whole map that predict the scan clearly better than none does; at least one."""
+        """The hypotheses in the whole map at which the scan is more probable than at an unknown place; at least one."""
         found = search_everywhere(view, self.seeds, self.settings)
-        log_anywhere = _log_ideal(view, view.surfaces.small) + _log_anywhere(view, view.surfaces.small)
-        return [mode for mode in found if mode.present > log_anywhere + 1] or found[:1]
+        log_unmapped = _log_reference(view, view.surfaces.small) + _log_unmapped(view, view.surfaces.small)
+        return [mode for mode in found if mode.present > log_unmapped + 1] or found[:1]
 
-    def _begin_with(self, view: View, found: list[Mode], unknown: float, all_changed: float = 0.0) -> bool:
+    def _start_with(self, view: View, found: list[Mode], unknown: float, all_changed: float = 0.0) -> bool:
         """Starts with the hypotheses ``found``, and the probability ``unknown`` that the robot is at none.
 
-        With the probability ``all_changed`` the map shows nothing that is there. Returns whether the best hypothesis
-        is more probable than that.
+        With the probability ``all_changed``, no surface is as the map shows it. Returns whether the best hypothesis is
+        more probable than that.
         """
         self._restart_local_map(view)
         self._unknown_place.restart(unknown, self.settings.unmapped_share)
-        ideal = _log_ideal(view, self._old_beams)
-        least = self._unknown_place.present + float(np.log(all_changed)) if all_changed else -np.inf
-        self._set_hypotheses([replace(mode, present=max(mode.present - ideal, least)) for mode in found])
-        return found[0].present - ideal > least
+        reference = _log_reference(view, self._old_beams)
+        log_all_changed = self._unknown_place.present + float(np.log(all_changed)) if all_changed else -np.inf
+        self._set_hypotheses([replace(mode, present=max(mode.present - reference, log_all_changed)) for mode in found])
+        return found[0].present - reference > log_all_changed
 
     def _restart_local_map(self, view: View) -> None:
-        """Starts another local map at the present scan."""
+        """Starts a new local map at the present scan."""
         self._local_map.clear()
         self._local_pose, self._old_beams, self._log_change = np.zeros(3), view.surfaces.small, 0.0
-        self._unknown_place.present = _log_anywhere(view, self._old_beams)
+        self._unknown_place.present = _log_unmapped(view, self._old_beams)
 
     def _add_hypotheses(self, found: list[Mode], view: View) -> None:
-        """Adds hypotheses at which the robot may have been since a key scan, or to which it was just carried."""
+        """Adds hypotheses: the robot may have been there since one of the key scans, or was carried there just now."""
         if not found:
             self._unknown_place.exclude_mapped_places()
             return
         stayed, surroundings = self._log_stayed(found, view)
         present = np.array([mode.present for mode in found])
-        carried = self._unknown_place.log_evidence + present - _log_ideal(view, view.surfaces.small)
+        carried = self._unknown_place.log_evidence + present - _log_reference(view, view.surfaces.small)
         evidence = np.array([mode.log_evidence for mode in found]) + np.maximum(stayed, carried)
         surroundings[carried >= stayed] = FIRST_SURROUNDINGS
         added = [
@@ -557,13 +560,12 @@ class PreciseEstimator:
         self._add_key_scan(view)
 
     def _log_stayed(self, found: list[Mode], view: View) -> tuple[Array, Array]:
-        """Evidence (N,) in nats that the robot has been at each of the hypotheses since one of the key scans.
+        """Evidence (N,) in nats that the robot has been at each of the hypotheses since some key scan, the best one.
 
-        That is the key scan since which the evidence is greatest. Also returns the probabilities (N, 3) of the
-        surroundings of the present scan then.
+        Also returns the probabilities (N, 3) of the surroundings of the present scan in that case.
         """
         poses = np.array([mode.pose for mode in found])
-        stayed = np.full((1, len(found)), -np.inf)  # a row for each key scan so far, after a first one for none
+        stayed = np.full((1, len(found)), -np.inf)  # the first row is for no key scan, then one row per key scan
         first = np.tile(FIRST_SURROUNDINGS, (1, len(found), 1))
         surroundings = first
         for key in self._local_map.scans:
@@ -600,9 +602,9 @@ class PreciseEstimator:
         return Predicted(np.where(unknown, np.inf, expected.ranges), sigma)
 
     def _posterior(self, view: View, poses: list[Array], predicted: Predicted, probability: float) -> Posterior:
-        """The posterior with the hypotheses at ``poses``, those at the stamp of the scan."""
+        """The posterior, with the hypotheses at their ``poses`` at the stamp of the scan."""
         best = self.modes[0]
-        error = EstimateError.of(view, best.pose, self._covariance(best), best.explained)
+        error = EstimateError.from_scan(view, best.pose, self._covariance(best), best.explained)
         covariances = [error.total_covariance(float(best.pose[2])), *map(self._covariance, self.modes[1:])]
         hypotheses = tuple(
             Hypothesis(pose, covariance, mode.weight)
@@ -644,35 +646,39 @@ class PreciseEstimator:
         return "lost" if self._was_tracking else "localising"
 
 
-def _share_not_by_chance(explained: float) -> float:
-    """Share of the beams at surfaces of the map, a share ``explained`` of all, that are not there by chance."""
+def _fraction_not_by_chance(explained: float) -> float:
+    """Fraction of the explained beams that do not end at surfaces of the map by chance.
+
+    ``explained`` is the fraction of all beams that the map explains.
+    """
     real = max(0.0, explained - EXPLAINED_BY_CHANCE) / (1 - EXPLAINED_BY_CHANCE)
     return real / explained if real else 0.0
 
 
-def _log_ideal(view: View, skip: npt.NDArray[np.bool_]) -> float:
+def _log_reference(view: View, skip: npt.NDArray[np.bool_]) -> float:
     """Log likelihood in nats of the scan, without the beams in ``skip`` (B,), if all surfaces were known.
 
-    It is the reference for the likelihoods that the next two functions return.
+    The next two functions return likelihoods relative to this reference.
     """
     return float(view.surfaces.known_log_density[~skip].sum())
 
 
-def _log_anywhere(view: View, skip: npt.NDArray[np.bool_]) -> float:
-    """Log likelihood in nats, minus `_log_ideal`, at a place of which no surface is known."""
+def _log_unmapped(view: View, skip: npt.NDArray[np.bool_]) -> float:
+    """Log likelihood in nats, minus `_log_reference`, if the map shows none of the surfaces."""
     return float((view.surfaces.log_density - view.surfaces.known_log_density)[~skip].sum())
 
 
 def _log_at_poses(view: View, poses: Array, skip: npt.NDArray[np.bool_], surroundings: Array) -> tuple[Array, Array]:
-    """Log likelihoods (..., N) in nats, minus `_log_ideal`, at ``poses`` (N, 3) in the map.
+    """Log likelihoods (..., N) in nats, minus `_log_reference`, at ``poses`` (N, 3) in the map.
 
-    Each is a mixture: the scan may also be clutter or in a room that the map lacks, and is equally likely at all poses
-    then. ``surroundings`` (..., N, 3) are the probabilities at the key scan before. Also returns those of this scan.
+    Each is a mixture over the three kinds of surroundings (see `NEXT_SURROUNDINGS`); in clutter and in a room that the
+    map lacks, a scan is equally likely at all poses. ``surroundings`` (..., N, 3) are their probabilities at the
+    previous key scan. Also returns those at this scan.
     """
-    mapped = view.surface_evidence(poses, skip=skip).log_likelihood - _log_ideal(view, skip)
-    anywhere = np.full_like(mapped, _log_anywhere(view, skip))
+    mapped = view.surface_evidence(poses, skip=skip).log_likelihood - _log_reference(view, skip)
+    unmapped = np.full_like(mapped, _log_unmapped(view, skip))
     with np.errstate(divide="ignore"):
-        logs = np.log(surroundings @ NEXT_SURROUNDINGS) + np.stack([mapped, anywhere, anywhere], axis=-1)
+        logs = np.log(surroundings @ NEXT_SURROUNDINGS) + np.stack([mapped, unmapped, unmapped], axis=-1)
     total = np.logaddexp.reduce(logs, axis=-1)
     return total, np.exp(logs - total[..., None])
 

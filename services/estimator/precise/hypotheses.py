@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 
 NEAR_POSITION_M, NEAR_HEADING_RAD = 0.2, math.radians(5)  # a pose with a larger error is wrong
 SAME_POSITION_M, SAME_HEADING_RAD = 0.1, 0.1  # hypotheses nearer to one another than this are merged
-# A direction counts as unobserved if its information is less than this share of the information across it; a learned
-# field adds a multiple of its squared ripple to the share.
+# A direction counts as unobserved if its information, divided by that across it, is less than the ratio plus the factor
+# times the squared ripple of the learned field.
 MIN_INFORMATION_RATIO, RIPPLE_FACTOR = 1e-4, 7.0
 WEAK_PRIOR = np.eye(3)  # 1/m², 1/rad²: keeps the covariance finite along unobserved directions
 MIN_WEIGHT = 1e-9  # hypotheses with less weight are dropped
-# What is new in a key scan is as the map predicts it, is clutter, or is in a room that the map lacks. The probabilities
-# of these three at the first key scan, and from one key scan (row) to the next (column): clutter ends soon, a room
-# lasts.
+# The surfaces that a key scan shows for the first time are as the map predicts (0), clutter (1), or in a room that the
+# map lacks (2). These are the probabilities at the first key scan, and from one key scan (row) to the next (column):
+# guesses, by which clutter lasts two key scans on average, and a room fifty.
 FIRST_SURROUNDINGS = np.array([0.7, 0.3, 0.0])
 NEXT_SURROUNDINGS = np.array([[0.784, 0.214, 0.002], [0.498, 0.5, 0.002], [0.014, 0.006, 0.98]])
 
@@ -42,10 +42,10 @@ class Mode:
     noise_covariance: Array  # (3, 3) caused by scanner noise and motion: fusion of scans reduces it
     model_covariance: Array  # (3, 3) caused by the model's error: fusion does not reduce it
     accuracy: float  # nats, -ln p of the last scan
-    complexity: float  # nats
-    xi: Array  # (3,)
-    curvature: Array  # (3, 3)
-    explained: float = 0.0  # share of the last scan's beams that end at surfaces of the map
+    complexity: float  # nats, Kullback-Leibler divergence of the posterior from the prior
+    xi: Array  # (3,) minus the gradient of accuracy
+    curvature: Array  # (3, 3) Gauss-Newton Hessian of accuracy
+    explained: float = 0.0  # fraction of the last scan's beams that end at surfaces of the map
     log_evidence: float = 0.0  # nats, of the key scans and the prior; unnormalised
     present: float = 0.0  # nats, log likelihood of the present scan
     surroundings: Array = field(default_factory=lambda: FIRST_SURROUNDINGS)  # (3,) probabilities at the last key scan
@@ -67,39 +67,39 @@ class Mode:
 
 @dataclass
 class UnknownPlace:
-    """The evidence that the robot is at none of the hypotheses, in nats and unnormalised as for a `Mode`."""
+    """The hypothesis that the robot is at none of the other ones; evidence in nats, unnormalised as for a `Mode`."""
 
-    log_evidence: float = 0.0  # of the key scans
-    log_unmapped: float = 0.0  # part of it that remains when the whole map was searched
+    log_evidence: float = 0.0  # of the key scans and the prior
+    log_unmapped: float = 0.0  # the same for places that are not on the map, which remain after a search of all of it
     present: float = 0.0  # log likelihood of the present scan
     weight: float = 1.0  # probability
 
     def restart(self, probability: float, unmapped: float) -> None:
-        """Sets the ``probability`` that the robot is at no hypothesis, a share ``unmapped`` of it off the map."""
+        """Sets the ``probability`` that the robot is at no hypothesis; ``unmapped`` is that it is off the map then."""
         self.log_evidence = self.log_unmapped = float(np.log(probability * unmapped))
 
     def allow_kidnapping(self, log_probability: float, unmapped: float) -> None:
-        """Adds the prior of a kidnapping; with probability ``unmapped`` it was to a place that no search finds."""
+        """Allows for a kidnapping; with probability ``unmapped`` it was to a place that is not on the map."""
         self.log_unmapped = max(self.log_unmapped, log_probability + float(np.log(unmapped)))
         self.log_evidence = max(self.log_evidence, log_probability)
 
     def allow_mismatch(self, log_probability: float) -> None:
-        """The hypotheses may have been matched at a wrong place; a search of the whole map finds the right one."""
+        """Allows for a match at a wrong place, with the right one on the map, where a search can find it."""
         self.log_evidence = max(self.log_evidence, log_probability)
 
     def add_key_scan(self) -> None:
-        """Keeps the evidence of the present scan, which becomes a key scan."""
+        """Adds the evidence of the present scan, which becomes a key scan."""
         self.log_evidence += self.present
         self.log_unmapped += self.present
         self.present = 0.0
 
     def exclude_mapped_places(self) -> None:
-        """Removes the places on the map: the whole map was searched, and what was found is among the hypotheses."""
+        """Removes the places on the map, after a search of the whole map has made hypotheses of them."""
         self.log_evidence = self.log_unmapped
 
 
 def principal_directions(curvature: Array) -> tuple[Array, float]:
-    """The directions (2, 2), as rows, about which a scan says least and most, and the ratio of their information."""
+    """The directions (2, 2), as rows, of least and most information in a scan, and the ratio of the two."""
     values, vectors = np.linalg.eigh(position_information(curvature))
     return vectors.T, float(values[0] / values[1]) if values[1] > 0 else 0.0
 
@@ -108,14 +108,13 @@ def is_unobserved(ratio: float, ripple: float) -> bool:
     """Whether a scan does not observe a direction, by the ``ratio`` of its information to that across it.
 
     In a corridor without features a learned field still has ripples: walls tilted by about ``ripple`` rad, which add
-    along the corridor about ripple² of the curvature across it. Information that does not clearly exceed this counts
-    as none.
+    along the corridor about ripple² of the curvature across it. Only information that clearly exceeds this counts.
     """
     return ratio < MIN_INFORMATION_RATIO + RIPPLE_FACTOR * ripple**2
 
 
 def project_evidence(evidence: Evidence, k: int, unobserved: Array) -> None:
-    """Removes the k-th evidence along the unit vectors (K, 3) of x, y, yaw that the scan does not observe, in place."""
+    """Sets the k-th evidence to zero, in place, along the unobserved directions: unit vectors (K, 3) of x, y, yaw."""
     if not len(unobserved):
         return
     projection = np.eye(3) - unobserved.T @ unobserved
@@ -129,8 +128,8 @@ def mode_from_search(
 ) -> Mode:
     """A hypothesis found by a search, from the k-th evidence at ``pose`` (3,).
 
-    Without a prior every pose in ``volume`` m² rad was equally likely, and complexity is the Kullback-Leibler
-    divergence from that. ``unknown`` (3, 3), the covariance of an unknown pose, remains along unobserved directions.
+    Without a prior, all poses in ``volume`` m² rad were equally likely. ``unknown`` (3, 3), the covariance of an
+    unknown pose, remains along unobserved directions.
     """
     (weakest, _), ratio = principal_directions(evidence.curvature[k])
     project_evidence(evidence, k, np.array([[*weakest, 0.0]]) if is_unobserved(ratio, ripple) else np.zeros((0, 3)))
@@ -161,7 +160,7 @@ def mode_from_search(
 def _log_volume_of_place(curvature: Array) -> float:
     """Logarithm of the volume in m² rad of the poses that fit a scan with this ``curvature`` (3, 3) at one place.
 
-    What is farther away than the poses of one place belongs to other hypotheses.
+    Poses that are farther away belong to other hypotheses.
     """
     place = np.diag([SAME_POSITION_M**-2, SAME_POSITION_M**-2, SAME_HEADING_RAD**-2])
     return float(1.5 * np.log(2 * np.pi) - 0.5 * float(np.linalg.slogdet(curvature + place)[1]))
@@ -170,17 +169,17 @@ def _log_volume_of_place(curvature: Array) -> float:
 def update_mode(mode: Mode, fused: FusedMotion, evidence: Evidence, k: int, period: float, *, unobserved: bool) -> Mode:
     """The hypothesis after a scan, from its fused prior and the k-th evidence.
 
-    The scan's information reduces the noise covariance. The model's errors are alike from scan to scan, so instead of
-    their variances their deviations add, each with its share in the pose. ``unobserved`` is true if the scan has no
-    information along some direction. The scan corrects the pose, but not the drift.
+    The scan's information reduces the noise covariance. The model's errors are alike from scan to scan, so their
+    standard deviations are averaged instead of their variances, weighted by each scan's information. ``unobserved`` is
+    true if the scan has no information along some direction. The scan corrects the pose, but not the drift.
     """
     inverse = np.linalg.inv(fused.information)
     prior_information = fused.information - evidence.curvature[k]
     inverse_of_scan = np.linalg.inv(evidence.curvature[k] + WEAK_PRIOR)
-    before = _root(mode.model_covariance)
-    of_scan = _root(inverse_of_scan @ evidence.xi_model_covariance[k] @ inverse_of_scan)
-    model_deviation = before + inverse @ evidence.curvature[k] @ (of_scan - before)
-    # A velocity that is not observed in every direction is not carried on.
+    deviation_before = _root(mode.model_covariance)
+    scan_deviation = _root(inverse_of_scan @ evidence.xi_model_covariance[k] @ inverse_of_scan)
+    model_deviation = deviation_before + inverse @ evidence.curvature[k] @ (scan_deviation - deviation_before)
+    # A velocity is dropped unless it was observed in every direction.
     velocity = None
     if not unobserved and not mode.unobserved_scans:
         velocity = smooth_velocity(mode.velocity, se2.between(mode.pose, fused.mean) / period, period)
@@ -214,7 +213,7 @@ def clip_to_map(modes: list[Mode], bounds: tuple[float, float, float, float]) ->
 
 
 def same_place(poses: Array, pose: Array) -> npt.NDArray[np.bool_]:
-    """Mask (N,) of the poses (N, 3) that are so near to ``pose`` (3,) that both are one hypothesis."""
+    """Mask (N,) of the poses (N, 3) so near to ``pose`` (3,) that they are the same hypothesis."""
     off = np.abs(se2.difference(poses, pose))
     return np.asarray((off[:, :2] < SAME_POSITION_M).all(axis=1) & (off[:, 2] < SAME_HEADING_RAD))
 
@@ -231,10 +230,10 @@ def select_distinct(poses: Array, energy: Array, count: int) -> list[int]:
 
 
 def weigh(modes: list[Mode], log_unknown: float, count: int) -> tuple[list[Mode], float]:
-    """Weighs the best hypothesis at each place by evidence, sorts them, and drops those of negligible weight.
+    """Normalises the weights of the best hypothesis at each place, and drops those of negligible weight.
 
-    Returns up to ``count`` hypotheses, and the probability that the robot is at none of them; ``log_unknown`` is its
-    unnormalised logarithm. The weights sum to 1.
+    Returns up to ``count`` hypotheses, best first, whose weights sum to 1, and the probability that the robot is at
+    none of them. ``log_unknown`` is the unnormalised logarithm of that.
     """
     energy = np.array([-mode.log_weight for mode in modes])
     kept = select_distinct(np.array([mode.pose for mode in modes]), energy, count)
@@ -242,16 +241,16 @@ def weigh(modes: list[Mode], log_unknown: float, count: int) -> tuple[list[Mode]
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
     total = weights[:-1].sum()
-    shares = weights[:-1] / total if total > 0 else np.eye(len(kept))[0]
-    shares = shares / shares[shares > MIN_WEIGHT].sum()
-    weighted = [replace(modes[k], weight=float(w)) for k, w in zip(kept, shares, strict=True) if w > MIN_WEIGHT]
+    known = weights[:-1] / total if total > 0 else np.eye(len(kept))[0]
+    known = known / known[known > MIN_WEIGHT].sum()
+    weighted = [replace(modes[k], weight=float(w)) for k, w in zip(kept, known, strict=True) if w > MIN_WEIGHT]
     return weighted, float(weights[-1])
 
 
 def constraining_beams(view: View, pose: Array, direction: Array) -> tuple[float, npt.NDArray[np.bool_]]:
-    """Expected number of beams on surfaces of the map that face ``direction`` (2,), and so fix ``pose`` along it.
+    """Expected number of beams on surfaces of the map that face ``direction`` (2,), and so constrain the pose along it.
 
-    Also returns the mask (B,) of the beams that would meet such surfaces.
+    Also returns the mask (B,) of the beams that the map predicts on such surfaces.
     """
     expected = view.expect(se2.compose(pose, view.mount)[None])
     normal, surface, scale = expected.jacobian[0, :, :2], expected.ranges[0], expected.scale[0]

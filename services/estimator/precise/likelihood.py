@@ -3,9 +3,9 @@
     p(o | g) = (1 - unseen) ((1 - short - random) N(o; g, sigma² + m²) + short [o < g] / g + random / range_max)
 
 o is the measured range and g the expected one. sigma is the scanner's noise (sigma² + (relative g)² if it grows with
-the range), m the model's stated error. `short` is the share of beams that end early at something the model does not
-know (people, moved furniture), `random` the share of all other outliers (for example, something was taken away). The
-density is proper and has tails, so that outliers do not move the estimate (Thrun, Burgard & Fox 2005, section 6.3,
+the range), m the error that the model states. `short` is the fraction of beams that end early at something the model
+lacks (people, moved furniture), `random` the fraction of all other outliers (for example, something was taken away).
+The density is proper and has tails, so that outliers do not move the estimate (Thrun, Burgard & Fox 2005, section 6.3,
 without tuned gains).
 
 A beam without return has the probability `unseen` if a surface is expected. If none is expected, a beam without return
@@ -57,10 +57,10 @@ class Evidence:
         for values, replacement in zip(vars(self).values(), vars(other).values(), strict=True):
             values[row] = replacement[0]
 
-    def scale(self, row: int, share: float) -> None:
-        """Multiplies the derivatives at one pose, and the covariances of xi, by ``share``, in place."""
+    def scale(self, row: int, factor: float) -> None:
+        """Multiplies the derivatives at one pose, and the covariances of xi, by ``factor``, in place."""
         for values in (self.xi, self.curvature, self.xi_noise_covariance, self.xi_model_covariance):
-            values[row] *= share
+            values[row] *= factor
 
 
 @dataclass(frozen=True)
@@ -68,10 +68,10 @@ class Likelihood:
     """Parameters of the density, as the module describes it."""
 
     sigma: float = 0.02  # m
-    short: float = 0.25  # share of beams that end early
-    random: float = 0.005  # share of other outliers
+    short: float = 0.25  # fraction of beams that end early
+    random: float = 0.005  # fraction of other outliers
     unseen: float = 0.05  # probability of no return from a surface
-    relative: float = 0.0  # standard deviation of the noise that grows with the range, as a share of the range
+    relative: float = 0.0  # standard deviation of the noise that grows with the range, as a fraction of the range
 
     def evaluate(
         self,

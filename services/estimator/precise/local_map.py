@@ -1,7 +1,7 @@
-"""The local map: the last key scans, in a frame of their own.
+"""The local map: the last key scans, in the local frame.
 
-Scan matching by the distance of points to lines (Censi, ICRA 2008), with the points of several scans instead of one, so
-that the error does not grow with every scan. It gives the motion where the map does not know the surroundings.
+Point-to-line scan matching (Censi, ICRA 2008), to several scans instead of one, so that the error does not grow with
+every scan. It gives the motion where the map does not show the surroundings.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ CELL_M = 0.05  # points within one cell are averaged
 NEIGHBOURS, NEIGHBOUR_RADIUS_M = 10, 0.3  # points from which the normal of a surface is estimated
 # Largest distance to a point's partner, iteration by iteration.
 PARTNER_RADII_M = (0.6, 0.6, 0.4, 0.4, 0.2, 0.2, 0.1, 0.1, 0.1, 0.1)
-CAUCHY_SCALE_M = 0.02  # of a point's distance from its line; farther points count ever less
-MATCHED_RADIUS_M = 0.08  # a point this near to one of the local map counts as matched
-SEEN_RADIUS_M = 0.15  # and this near, as on a surface that was seen before; beams far away are this far apart
-MIN_POINTS = 20  # of a scan, each with a partner in the local map
+CAUCHY_SCALE_M = 0.02  # of the Cauchy weight of a point by its distance from the line
+MATCHED_RADIUS_M = 0.08  # a point is matched if it is this near to one of the local map
+SEEN_RADIUS_M = 0.15  # and on a surface seen before if it is this near; far away, neighbouring beams are this far apart
+MIN_POINTS = 20  # of a scan that must have a partner in the local map
 MAX_SQUARED_DISTANCE = 4.0  # squared standard deviations of the result from the prior
 PASSED_M = 0.3  # behind a surface, from where a beam counts as having passed through it
-MIN_CHANGED_M, WALKING_SPEED = 0.2, 1.5  # m, width of one object that may change at once; m/s
-MIN_SHARE = 0.5  # of a scan's points that must match the local map
-CLEAR_SHARE = 0.8  # with a smaller share, matching is repeated from `EXTRA_HEADINGS_RAD`
+MIN_CHANGED_M, WALKING_SPEED = 0.2, 1.5  # m and m/s, see `LocalMap.count_changes`
+MIN_MATCHED_FRACTION = 0.5  # of a scan's points, else there is no match
+CLEAR_MATCHED_FRACTION = 0.8  # if fewer match, matching is repeated from `EXTRA_HEADINGS_RAD`
 EXTRA_HEADINGS_RAD = np.array([-0.3, -0.15, 0.15, 0.3])
 DRIFT_PER_SCAN = np.array([0.02, 0.02, 0.005])  # m, m, rad: standard deviation that each key scan contributes
-MIN_INFORMATION_RATIO = 0.02  # a direction with less information, as a share of that across it, is unobserved
+MIN_INFORMATION_RATIO = 0.02  # a direction is unobserved if its information, divided by that across it, is less
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Match:
 
     pose: Array  # (3,) base_link in the local frame
     covariance: Array  # (3, 3) of x, y, yaw, relative to the key scans
-    share: float  # of the scan's points that match
+    share: float  # fraction of the scan's points that match
     score: float  # mean weight of the scan's points, higher for closer matches
     degenerate: bool  # the points have almost no information along some direction
 
@@ -62,7 +62,7 @@ class LocalScan:
 class LocalMapScan(LocalScan):
     """A key scan of the local map."""
 
-    seen: npt.NDArray[np.bool_]  # (B,) beams that are no new evidence, as they end at surfaces of earlier scans
+    seen: npt.NDArray[np.bool_]  # (B,) beams that are no new evidence, as they end at surfaces seen before
     mapped: npt.NDArray[np.bool_]  # (B,) beams that end at surfaces of the map
     log_change: float  # nats, log probability of what had changed since the scan before
     log_unknown: float  # nats, evidence before this scan that the robot is at none of the hypotheses
@@ -70,7 +70,7 @@ class LocalMapScan(LocalScan):
 
 @dataclass
 class LocalMap:
-    """The last key scans in a local frame; evidence from the map moves this frame, and all scans with it."""
+    """The last key scans in a local frame. Localisation in the map moves this frame, and all scans with it."""
 
     mount: Array  # (3,) laser in base_link
     scans: deque[LocalMapScan] = field(default_factory=lambda: deque(maxlen=MAX_SCANS))
@@ -95,7 +95,7 @@ class LocalMap:
         self.frame = se2.compose(pose, se2.inverse(local))
 
     def is_key_scan_due(self, local: Array) -> bool:
-        """Whether ``local`` (3,) is so far from the last key scan that the scan there becomes another one."""
+        """Whether ``local`` (3,) is so far from the last key scan that the scan there becomes a key scan."""
         return not self.scans or is_key_pose(self.scans[-1].pose, local)
 
     def add(self, key: LocalMapScan, pose: Array, covariance: Array) -> None:
@@ -108,12 +108,12 @@ class LocalMap:
     def find_old_beams(
         self, local: Array, view: View, mapped: npt.NDArray[np.bool_]
     ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-        """Masks (B,) of the beams of a scan at ``local`` (3,) that are no new evidence: seen before, and appeared.
+        """Masks (B,) of the beams of a scan at ``local`` (3,) that are no new evidence.
 
-        Seen before are beams that end at surfaces of the key scans; beams without return have no end, and count as
-        seen once there are key scans. A beam that is not ``mapped`` (B,), so does not end at a surface of the map, must
-        be near another such one: if the map's surface was seen there, this is another surface. Appeared are surfaces
-        where a key scan saw through: they came since then, wherever the robot may be.
+        - Seen before: they end at surfaces of the key scans. Beams without return also count as seen once there are key
+          scans. A beam that does not end at a surface of the map (``mapped`` (B,) is false) must be near such a beam of
+          a key scan, because one near a surface of the map is on another surface.
+        - Appeared: they end where a key scan saw free space, so the surface came since then, wherever the robot is.
         """
         seen, appeared = np.zeros(len(view.ranges), np.bool_), np.zeros(len(view.ranges), np.bool_)
         if not self.scans or not len(self._tree_of_points().data):
@@ -132,7 +132,7 @@ class LocalMap:
         return seen, appeared
 
     def _in_free_space(self, points: Array) -> npt.NDArray[np.bool_]:
-        """Mask (K,) of local points (K, 2) in m through which a key scan saw."""
+        """Mask (K,) of local points (K, 2) in m that a beam of a key scan passed."""
         free = np.zeros(len(points), np.bool_)
         for key in self.scans if len(points) else ():
             ranges, beam, inside = _beams_towards(key.view, se2.compose(key.pose, self.mount), points)
@@ -142,13 +142,14 @@ class LocalMap:
     def count_changes(self, last: LocalScan, now: LocalScan, period: float) -> int:
         """Number of objects that vanished or appeared between two scans.
 
-        One object is as wide as what a walking person can have covered or uncovered in ``period`` s.
+        Narrower changes than what a walking person can cover or uncover in ``period`` s do not count, and wider ones
+        count as several objects.
         """
         width = MIN_CHANGED_M + WALKING_SPEED * period
         return self._count_passed(last, now, width) + self._count_passed(now, last, width)
 
     def _count_passed(self, seen: LocalScan, by: LocalScan, width: float) -> int:
-        """Number of objects of ``width`` m in the scan ``seen`` through which beams of the scan ``by`` pass."""
+        """Number of objects of ``width`` m in the scan ``seen`` that beams of the scan ``by`` pass through."""
         points = se2.transform(se2.compose(seen.pose, self.mount), seen.view.points)
         ranges, beam, inside = _beams_towards(by.view, se2.compose(by.pose, self.mount), points)
         passed = inside & (by.view.nearest_of_neighbours[beam] > ranges + PASSED_M)
@@ -159,7 +160,7 @@ class LocalMap:
         return int((widths[widths > width] / width).sum())
 
     def match(self, starts: Array, points: Array, prior: MotionCandidate) -> Match | None:
-        """Returns the pose at which a scan matches the key scans; None if there is none.
+        """Returns the pose at which a scan matches the key scans, or None if no pose matches.
 
         ``starts`` (N, 3) and ``prior`` are poses in map, ``points`` (K, 2) m in the laser frame.
         """
@@ -169,13 +170,13 @@ class LocalMap:
         covariance = turn @ prior.covariance @ turn.T
         local_prior = replace(prior, mean=self.to_local(prior.mean), covariance=covariance)
         found = self._best_match(self.to_local(starts), points, local_prior)
-        if found is None or found.share < CLEAR_SHARE:
+        if found is None or found.share < CLEAR_MATCHED_FRACTION:
             turned = np.repeat(self.to_local(starts[:1]), len(EXTRA_HEADINGS_RAD), axis=0)
             turned[:, 2] = se2.wrap(turned[:, 2] + EXTRA_HEADINGS_RAD)
             again = self._best_match(turned, points, local_prior)
             if again is not None and (found is None or again.score > found.score):
                 found = again
-        return None if found is None or found.share < MIN_SHARE or found.degenerate else found
+        return None if found is None or found.share < MIN_MATCHED_FRACTION or found.degenerate else found
 
     def candidate(self, match: Match) -> MotionCandidate:
         """The pose in map that a match gives."""
@@ -257,7 +258,7 @@ class LocalMap:
 
 
 def is_key_pose(last: Array, pose: Array) -> bool:
-    """Whether ``pose`` (3,) is so far from that of the ``last`` (3,) key scan that another one is taken there."""
+    """Whether ``pose`` (3,) is so far from that of the ``last`` (3,) key scan that a key scan is due there."""
     motion = se2.between(last, pose)
     return bool(np.hypot(motion[0], motion[1]) >= MIN_DISTANCE_M or abs(motion[2]) >= MIN_TURN_RAD)
 

@@ -10,10 +10,10 @@ The prior is a mixture of motions, here called candidates:
 The evidence of the scan selects the candidate. So the scans of a standing robot are averaged, and the belief of a
 moving robot does not lag.
 
-Slipping wheels lose a share of every motion, on each axis, so the errors of odometry are alike from scan to scan:
-their deviations add, not their variances. The shares are therefore a state of the filter, here called drift. They are
-not estimated, but their covariance with the pose is kept (Schmidt-Kalman filter). Scans that observe the pose reduce
-it.
+Slipping wheels lose a fraction of every motion, on each axis, so the errors of odometry are alike from scan to scan:
+their deviations add, not their variances. The fractions are therefore a state of the filter, here called drift. They
+are not estimated, but their covariance with the pose is kept (Schmidt-Kalman filter). Scans that observe the pose
+reduce it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 SMOOTHING_TIME_S = 1 / 15  # the velocity is averaged over at least this time, however high the scan rate is
-MAX_MOTION_SIGMAS = 3.0  # standard deviations: faster motion is not attributed to the robot
+MAX_MOTION_SIGMAS = 3.0  # standard deviations (a common bound): faster motion is not attributed to the robot
 MAX_EXTRA_STEP = 5 * MAX_STEP  # m, m, rad beyond that: the reach of the last steps of a descent
 
 
@@ -48,10 +48,10 @@ class MotionNoise:
     turn_by_path: float = 5e-4  # rad² per metre travelled
     path_by_path: float = 1e-3  # m² per metre travelled
     path_by_turn: float = 1e-4  # m² per radian turned
-    slip: float = 0.05  # standard deviation of the share by which odometry mistakes every motion alike, on each axis
-    command_share: float = 0.2  # as a share of the commanded velocity
+    slip: float = 0.05  # scale error of odometry on each axis, the same for all motions (a guess)
+    command_share: float = 0.2  # error of the commanded velocity, as a fraction of it
     standing: float = 1e-4  # m and rad per scan: motion of a robot that stands still
-    surprise: float = 0.02  # probability of any other motion
+    surprise: float = 0.02  # probability of any other motion (a guess)
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class MotionCandidate:
         return float(off @ np.linalg.solve(self.covariance, off))
 
     def excess(self, pose: Array) -> float:
-        """Nats by which ``pose`` (3,) is less probable than the farthest one that is attributed to the motion."""
+        """Nats by which ``pose`` (3,), d standard deviations off, is less probable than 3 off: half (d² - 9), or 0."""
         return 0.5 * max(0.0, self.squared_distance(pose) - MAX_MOTION_SIGMAS**2)
 
 
@@ -121,19 +121,19 @@ def smooth_velocity(previous: Array | None, current: Array, period: float) -> Ar
 
     ``current`` is the velocity between the last two poses, ``period`` s apart, ``previous`` the average before.
     """
-    share = period / SMOOTHING_TIME_S
-    return current if previous is None or share >= 1 else previous + share * (current - previous)
+    weight = period / SMOOTHING_TIME_S
+    return current if previous is None or weight >= 1 else previous + weight * (current - previous)
 
 
 def _velocity_variance(pose: Array, covariance: Array, period: float) -> Array:
     """Variances (3,) in base_link of the predicted motion, because the velocity was derived from uncertain poses.
 
-    With p the pose, q the one before and g the share of p - q in the velocity, p + g (p - q) has (1 + 2 g + 2 g²) times
-    the variance of p. With a slow scanner this is little compared with the possible acceleration.
+    With p the pose, q the one before and g the weight of p - q in the velocity, p + g (p - q) has (1 + 2 g + 2 g²)
+    times the variance of p. With a slow scanner this is little compared with the possible acceleration.
     """
-    share = min(1.0, period / SMOOTHING_TIME_S)
+    weight = min(1.0, period / SMOOTHING_TIME_S)
     turn = se2.rotation(-float(pose[2]))
-    return np.asarray(2 * share * (1 + share) * np.diagonal(turn @ covariance @ turn.T))
+    return np.asarray(2 * weight * (1 + weight) * np.diagonal(turn @ covariance @ turn.T))
 
 
 def _propagate(

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from services.estimator.precise.settings import PreciseSettings
 
 
-SEED_BEAMS = 75  # with which seeds are compared
+SEED_BEAMS = 75  # of a scan that is compared with the seeds
 SEED_SIGMA_M = 0.15  # typical error of a range at the nearest seed; added in quadrature to every beam's deviation
 # Added in the same way, step by step: in a descent from a seed, where more would take moved furniture for the map's,
 # and from a pose that may be half a metre off.
@@ -69,8 +69,9 @@ def search_around(view: View, starts: Array, prior: Prior, extra_starts: Array) 
     starts = np.concatenate([starts, extra_starts])
     repeated_prior = Prior(prior.mean[hypothesis], prior.information[hypothesis])
     poses, evidence = view.descend(starts, repeated_prior, NEAR_SCHEDULE_M)
-    own = np.flatnonzero(hypothesis == 0)
-    keep = np.array([own[np.argmin(evidence.accuracy[own] + repeated_prior.energy(poses)[own])], *range(1, count)])
+    of_first = np.flatnonzero(hypothesis == 0)
+    energy = evidence.accuracy[of_first] + repeated_prior.energy(poses)[of_first]
+    keep = np.array([of_first[np.argmin(energy)], *range(1, count)])
     return poses[keep], evidence.part(keep)
 
 

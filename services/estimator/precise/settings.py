@@ -12,21 +12,21 @@ class PreciseSettings:
     """Parameters of the precise estimator; the defaults are used for every shipped world."""
 
     # Search
-    ranked_seeds: int = 300  # seeds whose surfaces are compared with the scan's
-    search_starts: int = 48  # of them, from which a search of the whole map descends
+    ranked_seeds: int = 300  # seeds at which the evidence by surfaces is computed
+    search_starts: int = 48  # the best of them, from which a search of the whole map descends
     search_beams: int = 100  # beams used by these descents
     search_results: int = 12  # results of them, from which it descends with all beams
     near_starts: int = 48  # poses from which a search near a given pose descends
     max_hypotheses: int = 8
 
     # Following
-    min_explained_share: float = 0.75  # if the map explains fewer beams, recent scans give the motion
-    max_explained_drop: float = 0.1  # if the share falls by more from scan to scan, a wider area is searched
-    min_constraining_share: float = 0.004  # of the beams, to fix the position along a corridor
+    min_explained_share: float = 0.75  # if the map explains a smaller fraction of beams, recent scans give the motion
+    max_explained_drop: float = 0.1  # if this fraction falls by more from scan to scan, a wider area is searched
+    min_constraining_share: float = 0.004  # fraction of the beams needed to fix the position along a corridor
 
-    # Belief
-    unknown_probability: float = 1e-5  # that the robot is at none of the hypotheses: never less than this
-    unmapped_share: float = 1e-3  # of that: the robot is at no place that a search of the map finds
+    # Belief. The probabilities are guesses.
+    unknown_probability: float = 1e-5  # least probability that the robot is at none of the hypotheses
+    unmapped_share: float = 1e-3  # probability, if so, that it is at no place on the map
     all_changed_probability: float = 1e-2  # that nothing around the start is as the map shows it
     change_rate: float = 0.015  # 1/s, at which a surface in view is taken away or put there
     tracking_probability: float = 0.999  # of the pose being within 0.2 m and 5 degrees of the truth

@@ -9,8 +9,8 @@ from scipy.stats import norm
 from common.geometry import se2
 from services.estimator.precise.hypotheses import WEAK_PRIOR
 from services.estimator.precise.protection import (
-    EXCEEDED_SHARE,
-    MISTAKEN_SURFACE,
+    EXCEEDANCE_PROBABILITY,
+    MISTAKEN_FRACTION,
     EstimateError,
     _estimate_without_each_surface,
 )
@@ -59,37 +59,37 @@ def test_moments_and_level_of_a_mixture():
     deviation, offsets = np.array([1.0, 2.0, 0.5]), np.array([[8.0, 0.0, 1.0], [3.0, -5.0, 0.0]])
     widening = np.array([[1.5, 1.0, 2.0], [1.0, 3.0, 1.0]])
     error = EstimateError(np.diag(deviation**2), offsets, widening, 0.01)
-    level = error.protection_level(0.4 * EXCEEDED_SHARE)
+    level = error.protection_level(0.4 * EXCEEDANCE_PROBABILITY)
     beyond = 2 * norm.sf(level, scale=deviation)
     for offset, factor in zip(offsets, widening, strict=True):
         beyond += 0.01 * (norm.sf(level, offset, deviation * factor) + norm.cdf(-level, offset, deviation * factor))
-    assert beyond == pytest.approx(0.6 * EXCEEDED_SHARE, rel=1e-3)
+    assert beyond == pytest.approx(0.6 * EXCEEDANCE_PROBABILITY, rel=1e-3)
     spread = np.diag(deviation**2) + 0.01 * (np.outer(offsets[0], offsets[0]) + np.outer(offsets[1], offsets[1]))
     assert error.total_covariance(0.0) == pytest.approx(spread)
     assert error.total_covariance(0.5 * np.pi)[1, 1] == pytest.approx(spread[0, 0])
 
 
-def of(scan_view, pose, explained=1.0):
-    return EstimateError.of(scan_view, pose, COVARIANCE, explained)
+def error_of(scan_view, pose, explained=1.0):
+    return EstimateError.from_scan(scan_view, pose, COVARIANCE, explained)
 
 
 def test_elsewhere(matched):
-    near = of(*matched).protection_level(0.0)
+    near = error_of(*matched).protection_level(0.0)
     assert (near >= 3.89 * np.sqrt(np.diag(COVARIANCE)).min()).all()
-    assert (of(*matched).protection_level(0.5 * EXCEEDED_SHARE) > near).all()
-    assert of(*matched).protection_level(EXCEEDED_SHARE) is None
+    assert (error_of(*matched).protection_level(0.5 * EXCEEDANCE_PROBABILITY) > near).all()
+    assert error_of(*matched).protection_level(EXCEEDANCE_PROBABILITY) is None
 
 
 def test_few_explained_surfaces(matched):
-    assert of(*matched, 1.0).mistaken == MISTAKEN_SURFACE
-    assert of(*matched, 0.1).mistaken == pytest.approx(10 * MISTAKEN_SURFACE)
-    assert of(*matched, 0.0).mistaken == 1.0
-    assert (of(*matched, 0.1).protection_level(0.0) > of(*matched, 1.0).protection_level(0.0)).all()
+    assert error_of(*matched, 1.0).mistaken == MISTAKEN_FRACTION
+    assert error_of(*matched, 0.1).mistaken == pytest.approx(10 * MISTAKEN_FRACTION)
+    assert error_of(*matched, 0.0).mistaken == 1.0
+    assert (error_of(*matched, 0.1).protection_level(0.0) > error_of(*matched, 1.0).protection_level(0.0)).all()
 
 
 def test_no_surface(matched):
     made, pose = matched
-    error = of(view(np.full_like(made.ranges, np.nan)), pose * [1, 1, 0])
+    error = error_of(view(np.full_like(made.ranges, np.nan)), pose * [1, 1, 0])
     assert error.protection_level(0.0) == pytest.approx(3.8906 * np.sqrt(np.diag(COVARIANCE)), rel=1e-3)
     assert error.total_covariance(0.0) == pytest.approx(COVARIANCE)
 
@@ -103,6 +103,6 @@ def test_mistaken_surfaces(matched):
         dragged = view(made.ranges + 0.04 * (surface == k))
         wrong = dragged.descend(pose[None])[0][0]
         error = np.abs(se2.between(wrong, pose))
-        beyond["level"] += (error > of(dragged, wrong).protection_level(0.0)).any()
+        beyond["level"] += (error > error_of(dragged, wrong).protection_level(0.0)).any()
         beyond["covariance"] += (error > 3.89 * np.sqrt(np.diag(COVARIANCE))).any()
     assert beyond["level"] < beyond["covariance"] / 2, beyond
