@@ -327,12 +327,13 @@ class GeodesicPolicy:
         )
         if min(of_robot, of_goal) < 2 * self.robot.radius:
             self._obstacle_near_ns = stamp_ns
-            reason = f"{distance:.2f} m from the goal, {self._hindrance(pose, surroundings, standing=True)}"
+            reason = f"{distance:.2f} m from the goal, {self._hindrance_text(pose, surroundings, standing=True)}"
             return Decision(reason=reason, state="blocked", path=path) if arrived or stuck else None
         # After an obstacle has gone, the field may still lead around it for a while.
         if not stuck or distance > self.robot.radius or 0 <= stamp_ns - self._obstacle_near_ns < STUCK_AFTER_NS:
             return None
-        problem = f"is too near to a wall: stopped {distance:.2f} m from it"
+        stopped = f"stopped {distance:.2f} m from the goal, probably because a wall is too close"
+        problem = f"cannot be reached exactly: {stopped}"
         return Decision(reason=self._refusal_text(self._goal, problem), state="blocked", path=path, refused=True)
 
     def _reason(self, pose: Array, surroundings: Surroundings, *, hindered: bool, standing: bool) -> str:
@@ -340,23 +341,28 @@ class GeodesicPolicy:
         if self.robot.drive == "differential" and not bool(surroundings.sees(0.0)):
             return BLIND_AHEAD
         if self.ignores_obstacles:
-            return self._no_path(pose, surroundings)
-        return self._hindrance(pose, surroundings, standing=standing) if hindered else ""
+            return self._no_path_text(pose, surroundings, standing=standing)
+        return self._hindrance_text(pose, surroundings, standing=standing) if hindered else ""
 
-    def _hindrance(self, pose: Array, surroundings: Surroundings, *, standing: bool) -> str:
-        """Status text: what hinders the robot, and where."""
-        verb = "waiting" if standing else "slowing"
+    def _hindrance_text(self, pose: Array, surroundings: Surroundings, *, standing: bool) -> str:
+        """Status text for when something rules out the best motion.
+
+        It names the nearest obstacle, but not as the cause: that may be another obstacle, or a wall.
+        """
+        effect = "waiting" if standing else "slowed or diverted"
         if not len(surroundings.points):
-            return f"{verb}: a wall is near"
+            return f"{effect}: a wall is near"
         nearest, position = self._nearest_point(pose, surroundings)
         # Anything seen for less than a second may be a person, or a box that was just moved.
         what = "something that may move" if surroundings.moving[nearest] else "something that is not in the map"
-        return f"{verb}: {what}, {np.hypot(*surroundings.points[nearest]):.1f} m away at {position}"
+        away = f"{np.hypot(*surroundings.points[nearest]):.1f} m away at {position}"
+        return f"{effect}; the nearest obstacle is {what}, {away}"
 
-    def _no_path(self, pose: Array, surroundings: Surroundings) -> str:
+    def _no_path_text(self, pose: Array, surroundings: Surroundings, *, standing: bool) -> str:
         """Status text for when obstacles leave no path."""
-        place = f" at {self._nearest_point(pose, surroundings)[1]}" if len(surroundings.points) else ""
-        return f"no way around something that is not in the map{place}: waiting until it clears"
+        place = f", the nearest at {self._nearest_point(pose, surroundings)[1]}" if len(surroundings.points) else ""
+        activity = "waiting until they go" if standing else "driving up to them"
+        return f"no way around obstacles that are not in the map{place}: {activity}"
 
     def _nearest_point(self, pose: Array, surroundings: Surroundings) -> tuple[int, str]:
         """Index of the obstacle point nearest to the robot, and its position as text. Requires at least one."""
