@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from services.controller.policies.geodesic_field import CostField, FreeSpaceGraph
     from services.controller.policies.recovery import Recovery
 
-MIN_WEIGHT = 1e-3  # hypotheses with less weight are ignored: without them, the belief would be tracked
+MIN_WEIGHT = 1e-3  # hypotheses with less weight do not keep a belief from `tracking`, so they are ignored
 # A hypothesis counts as at least this probable. The goal is only reached once all others are excluded, however
 # improbable they are, and the information of a scan about an improbable one would be worth hardly a metre.
 MIN_COUNTED_WEIGHT = 0.05
@@ -48,11 +48,11 @@ INITIAL_WAIT_NS = 1_000_000_000  # time for the estimator to localise before the
 CORRELATION_LENGTH_M = 1.0  # scans from places this far apart are nearly independent
 MAX_VISITED = 100  # positions kept, VISITED_SPACING_M apart
 VISITED_SPACING_M = 0.25
-STALLED_NS = 3_000_000_000  # after this time without motion, a place counts as visited: no way leads there
+STALLED_NS = 3_000_000_000  # after this time without motion, the robot gives up the place
 MAX_USEFUL_ROOM_M = 5.0  # more free distance than this is no advantage
 WINDOW_RAD = 0.35  # the room (free distance) in a direction is the shortest range this far to either side of it
 MIN_ROOM_M = 0.7  # if every direction has less, the robot turns on the spot
-NOMINAL_SIGMA_M = 0.02  # of a beam whose precision is not in doubt
+NOMINAL_SIGMA_M = 0.02  # standard deviation of a beam at which its entropy counts as 0
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class VisitedPlaces:
             self._add(np.zeros(2))
         return motion
 
-    def give_up(self, place: Array) -> None:
+    def give_up_if_stalled(self, place: Array) -> None:
         """Counts the place (2,) m that the robot drives to as visited, if there was no progress for `STALLED_NS`."""
         if self._stamp_ns is not None and self._stamp_ns - self._progress[1] > STALLED_NS:
             self._progress = np.zeros(2), self._stamp_ns
@@ -118,7 +118,10 @@ class ActiveLocaliser:
         *,
         may_turn: bool = True,
     ) -> None:
-        """Keeps ``min_point_distance`` m from the robot's centre to scan points. ``may_turn``: any heading will do."""
+        """Keeps the robot's centre ``min_point_distance`` m away from scan points.
+
+        ``may_turn``: the robot may turn into its direction of motion.
+        """
         self.may_turn = may_turn
         self.robot = robot.model_copy(update={"max_speed": min(robot.max_speed, MAX_SPEED)})
         self.min_point_distance = min_point_distance
@@ -190,7 +193,7 @@ class ActiveLocaliser:
         if len(poses) > 1:
             self._unknown_since_ns = None
             if self._place is not None:
-                self._visited.give_up(self._place[0][:2])
+                self._visited.give_up_if_stalled(self._place[0][:2])
                 self._recovery.watch(belief.stamp_ns, moving=is_moving(velocity))
                 return self._drive_to(poses[0], *self._place, surroundings, velocity, len(poses))
             return Decision(reason=f"{len(poses)} places are possible: choosing where to drive to tell them apart")
@@ -256,7 +259,7 @@ class ActiveLocaliser:
         zero = np.zeros(len(gain))
         energy = ExpectedFreeEnergy(NATS_PER_METRE * (length + turn), zero, zero, gain)
         best = int(np.argmin(energy.total))
-        self._visited.give_up(length[best] * direction[best])
+        self._visited.give_up_if_stalled(length[best] * direction[best])
         attractor = min(float(length[best]), 2.0) * direction[best]
         return self._approach(
             attractor, surroundings, velocity, Decision(reason=reason, terms=energy.of(best, energy.total))

@@ -29,9 +29,9 @@ FIELD_OF_VIEW_MARGIN_RAD, FIELD_OF_VIEW_DIVISOR = np.pi / 4, 3
 # Cost in m of a change of velocity by 1 m/s, so that the choice does not alternate between motions of equal merit.
 CHANGE_COST_S = 0.02
 WALKING_SPEED = 1.0  # m/s at which moving obstacles are assumed to approach
-LINE_SAMPLES = (np.arange(6) + 0.5) / 6  # shares of the line to the attractor at which its information is looked up
-MOTION_SAMPLES = 5  # every so many steps of a motion
-HINDERED_M = 0.05  # the status names obstacles if they make the way longer by this much
+LINE_SAMPLES = (np.arange(6) + 0.5) / 6  # shares of the line to the attractor at which the ambiguity is looked up
+MOTION_STRIDE = 5  # the ambiguity is looked up at every fifth pose of a motion
+HINDERED_M = 0.05  # a status text is shown if walls and obstacles make the way longer by this much
 GAP_TOLERANCE_M = 1e-3  # for rounding errors
 
 
@@ -125,7 +125,7 @@ class PoseBelief:
             return np.zeros(len(motions)), np.zeros(len(motions))
         ends, length = motions[:, -1, :2], path_lengths(motions)
         line = ends[:, None] + LINE_SAMPLES[:, None] * (attractor - ends)[:, None]
-        points = se2.transform(self.pose, np.concatenate([motions[:, ::MOTION_SAMPLES, :2], line], axis=1))
+        points = se2.transform(self.pose, np.concatenate([motions[:, ::MOTION_STRIDE, :2], line], axis=1))
         line_length = np.hypot(*(attractor - ends).T)
         metres = np.full(points.shape[:2], 1.0)  # length of the part of the way that each point represents
         metres[:, -len(LINE_SAMPLES) :] *= line_length[:, None] / len(LINE_SAMPLES)
@@ -144,7 +144,7 @@ class SelectedMotion:
     action: Array  # (3,) m/s, m/s, rad/s in base_link
     poses: Array  # (T, 3) predicted, in the present base_link, until standstill
     terms: dict[str, float]  # of its expected free energy, nats, and its probability
-    hindered: bool  # an obstacle, or one that may approach, ruled out a better motion
+    hindered: bool  # a wall, or an obstacle that is there or may approach, ruled out a better motion
 
 
 def select_motion(

@@ -27,7 +27,7 @@ class Recovery:
         self.reset()
 
     def reset(self) -> None:
-        """Starts again: the robot stands for another reason, or has nowhere to drive."""
+        """Starts again, because the robot stands on purpose or has no goal."""
         self._standing_since_ns: int | None = None
         self._backing_off_since_ns: int | None = None
 

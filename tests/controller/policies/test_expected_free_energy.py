@@ -149,7 +149,7 @@ def test_visited_places():
     assert visited.novelty(far) == pytest.approx([0, 0, 0.99], abs=0.02)
     for stamp, novelty in [(5, 0.99), (7, 0.0)]:  # it has stood since 3.3 s
         visited.move(stamp * 10**9, np.zeros(3))
-        visited.give_up(far[2])
+        visited.give_up_if_stalled(far[2])
         assert visited.novelty(far)[2] == pytest.approx(novelty, abs=0.02)
 
 
