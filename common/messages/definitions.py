@@ -1,6 +1,7 @@
 """The messages published on topics.
 
-Frames: `map` is fixed to the world, `odom` drifts, `base_link` is the robot's centre, `laser` the scanner.
+Frames: `map` is fixed to the world, `odom` drifts, `base_link` is the centre of the robot's round outline, `laser` is
+the scanner.
 A new field gets a default; a field never changes its type. docs/messages.md is generated from the docstrings and the
 comments beside the fields.
 """
@@ -108,8 +109,8 @@ class Truth(Stamped):
     pose: Pose  # base_link in map
     twist: Twist  # base_link
     contact: bool = False  # the robot touches something
-    stopped: bool = False  # the obstacle stop slows or stops the robot
-    people: Points = np.zeros((0, 2), np.float32)  # (K, 2) m in map, positions of people
+    stopped: bool = False  # the obstacle stop reduced the commanded velocity
+    people: Points = np.zeros((0, 2), np.float32)  # (K, 2) m in map
     frame_id: Name = "map"
 
 
@@ -139,14 +140,14 @@ class Belief(Stamped):
     xi: Floats | None = None  # (3,) dg' Pi (o - g), the negative gradient of accuracy in map: nats/m, nats/m, nats/rad
     curvature: Matrix3 | None = None  # (3, 3) dg' Pi dg, Gauss-Newton Hessian of accuracy in map
     free_energy: Finite | None = None  # nats, accuracy + complexity
-    accuracy: Finite | None = None  # nats, -ln p(o | pose)
+    accuracy: Finite | None = None  # nats, negative log-likelihood -ln p(o | pose): smaller is better
     complexity: Finite | None = None  # nats, divergence of the posterior from the prior
     hypotheses: Annotated[list[BeliefHypothesis], Field(max_length=64)] = []  # noqa: RUF012
     # best first; the first one is at `pose`
     probability: Annotated[float, Field(ge=0, le=1)] | None = None  # that `pose` is within 0.2 m and 5 deg of the truth
     protection: Floats | None = None  # (3,) m, m, rad in base_link: error bounds, exceeded in 1 of 10^4 scans
     estimator: Name = ""
-    field_version: Count = 0  # `version` of the learned field; 0: original model
+    field_version: Count = 0  # of the LearnedField; 0: original model
     frame_id: Name = "map"
     map_id: Name = ""  # floor of the pose; empty between floors, or without floors
 
@@ -174,9 +175,9 @@ class Prediction(Stamped):
 
 
 class Map(Stamped):
-    """The map that the mapper has built so far; its origin is the place where mapping began."""
+    """The map that the mapper has built so far; the origin of the frame map is where mapping began."""
 
-    grid: OccupancyGrid  # its origin is where mapping began
+    grid: OccupancyGrid
     poses: Poses  # (K, 3) base_link in map, key scans in order of time
     closures: Points = np.zeros((0, 2), np.float32)  # (2 C, 2) m in map, both ends of each loop closure
     frame_id: Name = "map"
@@ -188,7 +189,7 @@ class LearnedField(Stamped):
     version: Count  # from 1
     base: Name = ""  # SHA-256 of the original model's weights, hexadecimal
     part: Annotated[int, Field(ge=0, lt=1000)] = 0  # index, from 0
-    parts: Annotated[int, Field(ge=1, le=1000)] = 1  # number of parts of this version
+    parts: Annotated[int, Field(ge=1, le=1000)] = 1  # of this version
     data: Bytes  # the joined parts are safetensors, compressed by zlib
     frame_id: Name = "map"
 
@@ -222,9 +223,9 @@ class Goal(Stamped):
 
 
 class Drive(Stamped):
-    """A velocity steered by hand. It takes precedence over the goal for 0.5 s; repeat it to continue."""
+    """A velocity steered by hand."""
 
-    twist: Twist  # base_link; after 0.5 s of zeros, the robot drives to its goal again
+    twist: Twist  # base_link; overrides the goal until no message, or only zero velocity, has arrived for 0.5 s
 
 
 class CmdVel(Stamped):
@@ -234,13 +235,14 @@ class CmdVel(Stamped):
 
 
 class PolicyEnergy(Message):
-    """Expected free energy of the chosen policy, in nats: risk + ambiguity - pose_information - place_information."""
+    """Expected free energy of the chosen motion, in nats: risk + ambiguity - pose_information - place_information."""
 
     risk: Finite  # of distance to go, closeness to obstacles and changes of velocity
-    ambiguity: Finite  # expected entropy of the scans
+    ambiguity: Finite  # entropy of the pose expected along the way; with several hypotheses, mean entropy of the beams
+    # predicted at the end of the way
     pose_information: Finite  # expected gain about the pose within a place; negative: a loss
     place_information: Finite  # expected gain about which hypothesis is true
-    probability: Annotated[float, Field(ge=0, le=1)]  # among the policies compared, softmax(-5000 G)
+    probability: Annotated[float, Field(ge=0, le=1)]  # among the motions compared, softmax(-5000 G)
 
 
 class Exploration(Message):
@@ -263,7 +265,7 @@ class Status(Stamped):
     goal: Pose | None = None  # base_link in map
     goal_seq: Count = 0  # seq of the goal
     distance: Distance | None = None  # m, from the believed pose to the goal
-    energy: PolicyEnergy | None = None  # of the chosen policy, preset geodesic
+    energy: PolicyEnergy | None = None  # preset geodesic
     exploration: Exploration | None = None  # nil: none, or cancelled
 
 

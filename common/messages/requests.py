@@ -172,14 +172,14 @@ class ConfigReply(Reply):
     versions: dict[str, str] = {}  # noqa: RUF012
     # of Python and packages, by name
     protocol: Count = 0  # version of the messages; 0: unknown
-    host: Name = ""  # host name
+    host: Name = ""
     uptime: NotNegative = 0.0  # s of wall time
 
 
 class ModelRequest(Request):
     """Query the estimator's map and weights."""
 
-    weights: bool = False  # include the weights
+    weights: bool = False
 
 
 class ModelReply(Reply):

@@ -85,7 +85,14 @@ BELIEF = Topic(
 PREDICTION = Topic(
     "prediction", m.Prediction, "estimator", 15, "newest", about="the scan predicted for the belief, with its stamp"
 )
-MAP = Topic("map", m.Map, "mapper", 0, "newest", about="the map so far, on change and every 5 s")
+MAP = Topic(
+    "map",
+    m.Map,
+    "mapper",
+    0,
+    "newest",
+    about="the map so far, whose origin is where mapping began; on change and every 5 s",
+)
 FIELD = Topic(
     "field",
     m.LearnedField,
@@ -121,7 +128,7 @@ DRIVE = Topic(
     "newest",
     multiple_publishers=True,
     publisher_roles=CONTROL_ROLES,
-    about="velocity steered by hand; takes precedence over the goal for 0.5 s",
+    about="velocity steered by hand, which overrides the goal",
 )
 STATUS = Topic("status", m.Status, "controller", 15, "newest", latched=True, about="what the controller does, and why")
 PLAN = Topic("plan", m.Plan, "controller", 0, "newest", about="planned path, and obstacles outside the map")

@@ -9,8 +9,9 @@ To process a belief means to wait for predicted scans if the policy needs them, 
 | AwaitsScan | process the waiting one, then the new one | process, if it is not older | - | process |
 | AwaitsPredictions | process it in place of the waiting one | - | answer | stop the robot: NoBelief |
 
-A new belief that came before its scan enters AwaitsScan instead, because the network reordered the two; a belief that
-awaits predictions is answered first. A repeated belief changes nothing; if it was answered, it gets the same answer.
+The network may deliver a belief before its scan. Such a belief enters AwaitsScan instead of being processed; a belief
+that awaits predictions is answered first. A repeated belief changes nothing; if it was answered, it gets the same
+answer.
 """
 
 from __future__ import annotations

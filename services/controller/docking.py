@@ -71,7 +71,7 @@ class Docking:
         return None
 
     def interrupt(self) -> None:
-        """Starts again: the robot was driven by hand, stopped, or lost its pose."""
+        """Starts again, because the robot was driven by hand, stopped, or lost its pose."""
         self.phase = DockingPhase.DRIVE
 
     def errors(self, pose: Array) -> tuple[float, float, float]:
@@ -106,7 +106,8 @@ class Docking:
             return None
         final_turn = turn_rate(turn, self.robot) if abs(turn) > TARGET_SHARE * (self.yaw_tolerance or np.inf) else 0.0
         if self.robot.drive == "holonomic":
-            return np.array([*se2.rotate(self.direction - pose[2], self._to_line(along, across)), final_turn])
+            velocity = self._holonomic_velocity(along, across)
+            return np.array([*se2.rotate(self.direction - pose[2], velocity), final_turn])
         speed = self._speed(along)
         if speed > 0:  # yaw'' = -2 yaw' / C - y / C^2 over the distance: critically damped
             final_turn = speed * (across / CONVERGENCE_M + 2 * turn) / CONVERGENCE_M
@@ -115,8 +116,8 @@ class Docking:
             return None
         return np.array([-speed if self.backwards else speed, 0.0, final_turn])
 
-    def _to_line(self, along: float, across: float) -> Array:
-        """Velocity (2,) m/s along and across the line, which leads to the line before it leads to the goal."""
+    def _holonomic_velocity(self, along: float, across: float) -> Array:
+        """Velocity (2,) m/s along and across the line, with which the robot gets onto the line before the goal."""
         target = np.array([along / 2, across])
         return target / max(float(np.hypot(*target)), 1e-9) * self._speed(float(np.hypot(along, across)))
 

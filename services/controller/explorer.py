@@ -35,7 +35,7 @@ PAUSE_NS = 2_000_000_000  # how long the robot stands at a goal of a user before
 STALLED_NS = 8_000_000_000  # after this time without a motion of `STALLED_M`, the goal counts as unreachable
 STALLED_M = 0.2
 VIEWPOINT_TOLERANCE_M = 0.1
-RETURN_TOLERANCE_M = 0.01  # of the goal at the start, to be surely within 2 cm of it
+RETURN_TOLERANCE_M = 0.01  # of the goal at the start, so that the robot surely stands within 2 cm of it
 SAME_PLACE_M = 0.1  # a new viewpoint this close to the present goal does not replace it
 
 
@@ -76,7 +76,7 @@ class Explorer:
         return se2.compose(poses[min(self._home_key, len(poses) - 1)], self._home)
 
     def use_map(self, planned: PlannedMap) -> None:
-        """Uses a new version of the map, whose frontier is another one."""
+        """Uses a new version of the map, in which another viewpoint may be better."""
         self.map, self.viewpoint_due = planned, self.drives
 
     def pause(self) -> None:
@@ -128,7 +128,7 @@ class Explorer:
         return not self.paused
 
     def _note_motion(self, stamp_ns: int) -> None:
-        """Notes when the robot has moved by `STALLED_M`."""
+        """Stores when the robot last moved by `STALLED_M`."""
         place, since_ns = self._last_moved
         if np.hypot(*(self._pose - place)[:2]) > STALLED_M or not 0 < since_ns <= stamp_ns:
             self._last_moved = self._pose, stamp_ns
@@ -144,7 +144,7 @@ class Explorer:
         return self.active  # a refused return is tried again, because the next attempt may find another path
 
     def _update_viewpoint(self, goal: Goal, state: GoalState, *, stalled: bool) -> bool:
-        """Notes that the viewpoint was reached, or is given up; returns whether either is the case."""
+        """Stores that the viewpoint was reached, or is given up; returns whether either is the case."""
         if state.active and not stalled:
             return False
         if state.phase is Phase.REACHED:

@@ -6,8 +6,8 @@
 | any | `cancel` | IDLE |
 | NAVIGATING, BLOCKED, UNLOCALISED | `lose_pose`, `lose_belief` | UNLOCALISED |
 | UNLOCALISED | `find_pose` | NAVIGATING |
-| NAVIGATING, BLOCKED | `update_progress`: recovers, or has stood before an obstacle for 2 s | BLOCKED |
-| BLOCKED | `update_progress`: moves, or nothing is in the way | NAVIGATING |
+| NAVIGATING, BLOCKED | `update_progress`: the robot backs off, or has stood before an obstacle for 2 s | BLOCKED |
+| BLOCKED | `update_progress`: the robot moves, or nothing is in the way | NAVIGATING |
 | NAVIGATING, BLOCKED | `reach` | REACHED |
 | NAVIGATING, BLOCKED | `refuse` | REFUSED |
 | NAVIGATING, BLOCKED, UNLOCALISED | `suspend` | NAVIGATING |
@@ -40,7 +40,7 @@ class Phase(Enum):
     REFUSED = auto()  # the goal cannot be reached: it is inside a wall, or in another room
 
 
-STATUS_OF_PHASE: dict[Phase, StatusState] = {
+STATUS_OF_PHASE: dict[Phase, StatusState] = {  # while UNLOCALISED, it depends on what the robot does
     Phase.IDLE: "idle",
     Phase.NAVIGATING: "navigating",
     Phase.BLOCKED: "blocked",

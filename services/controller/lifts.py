@@ -23,13 +23,13 @@ class LiftRide:
     place: Array  # (2,) m in map, of the lift on the robot's floor
     floor: str  # of the goal
 
-    def waits(self, pose: Array) -> bool:
+    def is_at_lift(self, pose: Array) -> bool:
         """Whether the robot at ``pose`` (3,) is at the lift."""
         return bool(np.hypot(*(pose[:2] - self.place)) <= LIFT_TOLERANCE_M)
 
     def reason(self, pose: Array) -> str:
         """Status text of the robot at ``pose`` (3,)."""
-        if self.waits(pose):
+        if self.is_at_lift(pose):
             return f"waiting to be taken to floor {self.floor!r}"
         return f"driving to the lift to floor {self.floor!r}"
 

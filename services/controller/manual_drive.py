@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.messages.definitions import Drive
 
-# Age at which a drive message expires. A commanded velocity of zero holds up the goal for as long at most.
+# Age at which a drive message expires. Messages that command zero velocity override the goal for as long at most.
 MANUAL_TIMEOUT_NS = 500_000_000
 
 
@@ -23,7 +23,7 @@ class ManualDrive:
     def __init__(self) -> None:
         self._twist = np.zeros(3)
         self._last_message_ns: int | None = None
-        self._zero_since_ns: int | None = None  # first of the latest uninterrupted messages that command zero velocity
+        self._zero_since_ns: int | None = None  # since when all messages command zero velocity
 
     def update(self, drive: Drive, now_ns: int) -> None:
         """Stores a drive message that arrived at ``now_ns``, the stamp of the latest scan or command."""

@@ -56,14 +56,14 @@ class Navigator:
         self._map: PlannedMap | None = None  # the mapper's, if there is one
         self._pose: Array | None = None  # (3,) base_link in map, of the latest belief that tracks
         self._tracking = False  # whether the latest belief tracks
-        self._floor: Floor | None = None  # for which the destination was chosen; None to choose it again
+        self._floor: Floor | None = None  # for which the destination was chosen; None if it was not known
         self.explorer: Explorer | None = None  # the last exploration, unless it was cancelled
         self._exploration_request: Goal | None = None  # waits for the first map and a pose in it
         self._scan: Scan | None = None
         self._scan_points = np.zeros((0, 2))  # m in base_link
 
     def on_scan(self, scan: Scan) -> None:
-        """Keeps the scan, corrected for the robot's motion, for the obstacle limits and for the policy."""
+        """Stores the scan, corrected for the robot's motion, for the obstacle limits and the policy."""
         self._scan = correct_scan(scan, self._command.velocity)
         self._scan_points = safety.scan_points(self._scan)
         self.policy.prepare(self._scan)
@@ -173,7 +173,7 @@ class Navigator:
     def _refusal(self, goal: Goal) -> str | None:
         def of_place(place: Array) -> str | None:
             if self.world is not None and self.world.floors and self._present_floor() != self.world.floor_at(place):
-                return wall_refusal(self.world, place, self.robot.radius)  # which ways lead there is known there
+                return wall_refusal(self.world, place, self.robot.radius)  # paths can be checked only on that floor
             return self.policy.refusal(place)
 
         if self._docking is None:
@@ -209,7 +209,7 @@ class Navigator:
             self._suspend_goal()
         goal = self.goal_state.goal
         distance = None if goal is None else float(np.hypot(*(goal.pose.array() - pose)[:2]))
-        shown_distance = distance if self._ride is None else None
+        shown_distance = distance if self._ride is None else None  # between floors it has no meaning
         if manual_twist is not None:
             command, _ = self._command.limit(belief.stamp_ns, manual_twist, self._scan_points)
             return command, self._add_exploration(self._manual_status(belief.stamp_ns, shown_distance))
@@ -303,7 +303,7 @@ class Navigator:
             self.policy.interrupt()
             turn = self._turn_to_goal_heading(pose, goal)
             if turn is None:
-                # Not before the robot stands: one that turns while it brakes may pass the goal.
+                # Only once the robot stands: one that turns while it brakes may leave the tolerance again.
                 if self._has_stood(belief.stamp_ns, 0.0):
                     self.goal_state.reach(_arrival(belief, goal))
                 return np.zeros(3)
@@ -319,7 +319,7 @@ class Navigator:
 
     def _lift_velocity(self, ride: LiftRide, belief: Belief, pose: Array) -> Array:
         """Velocity (3,) in base_link towards the lift, or zero at it."""
-        if ride.waits(pose):
+        if ride.is_at_lift(pose):
             self.policy.interrupt()
             self.decision = Decision(reason=ride.reason(pose))
             return np.zeros(3)

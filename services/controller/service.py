@@ -182,14 +182,14 @@ class ControllerService(Service):
     def _process(self, belief: Belief) -> None:
         """Answers a belief, or requests predictions first if the policy needs them."""
         self._wait = Answered()  # set first, so that a belief whose step raises an exception is not processed again
-        start_ns, motions = time.thread_time_ns(), None
+        start_ns, drives = time.thread_time_ns(), None
         if self.geodesic is not None and self.navigator.goal_state.active:
-            motions = self.geodesic.prediction_request(belief)
+            drives = self.geodesic.prediction_request(belief)
         cpu_ns = time.thread_time_ns() - start_ns
-        if motions is None:
+        if drives is None:
             self._step(belief, cpu_ns)
             return
-        request = PredictRequest(poses=motions.poses().reshape(-1, 3), beams=PREDICTED_BEAMS)
+        request = PredictRequest(poses=drives.poses().reshape(-1, 3), beams=PREDICTED_BEAMS)
         self._latest_request = self.send_request(PREDICT, request, PREDICTION_TIMEOUT_S)
         self._wait = AwaitsPredictions(belief, cpu_ns)
 

@@ -41,7 +41,7 @@ class ControllerSettings(SelfFilterSettings):
         Literal["travel", "keep"],
         Field(description="a holonomic robot turns into its direction of travel, or keeps its heading"),
     ] = "travel"
-    epistemic: Annotated[bool, Field(description="policies are also judged by the information that they gain")] = True
+    epistemic: Annotated[bool, Field(description="motions are also judged by the information that they gain")] = True
     gamma: Annotated[float, Field(gt=0, lt=1, description="preset paper: action step size per scan (equation 4)")] = 0.3
     belief_timeout: Annotated[
         float, Field(gt=0, le=60, description="the robot stops after this time without a belief, s")

@@ -51,7 +51,7 @@ class VelocityCommand:
         return motion
 
     def _in_pulses(self, desired: Array) -> Array:
-        """The desired velocity (3,); where the base's dead band would swallow it, pulses just above the dead band.
+        """The desired velocity (3,), or where that is below the base's dead band, pulses just above the dead band.
 
         The sum of the pulses follows that of the desired velocities, as in a sigma-delta modulator.
         """

@@ -11,9 +11,9 @@ from common.robot.scan_geometry import ALL_ROUND, Sector, Sweep
 from common.robot.scanner import SCANNERS
 from services.controller.policies.free_space import FreeSpace
 from services.controller.policies.motion_model import turn_to_attractor
+from services.controller.policies.motion_selection import FIELD_OF_VIEW_MARGIN_RAD, Surroundings, select_motion
 from services.controller.policies.obstacles import TemporaryObstacles
 from services.controller.policies.planner import BLIND_AHEAD, GeodesicPolicy
-from services.controller.policies.policy_selection import FIELD_OF_VIEW_MARGIN_RAD, Surroundings, select_policy
 from tests.controller.driving import belief, box, drive, goal, room, scan
 
 HALL, CHANGED = room(8, 6), room(8, 6, box(4.0, 1.5, 0.5, 0.5))
@@ -54,7 +54,7 @@ def test_actions_stay_within_the_view(centre, half_deg):
     surroundings = Surroundings(no_walls, no_points, np.zeros(0, bool), 0.0, 0.33, field_of_view=view)
     for bearing in np.arange(0, 2 * np.pi, 0.5):
         attractor = 3 * np.array([np.cos(bearing), np.sin(bearing)])
-        action = select_policy(np.zeros(3), attractor, surroundings, Robot()).action
+        action = select_motion(np.zeros(3), attractor, surroundings, Robot()).action
         if np.hypot(*action[:2]) > 0.02:
             off = abs(float(se2.wrap(np.arctan2(action[1], action[0]) - centre)))
             assert off <= max(view.half - FIELD_OF_VIEW_MARGIN_RAD, view.half / 3) + 1e-6

@@ -10,14 +10,14 @@ from common.messages.requests import PredictReply, Reply
 from common.messages.topics import BELIEF, CMD_VEL, PREDICT, SCAN
 from common.runtime.service import Loop
 from services.controller import service as shell
-from services.controller.policies.active_localisation import CandidateMotions
+from services.controller.policies.active_localisation import CandidateDrives
 from services.controller.service import ControllerService
 from services.controller.settings import ControllerSettings
 from tests.controller.driving import PERIOD_NS, belief, goal, room, scan
 from tests.process_replay.harness import FakeBus
 
 ROOM, POSE = room(10, 4), np.array([2.0, 2.0, 0.0])
-MOTIONS = CandidateMotions(POSE[None], np.ones(1), POSE[None], np.ones(1))
+DRIVES = CandidateDrives(POSE[None], np.ones(1), POSE[None], np.ones(1))
 
 
 class Clock:
@@ -37,7 +37,7 @@ class Predicting:
         self.numbers, self.used = numbers, 0
 
     def prediction_request(self, message):
-        return MOTIONS if message.stamp_ns // PERIOD_NS in self.numbers else None
+        return DRIVES if message.stamp_ns // PERIOD_NS in self.numbers else None
 
     def use_predictions(self, reply):
         self.used += 1

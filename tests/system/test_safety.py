@@ -104,6 +104,6 @@ def test_controller_without_obstacle_stop(process, bus, truths, base):
 
     seen = drive(bus, truths, publish_true_belief)
     assert not any(truth.contact for truth in seen)
-    wait_for_message(statuses, Status, lambda status: status.reason.startswith("waiting: something"))
+    wait_for_message(statuses, Status, lambda status: status.reason.startswith("waiting; the nearest obstacle"))
     for running in (simulator, controller):
         assert running.stop() == 0, running.output

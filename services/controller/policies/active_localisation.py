@@ -1,10 +1,10 @@
 """Chooses where to drive while the pose is ambiguous or unknown.
 
-A policy is a drive to a place. Its expected free energy (see `expected_free_energy`) is the length of the path to the
-place and from there to the goal, minus the expected information of a scan from there. With several possible poses, this
-information is how well predicted scans distinguish the poses; with an unknown pose, any scan is assumed to give the
-pose. In both cases a scan near a place where the robot has already been gives less information, because scans from one
-place are not independent.
+The candidates are drives to places. The expected free energy of a drive (see `expected_free_energy`) is the length of
+the path to the place and from there to the goal, minus the expected information of a scan from there. With several
+possible poses, this information is how well predicted scans distinguish the poses; with an unknown pose, any scan is
+assumed to give the pose. In both cases a scan near a place where the robot has already been gives less information,
+because scans from one place are not independent.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from services.controller.policies import expected_free_energy as efe
 from services.controller.policies.decision import Decision
 from services.controller.policies.expected_free_energy import NATS_PER_METRE, ExpectedFreeEnergy
 from services.controller.policies.motion_model import is_moving, turn_to_attractor
-from services.controller.policies.policy_selection import Surroundings, select_policy
+from services.controller.policies.motion_selection import Surroundings, select_motion
 from services.controller.policies.recovery import BACKING_OFF, back_off
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from services.controller.policies.geodesic_field import CostField, FreeSpaceGraph
     from services.controller.policies.recovery import Recovery
 
-MIN_WEIGHT = 1e-3  # hypotheses with less weight are ignored: without them, the belief would be tracked
+MIN_WEIGHT = 1e-3  # hypotheses with less weight do not keep a belief from `tracking`, so they are ignored
 # A hypothesis counts as at least this probable. The goal is only reached once all others are excluded, however
 # improbable they are, and the information of a scan about an improbable one would be worth hardly a metre.
 MIN_COUNTED_WEIGHT = 0.05
@@ -48,24 +48,24 @@ INITIAL_WAIT_NS = 1_000_000_000  # time for the estimator to localise before the
 CORRELATION_LENGTH_M = 1.0  # scans from places this far apart are nearly independent
 MAX_VISITED = 100  # positions kept, VISITED_SPACING_M apart
 VISITED_SPACING_M = 0.25
-STALLED_NS = 3_000_000_000  # after this time without motion, a place counts as visited: no way leads there
+STALLED_NS = 3_000_000_000  # after this time without motion, the robot gives up the place
 MAX_USEFUL_ROOM_M = 5.0  # more free distance than this is no advantage
 WINDOW_RAD = 0.35  # the room (free distance) in a direction is the shortest range this far to either side of it
 MIN_ROOM_M = 0.7  # if every direction has less, the robot turns on the spot
-NOMINAL_SIGMA_M = 0.02  # of a beam whose precision is not in doubt
+NOMINAL_SIGMA_M = 0.02  # standard deviation of a beam at which its entropy counts as 0
 
 
 @dataclass(frozen=True)
-class CandidateMotions:
-    """Possible motions under one belief. The first hypothesis is the best one."""
+class CandidateDrives:
+    """Drives to places, compared under one belief. The first hypothesis is the best one."""
 
     hypotheses: Array  # (K, 3) base_link in map
     weights: Array  # (K,)
-    displacements: Array  # (M, 3) places in base_link of the first hypothesis; the same motion applies to each
+    displacements: Array  # (M, 3) of each drive, in base_link; the same from each hypothesis
     lengths: Array  # (M,) m to drive there
 
     def poses(self) -> Array:
-        """Poses (K, M, 3) in map after each motion from each hypothesis."""
+        """Poses (K, M, 3) in map after each drive from each hypothesis."""
         return se2.compose(self.hypotheses[:, None, :], self.displacements[None, :, :])
 
 
@@ -91,7 +91,7 @@ class VisitedPlaces:
             self._add(np.zeros(2))
         return motion
 
-    def give_up(self, place: Array) -> None:
+    def give_up_if_stalled(self, place: Array) -> None:
         """Counts the place (2,) m that the robot drives to as visited, if there was no progress for `STALLED_NS`."""
         if self._stamp_ns is not None and self._stamp_ns - self._progress[1] > STALLED_NS:
             self._progress = np.zeros(2), self._stamp_ns
@@ -118,7 +118,10 @@ class ActiveLocaliser:
         *,
         may_turn: bool = True,
     ) -> None:
-        """Keeps ``min_point_distance`` m from the robot's centre to scan points. ``may_turn``: any heading will do."""
+        """Keeps the robot's centre ``min_point_distance`` m away from scan points.
+
+        ``may_turn``: the robot may turn into its direction of motion.
+        """
         self.may_turn = may_turn
         self.robot = robot.model_copy(update={"max_speed": min(robot.max_speed, MAX_SPEED)})
         self.min_point_distance = min_point_distance
@@ -136,13 +139,13 @@ class ActiveLocaliser:
     def reset(self) -> None:
         """Forgets everything. Call it when the pose is known, or the goal has changed."""
         self._visited = VisitedPlaces()
-        self._requested: tuple[int, CandidateMotions] | None = None  # stamp in ns and motions of the last request
+        self._requested: tuple[int, CandidateDrives] | None = None  # stamp in ns and drives of the last request
         self._place: tuple[Array, dict[str, float]] | None = None  # (3,) in base_link, and its expected free energy
         self._field: tuple[Array, CostField | None] | None = None  # a place (2,) m in map and its field
         self._unknown_since_ns: int | None = None  # stamp since which there are no likely hypotheses
 
-    def prediction_request(self, belief: Belief) -> CandidateMotions | None:
-        """Candidate motions; scans must be predicted for their end poses and passed to `use_predictions`.
+    def prediction_request(self, belief: Belief) -> CandidateDrives | None:
+        """Candidate drives; scans must be predicted for their end poses and passed to `use_predictions`.
 
         Returns None if no predictions are needed now.
         """
@@ -156,20 +159,23 @@ class ActiveLocaliser:
             lengths = np.concatenate([[np.hypot(*self._place[0][:2])], lengths])
         if not len(lengths):
             return None
-        self._requested = (stamp, CandidateMotions(poses, weights, displacements, lengths))
+        self._requested = (stamp, CandidateDrives(poses, weights, displacements, lengths))
         return self._requested[1]
 
-    def use_predictions(self, reply: PredictReply, range_max: float, to_goal: Callable[[Array], Array]) -> None:
-        """Chooses a place with the predictions for the last request; ``to_goal``: (..., 2) m in map -> (...,) m."""
+    def use_predictions(self, reply: PredictReply, range_max: float, cost_to_goal: Callable[[Array], Array]) -> None:
+        """Chooses a place with the predictions for the last request.
+
+        ``cost_to_goal`` returns the cost (...,) m of the paths to the goal from places (..., 2) m in map.
+        """
         if self._requested is None:
             return
-        _, motions = self._requested
-        shape = (len(motions.hypotheses), len(motions.displacements), -1)
+        _, drives = self._requested
+        shape = (len(drives.hypotheses), len(drives.displacements), -1)
         ranges = reply.ranges.astype(np.float64).reshape(shape)
         sigma = reply.sigma.astype(np.float64).reshape(shape) if len(reply.sigma) else np.full_like(ranges, 0.05)
-        energy = drive_energy(motions, ranges, sigma, range_max, to_goal, self._visited.novelty)
+        energy = drive_energy(drives, ranges, sigma, range_max, cost_to_goal, self._visited.novelty)
         best = int(np.argmin(energy.total))
-        self._place = motions.displacements[best], energy.of(best, energy.total)
+        self._place = drives.displacements[best], energy.of(best, energy.total)
 
     def decide(self, belief: Belief, scan: Scan, points: Array, velocity: Array, field_of_view: Sector) -> Decision:
         """Chooses a velocity; ``points`` (K, 2) m in base_link are obstacles."""
@@ -187,7 +193,7 @@ class ActiveLocaliser:
         if len(poses) > 1:
             self._unknown_since_ns = None
             if self._place is not None:
-                self._visited.give_up(self._place[0][:2])
+                self._visited.give_up_if_stalled(self._place[0][:2])
                 self._recovery.watch(belief.stamp_ns, moving=is_moving(velocity))
                 return self._drive_to(poses[0], *self._place, surroundings, velocity, len(poses))
             return Decision(reason=f"{len(poses)} places are possible: choosing where to drive to tell them apart")
@@ -253,7 +259,7 @@ class ActiveLocaliser:
         zero = np.zeros(len(gain))
         energy = ExpectedFreeEnergy(NATS_PER_METRE * (length + turn), zero, zero, gain)
         best = int(np.argmin(energy.total))
-        self._visited.give_up(length[best] * direction[best])
+        self._visited.give_up_if_stalled(length[best] * direction[best])
         attractor = min(float(length[best]), 2.0) * direction[best]
         return self._approach(
             attractor, surroundings, velocity, Decision(reason=reason, terms=energy.of(best, energy.total))
@@ -262,7 +268,7 @@ class ActiveLocaliser:
     def _approach(self, attractor: Array, surroundings: Surroundings, velocity: Array, decision: Decision) -> Decision:
         """The ``decision`` with a velocity towards the attractor (2,) m in base_link."""
         action = turn_to_attractor(
-            select_policy(velocity, attractor, surroundings, self.robot).action,
+            select_motion(velocity, attractor, surroundings, self.robot).action,
             attractor,
             self.robot,
             may_turn=self.may_turn,
@@ -275,27 +281,28 @@ class ActiveLocaliser:
 
 
 def drive_energy(
-    motions: CandidateMotions,
+    drives: CandidateDrives,
     ranges: Array,
     sigma: Array,
     range_max: float,
-    to_goal: Callable[[Array], Array],
+    cost_to_goal: Callable[[Array], Array],
     novelty: Callable[[Array], Array],
 ) -> ExpectedFreeEnergy:
     """Expected free energy of M drives under K hypotheses.
 
-    ``ranges`` and ``sigma`` (K, M, B) m are the scans predicted at the ends; ``to_goal`` returns the distance (...,) m
-    to the goal from places (..., 2) m in map, ``novelty`` the new share (M,) of scans at places (M, 2) m in base_link.
+    ``ranges`` and ``sigma`` (K, M, B) m are the scans predicted at the ends. ``cost_to_goal`` returns the cost (...,) m
+    of the paths to the goal from places (..., 2) m in map; ``novelty`` returns the share (M,) of the information of
+    scans at places (M, 2) m in base_link that is new.
     """
-    rest_of_path = motions.weights @ to_goal(motions.poses()[..., :2]) / motions.weights.sum()
+    rest_of_path = drives.weights @ cost_to_goal(drives.poses()[..., :2]) / drives.weights.sum()
     nominal_variance = NOMINAL_SIGMA_M**2 + efe.ARRIVAL_ERROR_M**2
     beam_entropy = np.log((sigma**2 + efe.ARRIVAL_ERROR_M**2) / nominal_variance).mean(axis=2) / 2
-    gain = efe.place_information(motions.weights, ranges, sigma, range_max)
+    gain = efe.place_information(drives.weights, ranges, sigma, range_max)
     return ExpectedFreeEnergy(
-        NATS_PER_METRE * (motions.lengths + rest_of_path),
-        motions.weights @ beam_entropy / motions.weights.sum(),
+        NATS_PER_METRE * (drives.lengths + rest_of_path),
+        drives.weights @ beam_entropy / drives.weights.sum(),
         np.zeros(len(gain)),
-        gain * novelty(motions.displacements[:, :2]),
+        gain * novelty(drives.displacements[:, :2]),
     )
 
 

@@ -1,12 +1,12 @@
-"""Expected free energy of policies.
+"""Expected free energy of candidate motions.
 
-A policy pi is a motion; q(s | pi) is the belief about the pose that it leads to, and o are the scans on the way. With
-preferences p(s) and the sensor model p(o | s), its expected free energy in nats is
+A motion pi, in active inference called a policy, leads to the belief q(s | pi) about the pose; o are the scans on the
+way. With preferences p(s) and the sensor model p(o | s), its expected free energy in nats is
 
     G(pi) = E_q[-ln p(s)] + E_q[H(p(o | s))] - E_q[ln q(s | o, pi) - ln q(s | pi)]
               risk            ambiguity        information gain, about the pose and about the place
 
-and the posterior over policies is softmax(-POLICY_PRECISION G) (Parr, Pezzulo & Friston 2022, chapter 4).
+and the probability of a motion is softmax(-PROBABILITY_PRECISION G) (Parr, Pezzulo & Friston 2022, chapter 4).
 docs/method.md derives the terms, and lists the approximations.
 """
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
 
 NATS_PER_METRE = 0.02  # of -ln p(s) per metre to go: 10 m of driving cost as much as 0.2 nats
-POLICY_PRECISION = 5000.0  # a policy that ends 1 cm nearer to the goal is e times as probable
+PROBABILITY_PRECISION = 5000.0  # a motion that ends 1 cm nearer to the goal is e times as probable
 # Resolution of the pose at which information counts: half of what the estimator calls localised, 0.2 m and 5 degrees.
 RESOLUTION = np.diag([0.1, 0.1, np.deg2rad(2.5)]) ** 2
 # Standard deviation, in m and rad, that a metre without scans adds to a position and a heading. It is as far as the
@@ -35,10 +35,10 @@ MIN_BEAM_OVERLAP = 1e-6  # lower limit of one beam's overlap, so that a product 
 
 @dataclass(frozen=True)
 class ExpectedFreeEnergy:
-    """The terms of N policies in nats, (N,) each."""
+    """The terms of N motions in nats, (N,) each."""
 
     risk: Array
-    ambiguity: Array
+    ambiguity: Array  # of the pose along the way; of a drive to tell hypotheses apart, of a beam at its end
     pose_information: Array  # expected gain about where the robot is within a place
     place_information: Array  # expected gain about which of several places it is at
 
@@ -47,14 +47,14 @@ class ExpectedFreeEnergy:
         """G (N,) in nats."""
         return self.risk + self.ambiguity - self.pose_information - self.place_information
 
-    def of(self, policy: int, energy: Array) -> dict[str, float]:
-        """The terms of one policy by name, and its probability; ``energy`` (N,) is `total`, +inf if not allowed."""
-        terms = {name: float(values[policy]) for name, values in vars(self).items()}
-        return terms | {"probability": float(policy_posterior(energy)[policy])}
+    def of(self, motion: int, energy: Array) -> dict[str, float]:
+        """The terms of one motion by name, and its probability; ``energy`` (N,) is `total`, or +inf if excluded."""
+        terms = {name: float(values[motion]) for name, values in vars(self).items()}
+        return terms | {"probability": float(motion_probabilities(energy)[motion])}
 
 
-def policy_posterior(energy: Array, precision: float = POLICY_PRECISION) -> Array:
-    """Probabilities (N,) of policies with expected free energies (N,) nats, of which at least one is finite."""
+def motion_probabilities(energy: Array, precision: float = PROBABILITY_PRECISION) -> Array:
+    """Probabilities (N,) of motions with expected free energies (N,) nats, of which at least one is finite."""
     weight = np.exp(-precision * (energy - np.min(energy)))
     return np.asarray(weight / weight.sum())
 

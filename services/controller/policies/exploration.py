@@ -1,7 +1,7 @@
 """Exploration: where to drive next in a building of which a part is unknown.
 
-A policy is a tour: from the robot through viewpoints, from which a scan sees the frontier between known free and
-unknown space, and back to where exploration began. Its expected free energy in nats is
+The candidates are tours: from the robot through viewpoints, from which a scan sees the frontier between known free and
+unknown space, and back to where exploration began. The expected free energy of a tour in nats is
 
     G(tour) = NATS_PER_METRE * length - information about the map
 

@@ -1,4 +1,4 @@
-"""The goal as a preference: the cost of the path there over free space.
+"""The goal as a preference: the cost of the path to it through free space.
 
 A quadratic prior on the goal pulls straight at it, through walls. It is replaced by ``-ln p(x) = lambda d(x)``, where d
 is the geodesic distance to the goal and a metre near a wall counts for more. The slope of this prior is lambda
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from services.controller.policies.free_space import FreeSpace
 
-WALL_GAP_M = 0.03  # minimum distance between footprint and wall, a little more than the obstacle stop needs
+WALL_GAP_M = 0.03  # minimum distance between footprint and wall; beside it, the obstacle stop needs 0.01 m
 WALL_COST_RANGE_M = 0.35  # range of clearances beyond the minimum within which a metre costs more
 STOP_RANGE_M = 0.05  # within this range it costs even more: there, noise in the scan makes the obstacle stop brake
 MAX_WALL_COST = 1.0  # additional cost of a metre at the minimum clearance, for each of the two ranges

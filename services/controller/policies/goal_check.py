@@ -25,5 +25,5 @@ def near_wall(clearance: float) -> str:
 
 
 def refusal_text(world: str, goal: str, problem: str) -> str:
-    """The reason in `Status` for refusing a goal, as in `place_text`, in the world of that name."""
+    """The reason in `Status` for refusing a ``goal``, given by `place_text`, in the world of that name."""
     return f"{goal} in {world} {problem}"

@@ -1,8 +1,8 @@
-"""Policies, and the motion that they lead to, until the robot stands.
+"""Candidate motions, and the poses that they lead to, until the robot stands.
 
-A policy (5,) is an action, a velocity in m/s, m/s and rad/s in base_link, and two times in s, for which its linear part
-and its turn are held; then the robot brakes them. Acceleration limits are thus part of the prediction, and if a
-policy's motion is free, the robot can always stop in time.
+A candidate motion (5,) consists of an action, which is a velocity in m/s, m/s and rad/s in base_link, and two times in
+s: how long the linear part of the action is held before the robot brakes, and how long its turn. Acceleration limits
+are part of the prediction, so on a motion without collision the robot can always stop in time.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from common.messages.definitions import Scan
     from common.robot.robot import Robot
 
-HOLD_S = 0.4  # how long most policies hold their action; the next scan leads to a new decision
+HOLD_S = 0.4  # how long most motions hold their action; the next scan leads to a new decision
 STEP_S = 1 / 15  # time step of predicted motion: the scan period of the shipped scanner
-SHORT_HOLDS_S = STEP_S * np.arange(1, 6)  # of policies that brake, or stop turning, for their target later
+SHORT_HOLDS_S = STEP_S * np.arange(1, 6)  # of motions that stop at the target, or end their turn in its direction
 TURN_ACCELERATION_SHARE = 0.4  # share of the acceleration that a turn during motion may use
-NEAR_ATTRACTOR_M = 0.5  # nearer than this, the robot does not turn to the attractor any more
+NEAR_ATTRACTOR_M = 0.5  # nearer than this, the robot no longer turns to an attractor that lies ahead
 STANDING_SPEED = 0.02  # m/s or rad/s; anything slower counts as standing
 
 
@@ -31,8 +31,8 @@ def delay_until_effect(robot: Robot, scan: Scan | None) -> float:
     return robot.latency + (scan.sweep_time if scan is not None else 0.0)
 
 
-def rollouts(current: Array, policies: Array, robot: Robot) -> tuple[Array, Array, Array]:
-    """Predicts the motion of policies (N, 5).
+def rollouts(current: Array, motions: Array, robot: Robot) -> tuple[Array, Array, Array]:
+    """Predicts the poses of candidate motions (N, 5).
 
     ``current`` (3,) is the present velocity in base_link. A holonomic base keeps its direction in the map while it
     turns, because each scan leads to a new command; a differential base drives arcs.
@@ -41,13 +41,13 @@ def rollouts(current: Array, policies: Array, robot: Robot) -> tuple[Array, Arra
     stands, apart from a turn on the spot.
     """
     times = np.arange(0, HOLD_S + max_braking_time(robot), STEP_S) + STEP_S / 2  # middles of the steps
-    velocity = _velocities(current, policies, times, robot)
-    return _integrate(velocity, robot), times + STEP_S / 2, _standing_times(current, policies, robot)
+    velocity = _velocities(current, motions, times, robot)
+    return _integrate(velocity, robot), times + STEP_S / 2, _standing_times(current, motions, robot)
 
 
-def _velocities(current: Array, policies: Array, times: Array, robot: Robot) -> Array:
-    """Velocities (N, T, 3) of policies (N, 5) at ``times`` (T,) s: accelerated, held, then braked."""
-    actions, hold, turn_hold = policies[:, :3], policies[:, 3], policies[:, 4]
+def _velocities(current: Array, motions: Array, times: Array, robot: Robot) -> Array:
+    """Velocities (N, T, 3) of motions (N, 5) at ``times`` (T,) s: accelerated, held, then braked."""
+    actions, hold, turn_hold = motions[:, :3], motions[:, 3], motions[:, 4]
     accelerating = np.minimum(times, hold[:, None])  # (N, T) s until then
     turning = np.minimum(times, turn_hold[:, None])
     change = actions - current
@@ -56,7 +56,7 @@ def _velocities(current: Array, policies: Array, times: Array, robot: Robot) -> 
     velocity = np.empty((len(actions), len(times), 3))
     velocity[..., :2] = current[:2] + change[:, None, :2] * progress[..., None]
     velocity[..., 2] = current[2] + np.clip(change[:, None, 2], -max_turn_change, max_turn_change)
-    # From here on, braking.
+    # Then braking.
     share_left = np.maximum(0.0, 1 - robot.acceleration * (times - accelerating) / _linear(velocity))
     velocity[..., :2] *= share_left[..., None]
     turn_left = np.abs(velocity[..., 2]) - robot.turn_acceleration * (times - turning)
@@ -79,16 +79,16 @@ def _integrate(velocity: Array, robot: Robot) -> Array:
     return np.concatenate([np.cumsum(linear_velocity, axis=1) * STEP_S, yaw[..., None]], axis=-1)
 
 
-def _standing_times(current: Array, policies: Array, robot: Robot) -> Array:
+def _standing_times(current: Array, motions: Array, robot: Robot) -> Array:
     """Times (N,) s after which the robot stands, apart from a turn on the spot."""
-    hold, change = policies[:, 3], policies[:, :3] - current
+    hold, change = motions[:, 3], motions[:, :3] - current
     share = np.minimum(1.0, robot.acceleration * hold[:, None] / _linear(change)[:, None])
     top_speed = np.hypot(*(current[:2] + change[:, :2] * share).T)
     return np.asarray(hold + top_speed / robot.acceleration)
 
 
 def _linear(velocity: Array) -> Array:
-    """Speeds (...,) m/s of velocities (..., 3), at least a tiny one, by which can be divided."""
+    """Speeds (...,) m/s of velocities (..., 3), at least 1e-12, so that one can divide by them."""
     return np.asarray(np.maximum(np.hypot(velocity[..., 0], velocity[..., 1]), 1e-12))
 
 
@@ -132,39 +132,38 @@ def turn_rate(angle: float, robot: Robot, hold: float = STEP_S) -> float:
 
 
 def turn_to_attractor(action: Array, attractor: Array, robot: Robot, *, may_turn: bool, forward: float = 0.0) -> Array:
-    """Adds a turn to the action (3,) of a holonomic base, so that the scanner looks where the robot goes.
+    """Adds a turn to the action (3,) of a holonomic base, so that the scanner faces the direction of motion.
 
-    The side at bearing ``forward`` rad in base_link is turned towards the attractor (2,) m. The heading is kept near
-    the attractor if that lies ahead. Returns the action unchanged for a differential base, and if ``may_turn`` is
-    False.
+    The side at bearing ``forward`` rad in base_link is turned towards the attractor (2,) m, unless the attractor is
+    near and lies ahead. Returns the action unchanged for a differential base, and if ``may_turn`` is False.
     """
     if robot.drive != "holonomic" or not may_turn:
         return np.array(action)
     bearing = float(se2.wrap(np.arctan2(attractor[1], attractor[0]) - forward))
     if np.hypot(*attractor) < NEAR_ATTRACTOR_M and abs(bearing) < np.pi / 3:
         return np.array([action[0], action[1], 0.0])
-    # A base that turns must change its velocity in base_link to keep it in map, which takes acceleration.
+    # A base that turns keeps its velocity in map only by a change of that in base_link, which takes acceleration.
     max_turn = TURN_ACCELERATION_SHARE * robot.acceleration / max(float(np.hypot(action[0], action[1])), 1e-3)
     turn = float(np.clip(turn_rate(bearing, robot), -max_turn, max_turn))
     return np.array([*se2.rotate(-turn * STEP_S / 2, action[:2]), turn])
 
 
-def candidate_policies(current: Array, attractor: Array, robot: Robot) -> Array:
-    """Policies (N, 5) to choose from: standing, the current action, and a fan around the attractor (2,) m in base_link.
+def candidate_motions(current: Array, attractor: Array, robot: Robot) -> Array:
+    """Motions (N, 5) to choose from: braking, the current action, and a fan around the attractor (2,) m in base_link.
 
-    One of the speeds is that which ends at the attractor; the last policies reach it faster, and brake later. A
-    differential base may also turn until the attractor lies ahead, and drive straight from then on.
+    One of the speeds is that with which the robot stops at the attractor. The last motions hold a higher speed for less
+    time. A differential base may also turn until the attractor lies ahead, and drive straight from then on.
     """
     bearing, distance = float(np.arctan2(attractor[1], attractor[0])), float(np.hypot(*attractor))
     speeds = np.unique([*(robot.max_speed * np.array([0.08, 0.2, 0.4, 0.7, 1.0])), braking_speed(distance, robot)])
     fan = _holonomic_fan(speeds, bearing) if robot.drive == "holonomic" else _arcs(speeds, bearing, distance, robot)
     held = np.pad(np.concatenate([np.zeros((1, 3)), current[None], fan]), ((0, 0), (0, 2)), constant_values=HOLD_S)
     late = [(stopping_action(current, attractor, robot, hold), hold) for hold in SHORT_HOLDS_S]
-    policies = [[*action, hold, hold] for action, hold in late if action is not None]
+    motions = [[*action, hold, hold] for action, hold in late if action is not None]
     if robot.drive == "differential":
         rates = [(turn_rate(bearing, robot, hold), hold) for hold in SHORT_HOLDS_S]
-        policies += [[v, 0.0, rate, HOLD_S, hold] for rate, hold in rates for v in [0.0, *speeds]]
-    return np.concatenate([held, np.reshape(policies, (-1, 5))])
+        motions += [[v, 0.0, rate, HOLD_S, hold] for rate, hold in rates for v in [0.0, *speeds]]
+    return np.concatenate([held, np.reshape(motions, (-1, 5))])
 
 
 def _holonomic_fan(speeds: Array, bearing: float) -> Array:
@@ -184,10 +183,10 @@ def _arcs(speeds: Array, bearing: float, distance: float, robot: Robot) -> Array
     return np.stack([v, np.zeros_like(v), w], axis=-1)
 
 
-def refined_policies(policy: Array, robot: Robot) -> Array:
-    """Policies (N, 5) near a policy (5,): slightly faster or slower, and in slightly other directions."""
+def refined_motions(motion: Array, robot: Robot) -> Array:
+    """Motions (N, 5) near a ``motion`` (5,): slightly faster or slower, and in slightly other directions."""
     factor, turn = (each.ravel() for each in np.meshgrid([0.85, 0.93, 1.0, 1.07, 1.15], np.linspace(-1, 1, 7)))
-    actions = factor[:, None] * policy[:3]
+    actions = factor[:, None] * motion[:3]
     if robot.drive == "holonomic":
         actions[:, :2] = se2.rotate(np.deg2rad(4) * turn, actions[:, :2])
     else:
@@ -195,4 +194,4 @@ def refined_policies(policy: Array, robot: Robot) -> Array:
     speed = np.hypot(actions[:, 0], actions[:, 1])
     actions[:, :2] *= np.minimum(1.0, robot.max_speed / np.maximum(speed, 1e-9))[:, None]
     actions[:, 2] = np.clip(actions[:, 2], -robot.max_turn, robot.max_turn)
-    return np.column_stack([actions, np.broadcast_to(policy[3:], (len(actions), 2))])
+    return np.column_stack([actions, np.broadcast_to(motion[3:], (len(actions), 2))])

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from services.controller.policies.free_space import FreeSpace
 
 MIN_WALL_DISTANCE_M = 0.2  # a return farther than this from every wall is an obstacle; ten times the scanner's noise
-MAX_RANGE_M = 8.0  # an error of the heading displaces returns beyond this too far
+MAX_RANGE_M = 8.0  # beyond this, an error of the heading displaces returns too far
 CELL_M = 0.05
 STATIC_AFTER_NS = 1_000_000_000  # a cell hit for at least this long counts as furniture, a younger one as moving
 SAME_OBSTACLE_M = 0.3  # a new cell this close to furniture is another side of it

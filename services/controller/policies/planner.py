@@ -14,14 +14,14 @@ from common.geometry import se2
 from common.robot.scan_geometry import ALL_ROUND, Sweep
 from common.runtime import safety
 from services.controller.policies import expected_free_energy as efe
-from services.controller.policies.active_localisation import ActiveLocaliser, CandidateMotions
+from services.controller.policies.active_localisation import ActiveLocaliser, CandidateDrives
 from services.controller.policies.decision import Decision, DecisionState
 from services.controller.policies.free_space import NO_MAP, FreeSpace
 from services.controller.policies.geodesic_field import WALL_COST_RANGE_M, CostField, FreeSpaceGraph
 from services.controller.policies.goal_check import near_wall, refusal_text, wall_refusal
 from services.controller.policies.motion_model import STEP_S, delay_until_effect, is_moving, turn_to_attractor
+from services.controller.policies.motion_selection import PoseBelief, Surroundings, least_distance, select_motion
 from services.controller.policies.obstacles import TemporaryObstacles
-from services.controller.policies.policy_selection import PoseBelief, Surroundings, least_distance, select_policy
 from services.controller.policies.recovery import BACKING_OFF, STUCK_AFTER_NS, Recovery, back_off
 from services.controller.policies.scan_information import ScanInformation
 
@@ -32,12 +32,14 @@ if TYPE_CHECKING:
     from common.messages.requests import PredictReply
     from common.robot.robot import Robot
 
-OBSTACLE_GAP_M = 0.06  # between footprint and unmapped obstacles: the scanner's noise, and half a cell
+# Minimum gap between footprint and unmapped obstacles: more than the scanner's noise, 0.02 m, and half a cell of
+# `obstacles`, 0.025 m, together.
+OBSTACLE_GAP_M = 0.06
 REPLAN_PERIOD_NS = 400_000_000  # minimum time between two plans when obstacles near the path change
 REPLAN_PERIOD_FAR_NS = 1_500_000_000  # the same when obstacles change elsewhere
-BLIND_AHEAD = "a differential base drives ahead, but the scanner does not see there: mount the scanner facing ahead"
-MIN_PROGRESS_M = 0.004  # near the goal, the robot counts as stuck unless it gets nearer by this much
-UNREACHABLE_M = 100.0  # counts as the distance to a goal to which no path leads
+BLIND_AHEAD = "the scanner does not see ahead, where a differential base drives: mount it facing ahead"
+MIN_PROGRESS_M = 0.004  # near the goal, the robot counts as stuck if it gets nearer by less than this
+MAX_COST_TO_GOAL_M = 100.0  # larger costs are clipped, also that of a goal to which no path leads
 OBSTACLE_RANGE_M = 3.0  # obstacles farther from the robot do not matter to its next second
 
 
@@ -47,9 +49,9 @@ class GeodesicPolicy:
     def __init__(
         self, robot: Robot, world: World | None, *, keep_heading: bool = False, epistemic: bool = True
     ) -> None:
-        """Builds the graph of the world, or without a world waits for a map (`use_map`).
+        """Builds the graph of the world. Without a world, every goal is refused until `use_map`.
 
-        ``keep_heading``: a holonomic base does not turn into its direction of motion. ``epistemic``: policies are also
+        ``keep_heading``: a holonomic base does not turn into its direction of motion. ``epistemic``: motions are also
         judged by the information that they gain; otherwise the robot drives on as if the best hypothesis were true.
         """
         # In a growing map this is off, because the information of a scan cannot be computed where the map is unknown.
@@ -64,23 +66,25 @@ class GeodesicPolicy:
         )
         self.field: CostField | None = None  # to the goal, around obstacles unless `ignores_obstacles`
         self.ignores_obstacles = False  # whether the field leads through obstacles, because they leave no path
-        self.field_changed = False  # set with each new field, and cleared by the caller that publishes it
+        self.field_changed = False  # set by `_update_field` when there is another field; the publisher clears it
         self._goal: Array | None = None
         self._component: int | None = None  # of the graph, where the robot was when last tracked
         self._scan: Scan | None = None
         self._information: ScanInformation | None = None  # None before the first scan, and without `epistemic`
-        # When obstacles were last given to the graph, and their cells; whether the field is older than that.
-        self._obstacles_set_ns = -REPLAN_PERIOD_NS
-        self._obstacle_cells: npt.NDArray[Any] = np.zeros(0, int)
-        self._field_outdated = False
-        self._reachable_from: int | None = None  # component of the graph from which the goal is known to be reachable
+        self._obstacles_set_ns = -REPLAN_PERIOD_NS  # when obstacles were last given to the graph
+        self._obstacle_cells: npt.NDArray[Any] = np.zeros(0, int)  # of the graph, that these obstacles occupy
+        self._field_outdated = False  # whether the field was computed before that
+        self._reachable_from: int | None = None  # a component of the graph; the goal can be reached from there
         self._field_of_view = ALL_ROUND
         # Least distance from the goal in m, and the stamp at which the robot got there; None until it is near the goal.
-        self._nearest: tuple[float, int] | None = None
-        self._obstructed_ns = -STUCK_AFTER_NS  # when an obstacle was last near the robot or the goal
+        self._closest_approach: tuple[float, int] | None = None
+        self._obstacle_near_ns = -STUCK_AFTER_NS  # when an obstacle was last near the robot or the goal
 
     def refusal(self, goal: Array) -> str | None:
-        """The reason why a goal (2,) m cannot be reached by the map, with the nearest place that can, or None."""
+        """The reason why a goal (2,) m cannot be reached according to the map, or None if it can.
+
+        The text names the nearest place that can be reached.
+        """
         if self.free is NO_MAP:
             return "there is no map yet; does the mapper run, and do scans arrive?"
         refusal = self._wall_refusal(goal)
@@ -109,7 +113,10 @@ class GeodesicPolicy:
         return self._refusal_text(goal, near_wall(clearance))
 
     def use_map(self, graph: FreeSpaceGraph, *, jumped: bool) -> None:
-        """Plans in a new version of the mapper's map; if places ``jumped`` in it, forgets the obstacles seen so far."""
+        """Plans in a new version of the mapper's map.
+
+        If a loop closure has moved places in it (``jumped``), the obstacles seen so far are forgotten.
+        """
         self.free, self.graph = graph.free, graph
         if jumped:
             self.obstacles = TemporaryObstacles(self.free)
@@ -127,7 +134,7 @@ class GeodesicPolicy:
 
     def interrupt(self) -> None:
         """Stops watching for progress: a robot that does not drive to its goal is not stuck."""
-        self._nearest = None
+        self._closest_approach = None
         self._recovery.reset()
 
     def resume(self) -> None:
@@ -162,30 +169,30 @@ class GeodesicPolicy:
         if (refusal := self._refusal_from_here()) is not None:
             return Decision(reason=refusal, state="blocked", refused=True)
         points, moving = self.obstacles.points(), self.obstacles.moving(stamp_ns)
-        self._plan(pose[:2], points[~moving], stamp_ns)  # without moving obstacles, which will have left
+        self._update_field(pose[:2], points[~moving], stamp_ns)  # moving obstacles will have left
         path = self.field.path(pose[:2]) if self.field is not None else np.zeros((0, 2))
         if not len(path):
             return Decision(reason="no way to the goal from here", state="blocked")
         surroundings = self._surroundings(pose, points, moving)
         if self._recovery.is_active(stamp_ns):
             selected = back_off(velocity, surroundings, self.robot)
-            motion = se2.transform(pose, selected.motion[:, :2])
+            motion = se2.transform(pose, selected.poses[:, :2])
             return Decision(selected.action, BACKING_OFF, "blocked", path, motion, recovering=True)
         assert self.field is not None  # noqa: S101 - there is a path
-        if (stop := self._stop_short(stamp_ns, pose, self.field.goal, surroundings, path)) is not None:
+        if (stop := self._stop_beside_goal(stamp_ns, pose, self.field.goal, surroundings, path)) is not None:
             return stop
         attractor = se2.rotate(-pose[2], self.field.attractor(pose[:2], path) - pose[:2])
         known = PoseBelief(pose, _covariance(belief), self._information)
-        selected = select_policy(velocity, attractor, surroundings, self.robot, known)
+        selected = select_motion(velocity, attractor, surroundings, self.robot, known)
         action = turn_to_attractor(
             selected.action, attractor, self.robot, may_turn=surroundings.may_turn, forward=surroundings.forward
         )
-        # Judged by the command that was sent, not by the action: the limits may have stopped the robot.
+        # The velocity that was commanded counts, not the action: the limits may have stopped the robot.
         self._recovery.watch(stamp_ns, moving=is_moving(velocity))
         standing = not selected.action.any()
         reason = self._reason(pose, surroundings, hindered=selected.hindered, standing=standing)
         state: DecisionState = "blocked" if reason and standing else "navigating"
-        motion = se2.transform(pose, selected.motion[:, :2])
+        motion = se2.transform(pose, selected.poses[:, :2])
         return Decision(action, reason, state, path, motion, terms=selected.terms)
 
     def _refusal_from_here(self) -> str | None:
@@ -197,8 +204,8 @@ class GeodesicPolicy:
             self._reachable_from = self._component
         return refusal
 
-    def prediction_request(self, belief: Belief) -> CandidateMotions | None:
-        """Motions for which scans must be predicted before `decide_unlocalised`; None if none are needed."""
+    def prediction_request(self, belief: Belief) -> CandidateDrives | None:
+        """Drives at whose ends scans must be predicted before `decide_unlocalised`; None if none are needed."""
         if self._goal is None or not self.epistemic:
             return None
         return self.localiser.prediction_request(belief)
@@ -206,21 +213,24 @@ class GeodesicPolicy:
     def use_predictions(self, reply: PredictReply) -> None:
         """Uses the scans that were predicted for the last `prediction_request`."""
         if self._scan is not None:
-            self.localiser.use_predictions(reply, self._scan.range_max, self._to_goal)
+            self.localiser.use_predictions(reply, self._scan.range_max, self._cost_to_goal)
 
-    def _to_goal(self, points: Array) -> Array:
-        """Distance (...,) m to the goal from points (..., 2) m in map."""
+    def _cost_to_goal(self, points: Array) -> Array:
+        """Cost (...,) m of the path to the goal from points (..., 2) m in map, at most `MAX_COST_TO_GOAL_M`."""
         if self.field is None and self._goal is not None:
             self.field, self._field_outdated = self.graph.cost_field(self._goal), True
         if self.field is None:
-            return np.full(points.shape[:-1], UNREACHABLE_M)
-        return np.minimum(self.field.cost.ravel()[self.free.grid.cell_of(points)], UNREACHABLE_M)
+            return np.full(points.shape[:-1], MAX_COST_TO_GOAL_M)
+        return np.minimum(self.field.cost.ravel()[self.free.grid.cell_of(points)], MAX_COST_TO_GOAL_M)
 
     def decide_unlocalised(self, belief: Belief, velocity: Array) -> Decision:
-        """Moves so that the pose becomes known. Without `epistemic`, drives to the goal from the best hypothesis."""
+        """Chooses a velocity with which the pose becomes known.
+
+        Without `epistemic`, an ambiguous belief leads to the goal, as if its best hypothesis were true.
+        """
         if self._scan is None:
             return Decision(reason=f"standing until localised: the belief is {belief.state}")
-        self._nearest = None  # near the goal, the robot is not stuck while its pose is not known
+        self._closest_approach = None  # near the goal, the robot is not stuck while its pose is not known
         if self.epistemic or belief.state != "ambiguous":
             points = safety.scan_points(self._scan)
             points = points[np.hypot(*points.T) < OBSTACLE_RANGE_M]
@@ -229,24 +239,18 @@ class GeodesicPolicy:
         decision.reason = decision.reason or f"the belief is {belief.state}: assuming its best hypothesis"
         return decision
 
-    def _plan(self, position: Array, points: Array, stamp_ns: int) -> None:
-        """Recomputes the field if the goal or the obstacles, ``points`` (K, 2) m in map, changed.
+    def _update_field(self, position: Array, points: Array, stamp_ns: int) -> None:
+        """Recomputes the cost field if the goal, the map or the obstacles, ``points`` (K, 2) m in map, have changed.
 
-        If there is a usable field, the obstacles are given to the graph with one scan and the field follows with the
-        next, because each of the two takes milliseconds.
+        Changed obstacles are given to the graph first, and a field that still leads to the goal is recomputed only with
+        the next scan, because each of the two takes milliseconds.
         """
         if self._goal is None:
             self.field = None
             return
         cells = np.unique(self.free.grid.cell_of(points)) if len(points) else np.zeros(0, int)
         changed = np.setxor1d(cells, self._obstacle_cells, assume_unique=True)
-        age = stamp_ns - self._obstacles_set_ns
-        due = (
-            age < 0  # the simulation was reset
-            or age >= REPLAN_PERIOD_FAR_NS
-            or (age >= REPLAN_PERIOD_NS and self._near_path(position, changed))
-        )
-        if self.field is None or (len(changed) and due):
+        if self.field is None or (len(changed) and self._may_replan(self.field, position, changed, stamp_ns)):
             self.graph.set_obstacles(points)
             self._obstacles_set_ns, self._obstacle_cells, self._field_outdated = stamp_ns, cells, True
             if self.field is not None and not self.ignores_obstacles:
@@ -262,11 +266,18 @@ class GeodesicPolicy:
             self.graph.set_obstacles(np.zeros((0, 2)))
             self.field, self.ignores_obstacles = self.graph.cost_field(self._goal, max_goal_shift), bool(len(points))
 
-    def _near_path(self, position: Array, cells: npt.NDArray[Any]) -> bool:
-        """Whether any of these cells lies near the path from ``position`` (2,) m, or there is no path yet."""
-        if self.field is None or not len(cells) or self.ignores_obstacles:
+    def _may_replan(self, field: CostField, position: Array, changed: npt.NDArray[Any], stamp_ns: int) -> bool:
+        """Whether the plan is old enough to be replaced because obstacles in the cells ``changed`` came or went."""
+        age = stamp_ns - self._obstacles_set_ns
+        if age < 0 or age >= REPLAN_PERIOD_FAR_NS:  # below 0, the simulation was reset
             return True
-        path = self.field.path(position)
+        return age >= REPLAN_PERIOD_NS and self._affects_path(field, position, changed)
+
+    def _affects_path(self, field: CostField, position: Array, cells: npt.NDArray[Any]) -> bool:
+        """Whether obstacles in these cells may change the path of the field from ``position`` (2,) m."""
+        if self.ignores_obstacles:
+            return True
+        path = field.path(position)
         if not len(path):
             return False
         distance = least_distance(self.free.grid.centres(cells), path)
@@ -288,35 +299,41 @@ class GeodesicPolicy:
             may_turn=not self.keep_heading,
         )
 
-    def _stop_short(
+    def _stop_beside_goal(
         self, stamp_ns: int, pose: Array, place: Array, surroundings: Surroundings, path: Array
     ) -> Decision | None:
-        """The decision to stop before a goal that is too near to a wall or obstacle; None while the robot gets nearer.
+        """The decision to stop beside a goal that cannot be reached exactly; None while the robot can drive on.
 
-        ``place`` (2,) m is the end of the ``path``: the goal, or the free place nearest to it.
+        Beside an obstacle the robot waits; otherwise the goal is refused. ``place`` (2,) m is the end of the ``path``:
+        the goal, or the free place nearest to it.
         """
         assert self._goal is not None  # noqa: S101 - there is a path
         to_goal = self._goal - pose[:2]
         distance, shift = float(np.hypot(*to_goal)), float(np.hypot(*(place - self._goal)))
         if distance > shift + 2 * self.robot.radius:
-            self._nearest = None
-        elif self._nearest is None or stamp_ns < self._nearest[1] or distance < self._nearest[0] - MIN_PROGRESS_M:
-            self._nearest = (distance, stamp_ns)
-        # Several cells may be about as near to the goal, so the robot need not stand in a certain one.
+            self._closest_approach = None
+        elif (
+            self._closest_approach is None
+            or stamp_ns < self._closest_approach[1]
+            or distance < self._closest_approach[0] - MIN_PROGRESS_M
+        ):
+            self._closest_approach = (distance, stamp_ns)
+        # Other free places may be as near to the goal as this one, so the robot need not stand exactly here.
         arrived = shift > 0 and distance < shift + self.free.grid.resolution
-        stuck = self._nearest is not None and stamp_ns - self._nearest[1] > STUCK_AFTER_NS
+        stuck = self._closest_approach is not None and stamp_ns - self._closest_approach[1] > STUCK_AFTER_NS
         of_robot, of_goal = (
             np.hypot(*(surroundings.points - centre).T).min(initial=np.inf)
             for centre in (np.zeros(2), se2.rotate(-pose[2], to_goal))
         )
         if min(of_robot, of_goal) < 2 * self.robot.radius:
-            self._obstructed_ns = stamp_ns
-            reason = f"{distance:.2f} m from the goal, {self._hindrance(pose, surroundings, standing=True)}"
+            self._obstacle_near_ns = stamp_ns
+            reason = f"{distance:.2f} m from the goal, {self._hindrance_text(pose, surroundings, standing=True)}"
             return Decision(reason=reason, state="blocked", path=path) if arrived or stuck else None
-        # The field may still lead around something that has just gone.
-        if not stuck or distance > self.robot.radius or 0 <= stamp_ns - self._obstructed_ns < STUCK_AFTER_NS:
+        # After an obstacle has gone, the field may still lead around it for a while.
+        if not stuck or distance > self.robot.radius or 0 <= stamp_ns - self._obstacle_near_ns < STUCK_AFTER_NS:
             return None
-        problem = f"is too near to a wall: stopped {distance:.2f} m from it"
+        stopped = f"stopped {distance:.2f} m from the goal, probably because a wall is too close"
+        problem = f"cannot be reached exactly: {stopped}"
         return Decision(reason=self._refusal_text(self._goal, problem), state="blocked", path=path, refused=True)
 
     def _reason(self, pose: Array, surroundings: Surroundings, *, hindered: bool, standing: bool) -> str:
@@ -324,23 +341,28 @@ class GeodesicPolicy:
         if self.robot.drive == "differential" and not bool(surroundings.sees(0.0)):
             return BLIND_AHEAD
         if self.ignores_obstacles:
-            return self._no_path(pose, surroundings)
-        return self._hindrance(pose, surroundings, standing=standing) if hindered else ""
+            return self._no_path_text(pose, surroundings, standing=standing)
+        return self._hindrance_text(pose, surroundings, standing=standing) if hindered else ""
 
-    def _hindrance(self, pose: Array, surroundings: Surroundings, *, standing: bool) -> str:
-        """Status text: what hinders the robot, and where."""
-        verb = "waiting" if standing else "slowing"
+    def _hindrance_text(self, pose: Array, surroundings: Surroundings, *, standing: bool) -> str:
+        """Status text for when something rules out the best motion.
+
+        It names the nearest obstacle, but not as the cause: that may be another obstacle, or a wall.
+        """
+        effect = "waiting" if standing else "slowed or diverted"
         if not len(surroundings.points):
-            return f"{verb}: a wall is near"
+            return f"{effect}: a wall is near"
         nearest, position = self._nearest_point(pose, surroundings)
         # Anything seen for less than a second may be a person, or a box that was just moved.
         what = "something that may move" if surroundings.moving[nearest] else "something that is not in the map"
-        return f"{verb}: {what}, {np.hypot(*surroundings.points[nearest]):.1f} m away at {position}"
+        away = f"{np.hypot(*surroundings.points[nearest]):.1f} m away at {position}"
+        return f"{effect}; the nearest obstacle is {what}, {away}"
 
-    def _no_path(self, pose: Array, surroundings: Surroundings) -> str:
+    def _no_path_text(self, pose: Array, surroundings: Surroundings, *, standing: bool) -> str:
         """Status text for when obstacles leave no path."""
-        place = f" at {self._nearest_point(pose, surroundings)[1]}" if len(surroundings.points) else ""
-        return f"no way around something that is not in the map{place}: waiting until it clears"
+        place = f", the nearest at {self._nearest_point(pose, surroundings)[1]}" if len(surroundings.points) else ""
+        activity = "waiting until they go" if standing else "driving up to them"
+        return f"no way around obstacles that are not in the map{place}: {activity}"
 
     def _nearest_point(self, pose: Array, surroundings: Surroundings) -> tuple[int, str]:
         """Index of the obstacle point nearest to the robot, and its position as text. Requires at least one."""

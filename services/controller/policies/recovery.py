@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from services.controller.policies.motion_model import turn_to_attractor
-from services.controller.policies.policy_selection import SelectedPolicy, Surroundings, select_policy
+from services.controller.policies.motion_selection import SelectedMotion, Surroundings, select_motion
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -27,7 +27,7 @@ class Recovery:
         self.reset()
 
     def reset(self) -> None:
-        """Starts again: the robot stands for another reason, or has nowhere to drive."""
+        """Starts again, because the robot stands on purpose or has no goal."""
         self._standing_since_ns: int | None = None
         self._backing_off_since_ns: int | None = None
 
@@ -45,12 +45,12 @@ class Recovery:
             self._standing_since_ns, self._backing_off_since_ns = None, stamp_ns
 
 
-def back_off(velocity: Array, surroundings: Surroundings, robot: Robot) -> SelectedPolicy:
-    """The policy towards the largest gap to walls and obstacles; ``velocity`` (3,) is the latest command."""
+def back_off(velocity: Array, surroundings: Surroundings, robot: Robot) -> SelectedMotion:
+    """The motion towards the largest gap to walls and obstacles; ``velocity`` (3,) is the latest command."""
     angle = np.arange(16) * np.pi / 8
     targets = BACK_OFF_M * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     target = targets[int(np.argmax(surroundings.gaps(targets[:, None, :], np.zeros(1))[:, 0]))]
-    selected = select_policy(velocity, target, surroundings, robot)
+    selected = select_motion(velocity, target, surroundings, robot)
     action = turn_to_attractor(
         selected.action, target, robot, may_turn=surroundings.may_turn, forward=surroundings.forward
     )

@@ -2,7 +2,7 @@
 
 A beam along u that hits a surface with normal n measures n·x, because its range changes by -n/(n·u) per metre of x. Its
 precision along n is 1 / ((sigma n·u)² + MAP_ERROR_M²): an error of the map displaces the surface along its normal. The
-information of a scan is the sum over its beams (Censi 2007). Beams without a return count as without information.
+information of a scan is the sum over its beams (Censi 2007). Beams without a return give no information.
 
 A robot at a place p knows its pose by the scans there, or by those at another place q and dead reckoning from there.
 If the scans on the way at q leave the standard deviation s(q), that at p is the least of s(q) plus the drift from q to
@@ -76,8 +76,8 @@ def _information(free: FreeSpace, places: Array, scan: Scan) -> Array:
 def _ambiguity(graph: FreeSpaceGraph, grid: Grid, information: Array) -> Array:
     """Entropy (rows, columns) in nats of the pose beyond `efe.RESOLUTION` in each cell of a graph.
 
-    ``information`` (cells of the coarse ``grid``, 3, 3) is that of the scans of a metre. The directions in which the
-    position is known better and worse, and the heading, are treated separately.
+    ``information`` (cells of the coarse ``grid``, 3, 3) is that of all scans taken on a metre. The heading, and the
+    directions in which the position is known better and worse, are treated separately.
     """
     scan_covariance = np.linalg.inv(information + np.eye(3) / UNKNOWN_VARIANCE)
     scan_variances = np.column_stack([np.linalg.eigvalsh(scan_covariance[:, :2, :2]), scan_covariance[:, 2, 2]])
@@ -95,7 +95,8 @@ def _ambiguity(graph: FreeSpaceGraph, grid: Grid, information: Array) -> Array:
 def _propagate_deviation(graph: FreeSpaceGraph, deviation: Array) -> Array:
     """The standard deviation (cells,) in each cell of a graph, if the robot may come from any other cell.
 
-    There it is that of the scans, ``deviation`` (cells,) in m or rad; on the way it grows by `efe.DRIFT_PER_METRE`.
+    In the other cell, the scans leave the ``deviation`` (cells,) in m or rad; on the way it grows by
+    `efe.DRIFT_PER_METRE`.
     """
     distance = deviation / efe.DRIFT_PER_METRE
     # Dijkstra's algorithm starts at an additional node. Its distance from a cell is the way on which the deviation
@@ -128,12 +129,13 @@ def ray_lengths(free: FreeSpace, start: Array, ray: Array, range_max: float) -> 
     Each step is as long as the clearance, so it passes no wall (sphere tracing).
     """
     shape, start, ray = start.shape[:-1], start.reshape(-1, 2), ray.reshape(-1, 2)
-    length, on_the_way = np.zeros(len(start)), np.arange(len(start))
-    reached = 0.6 * free.grid.resolution  # of a wall; beyond the grid clearances are those of the outermost centres
+    length, active = np.zeros(len(start)), np.arange(len(start))  # rays that have not reached a wall
+    # At this clearance a ray has reached a wall. Beyond the grid, clearances are those of the outermost cell centres.
+    reached = 0.6 * free.grid.resolution
     for _ in range(MAX_RAY_STEPS):
-        clearance = free.clearance_at(start[on_the_way] + length[on_the_way, None] * ray[on_the_way])
-        length[on_the_way] += np.maximum(clearance, 0.0)
-        on_the_way = on_the_way[(clearance > reached) & (length[on_the_way] < range_max)]
-        if not len(on_the_way):
+        clearance = free.clearance_at(start[active] + length[active, None] * ray[active])
+        length[active] += np.maximum(clearance, 0.0)
+        active = active[(clearance > reached) & (length[active] < range_max)]
+        if not len(active):
             break
     return np.where(length < range_max, length, np.inf).reshape(shape)

@@ -1,4 +1,4 @@
-"""Preset `paper`: the goal attracts in a straight line."""
+"""Preset `paper`: drives straight to the goal."""
 
 from __future__ import annotations
 

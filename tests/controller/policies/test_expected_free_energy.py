@@ -12,7 +12,7 @@ from common.geometry import se2
 from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS
 from services.controller.policies import expected_free_energy as efe
-from services.controller.policies.active_localisation import CandidateMotions, VisitedPlaces, drive_energy
+from services.controller.policies.active_localisation import CandidateDrives, VisitedPlaces, drive_energy
 from services.controller.policies.expected_free_energy import entropy, place_information
 from services.controller.policies.free_space import FreeSpace, Grid
 from services.controller.policies.geodesic_field import FreeSpaceGraph
@@ -124,14 +124,14 @@ def test_identical_rooms():
     moves = se2.between(here, np.column_stack([places, np.full(len(places), here[2])]))
     goal = np.array([4.5, 3.0])  # in the first room
     for first, second in ((here, here + twin), (here + twin, here)):
-        motions = CandidateMotions(np.array([first, second]), np.array([0.5, 0.5]), moves, lengths)
-        poses = se2.compose(motions.poses().reshape(-1, 3), np.array(scanner.mount))
+        drives = CandidateDrives(np.array([first, second]), np.array([0.5, 0.5]), moves, lengths)
+        poses = se2.compose(drives.poses().reshape(-1, 3), np.array(scanner.mount))
         ranges = world.ray_distances(poses, scanner.angles()).reshape(2, len(places), 61)
         gain = gain_of(ranges)
         assert np.median(gain[places[:, 1] < 3.5]) < 0.01
         assert gain[outside].max() > 0.6
         energy = drive_energy(
-            motions,
+            drives,
             ranges,
             np.full(ranges.shape, 0.02),
             scanner.range_max,
@@ -149,12 +149,12 @@ def test_visited_places():
     assert visited.novelty(far) == pytest.approx([0, 0, 0.99], abs=0.02)
     for stamp, novelty in [(5, 0.99), (7, 0.0)]:  # it has stood since 3.3 s
         visited.move(stamp * 10**9, np.zeros(3))
-        visited.give_up(far[2])
+        visited.give_up_if_stalled(far[2])
         assert visited.novelty(far)[2] == pytest.approx(novelty, abs=0.02)
 
 
-def test_policy_posterior():
-    assert efe.policy_posterior(np.array([0.3, 0.1, np.inf]), 5.0) == pytest.approx([0.2689, 0.7311, 0], abs=1e-4)
+def test_motion_probabilities():
+    assert efe.motion_probabilities(np.array([0.3, 0.1, np.inf]), 5.0) == pytest.approx([0.2689, 0.7311, 0], abs=1e-4)
 
 
 def test_one_step_and_a_known_pose():

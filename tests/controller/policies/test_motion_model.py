@@ -18,7 +18,7 @@ from services.controller.policies.motion_model import (
     turn_rate,
     turn_to_attractor,
 )
-from services.controller.policies.policy_selection import Surroundings, remaining_distance, select_policy
+from services.controller.policies.motion_selection import Surroundings, remaining_distance, select_motion
 
 ROBOT = Robot()
 both_drives = pytest.mark.parametrize("robot", [ROBOT, Robot(drive="differential")], ids=lambda robot: robot.drive)
@@ -79,9 +79,9 @@ def test_turn_is_braked_in_time(angle):
 @given(x=st.floats(-4, 4), y=st.floats(-4, 4), v=speeds, w=speeds)
 def test_distance_after_selection(robot, x, y, v, w):
     current, goal = np.array([v, 0.0, w]), np.array([x, y])
-    selected = select_policy(current, goal, around(), robot)
+    selected = select_motion(current, goal, around(), robot)
     poses, _, _ = rollouts(current, np.array([[0, 0, 0, HOLD_S, HOLD_S]]), robot)
-    to_go, if_braking = (remaining_distance(each, goal, robot) for each in (selected.motion, poses[0]))
+    to_go, if_braking = (remaining_distance(each, goal, robot) for each in (selected.poses, poses[0]))
     assert to_go.mean() + to_go[-1] <= if_braking.mean() + if_braking[-1] + 0.02 * np.hypot(*current[:2]) + 1e-9
     assert np.hypot(*selected.action[:2]) <= robot.max_speed + 1e-9
     assert abs(selected.action[2]) <= robot.max_turn + 1e-9
@@ -94,7 +94,7 @@ def test_speed_is_kept_up_to_the_goal(robot):
     """With a quadratic prior the slope, and with it the speed, would decrease towards the goal."""
     pose, velocity, steps, goal = np.zeros(3), np.zeros(3), 0, np.array([4.0, 0.0])
     while np.hypot(*(goal - pose[:2])) > 0.05 and steps < 200:
-        selected = select_policy(velocity, se2.rotate(-pose[2], goal - pose[:2]), around(), robot)
+        selected = select_motion(velocity, se2.rotate(-pose[2], goal - pose[:2]), around(), robot)
         velocity = safety.ramp(velocity, selected.action, robot, PERIOD)
         pose, steps = se2.compose(pose, velocity * PERIOD), steps + 1
     least = 4.0 / robot.max_speed + robot.max_speed / robot.acceleration  # accelerate, cruise, brake
@@ -107,9 +107,9 @@ def test_speed_is_kept_up_to_the_goal(robot):
 def test_selected_motion(robot, points, seed):
     v, w = np.random.default_rng(seed).uniform([0, -1], [0.5, 1])
     surroundings = around([p for p in points if np.hypot(*p) > 0.35])
-    selected = select_policy(np.array([v, 0, w]), np.array([1.5, 0.7]), surroundings, robot)
+    selected = select_motion(np.array([v, 0, w]), np.array([1.5, 0.7]), surroundings, robot)
     if selected.action.any():
-        assert surroundings.gaps(selected.motion[None], np.zeros(len(selected.motion))).min() >= -1e-3
+        assert surroundings.gaps(selected.poses[None], np.zeros(len(selected.poses))).min() >= -1e-3
 
 
 @pytest.mark.parametrize(
@@ -118,15 +118,15 @@ def test_selected_motion(robot, points, seed):
 def test_moving_and_static_obstacles(point, moving, hindered):
     """Driving at a moving one, the robot must be able to stop before it arrives."""
     surroundings = around([point], moving=moving)
-    selected = select_policy(np.array([0.6, 0.0, 0.0]), np.array([3.0, 0.0]), surroundings, ROBOT)
+    selected = select_motion(np.array([0.6, 0.0, 0.0]), np.array([3.0, 0.0]), surroundings, ROBOT)
     assert selected.hindered == hindered
     assert (np.hypot(*selected.action[:2]) < 0.6) == hindered
 
 
 def test_unseen_directions():
     behind, view = np.array([-3.0, 0.0]), Sector(0.0, np.deg2rad(135))
-    action = select_policy(np.zeros(3), behind, around(field_of_view=view), ROBOT).action
+    action = select_motion(np.zeros(3), behind, around(field_of_view=view), ROBOT).action
     assert abs(np.arctan2(action[1], action[0])) <= np.pi / 2 + 1e-9  # the body is wide
     assert abs(turn_to_attractor(action, behind, ROBOT, may_turn=True)[2]) > 1.0
-    kept = select_policy(np.zeros(3), behind, around(field_of_view=view, may_turn=False), ROBOT).action
+    kept = select_motion(np.zeros(3), behind, around(field_of_view=view, may_turn=False), ROBOT).action
     assert 0 < np.hypot(*kept[:2]) <= 0.25 + 1e-9

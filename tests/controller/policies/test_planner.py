@@ -54,9 +54,9 @@ def test_turns_to_the_heading_of_the_goal(kind):
         (
             2.5,
             room(10, 5, box(7.5, 3.0, 0.6, 0.6)),
-            r"0\.\d\d m from the goal, waiting: something that is not in the map",
+            r"0\.\d\d m from the goal, waiting; the nearest obstacle is something that is not in the map",
         ),
-        (0.29, HALL, r"goal refused: .* is too near to a wall: stopped 0\.\d\d m from it"),
+        (0.29, HALL, r"goal refused: .* cannot be reached exactly: stopped 0\.\d\d m from the goal"),
     ],
 )
 def test_stops_short_of_the_goal(kind, goal_y, changed, reason):
@@ -104,7 +104,7 @@ def test_new_box():
 
     _, statuses, _ = drive(world, Robot(), (1.5, 1.5, 0.0), goal(8.5, 1.5), 60, known=hall, change=change)
     reasons = [status.reason.split(",")[0] for status in statuses[30:]]
-    assert set(reasons[:15]) == {"waiting: something that may move"}
+    assert set(reasons[:15]) == {"waiting; the nearest obstacle is something that may move"}
     assert not any("may move" in reason for reason in reasons[15:])
 
 

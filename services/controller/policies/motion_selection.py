@@ -1,4 +1,4 @@
-"""Selects the policy of least expected free energy."""
+"""Selects the candidate motion of least expected free energy; `motion_model` defines candidate motions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy.typing as npt
 from common.geometry import se2
 from common.robot.scan_geometry import ALL_ROUND, Sector
 from services.controller.policies import expected_free_energy as efe
-from services.controller.policies import motion_model as motion
+from services.controller.policies import motion_model
 from services.controller.policies.expected_free_energy import NATS_PER_METRE, ExpectedFreeEnergy
 from services.controller.policies.geodesic_field import MAX_WALL_COST, WALL_COST_RANGE_M
 
@@ -26,12 +26,12 @@ BLIND_SPEED = 0.25  # m/s into directions that the scanner does not see, for a b
 # The field of view must extend this far to either side of the direction of motion, because the body is wide. In a
 # field of view too narrow for that, motion is allowed in its middle third.
 FIELD_OF_VIEW_MARGIN_RAD, FIELD_OF_VIEW_DIVISOR = np.pi / 4, 3
-# Cost in m of a change of velocity by 1 m/s, so that the choice does not alternate between policies of equal merit.
+# Cost in m of a change of velocity by 1 m/s, so that the choice does not alternate between motions of equal merit.
 CHANGE_COST_S = 0.02
 WALKING_SPEED = 1.0  # m/s at which moving obstacles are assumed to approach
-LINE_SAMPLES = (np.arange(6) + 0.5) / 6  # shares of the line to the attractor at which its information is looked up
-MOTION_SAMPLES = 5  # every so many steps of a motion
-HINDERED_M = 0.05  # the status names obstacles if they make the way longer by this much
+LINE_SAMPLES = (np.arange(6) + 0.5) / 6  # shares of the line to the attractor at which the ambiguity is looked up
+MOTION_STRIDE = 5  # the ambiguity is looked up at every fifth pose of a motion
+HINDERED_M = 0.05  # a status text is shown if walls and obstacles make the way longer by this much
 GAP_TOLERANCE_M = 1e-3  # for rounding errors
 
 
@@ -75,7 +75,7 @@ class Surroundings:
         shape = poses.shape[:-1]
         times = np.broadcast_to(times, shape)
         until = np.broadcast_to(np.asarray(standing_after)[..., None], shape)
-        relevant = times <= until + motion.STEP_S  # the robot does not move after that
+        relevant = times <= until + motion_model.STEP_S  # the robot does not move after that
         positions, times, in_motion = poses[relevant][:, :2], times[relevant], (times <= until)[relevant]
         gap = np.minimum(self.wall_distance(positions) - self.min_wall_distance, max_gap)
         reach = float(np.hypot(*positions.T).max(initial=0.0)) + self.min_point_distance + max_gap
@@ -125,70 +125,70 @@ class PoseBelief:
             return np.zeros(len(motions)), np.zeros(len(motions))
         ends, length = motions[:, -1, :2], path_lengths(motions)
         line = ends[:, None] + LINE_SAMPLES[:, None] * (attractor - ends)[:, None]
-        points = se2.transform(self.pose, np.concatenate([motions[:, ::MOTION_SAMPLES, :2], line], axis=1))
+        points = se2.transform(self.pose, np.concatenate([motions[:, ::MOTION_STRIDE, :2], line], axis=1))
         line_length = np.hypot(*(attractor - ends).T)
         metres = np.full(points.shape[:2], 1.0)  # length of the part of the way that each point represents
         metres[:, -len(LINE_SAMPLES) :] *= line_length[:, None] / len(LINE_SAMPLES)
         metres[:, : -len(LINE_SAMPLES)] *= length[:, None] / (points.shape[1] - len(LINE_SAMPLES))
         ambiguity = np.sum(metres * self.scans.free_grid.interpolate(self.scans.ambiguity, points), axis=1)
         information = self.scans.matrix[self.scans.grid.cell_of(se2.transform(self.pose, ends))]
-        information = information * seconds / motion.STEP_S
+        information = information * seconds / motion_model.STEP_S
         before = efe.remaining_entropy(self.covariance, np.zeros((3, 3)))
         return ambiguity, before - efe.remaining_entropy(self.covariance, information)
 
 
 @dataclass(frozen=True)
-class SelectedPolicy:
-    """The best policy."""
+class SelectedMotion:
+    """The best candidate motion."""
 
     action: Array  # (3,) m/s, m/s, rad/s in base_link
-    motion: Array  # (T, 3) predicted poses in the present base_link, until standstill
+    poses: Array  # (T, 3) predicted, in the present base_link, until standstill
     terms: dict[str, float]  # of its expected free energy, nats, and its probability
-    hindered: bool  # an obstacle, or one that may approach, ruled out a better policy
+    hindered: bool  # a wall, or an obstacle that is there or may approach, ruled out a better motion
 
 
-def select_policy(
+def select_motion(
     current: Array, attractor: Array, surroundings: Surroundings, robot: Robot, belief: PoseBelief | None = None
-) -> SelectedPolicy:
-    """The policy of least expected free energy, the most probable one under `efe.policy_posterior`.
+) -> SelectedMotion:
+    """The candidate motion of least expected free energy.
 
-    ``current`` (3,) is the present velocity and ``attractor`` (2,) m the target, both in base_link. Policies are
-    sampled once around the attractor, and once more around the best of them. One whose motion is not free, or may not
-    stay free until the robot stands, is excluded: its risk is infinite.
+    ``current`` (3,) is the present velocity and ``attractor`` (2,) m the target, both in base_link. Motions are
+    sampled around the attractor, and then once more around the best of them. A motion is excluded if something is in
+    its way, or may come into its way before the robot stands.
     """
     evaluator = _Evaluator(current, attractor, surroundings, robot, belief or PoseBelief())
-    sampled = evaluator.evaluate(motion.candidate_policies(current, attractor, robot), braking_is_free=True)
-    refined = evaluator.evaluate(motion.refined_policies(sampled.policies[sampled.best], robot))
+    sampled = evaluator.evaluate(motion_model.candidate_motions(current, attractor, robot), braking_is_free=True)
+    refined = evaluator.evaluate(motion_model.refined_motions(sampled.motions[sampled.best], robot))
     chosen = sampled if sampled.least <= refined.least else refined
     hindered = float(sampled.energy.total.min()) < chosen.least - HINDERED_M * NATS_PER_METRE
     best = chosen.best
-    return SelectedPolicy(chosen.policies[best, :3], chosen.poses[best], chosen.terms, hindered=hindered)
+    return SelectedMotion(chosen.motions[best, :3], chosen.poses[best], chosen.terms, hindered=hindered)
 
 
 @dataclass(frozen=True)
 class _Evaluation:
-    """Policies and their expected free energy."""
+    """Candidate motions and their expected free energy."""
 
-    policies: Array  # (N, 5)
+    motions: Array  # (N, 5)
     poses: Array  # (N, T, 3) to which they lead
     energy: ExpectedFreeEnergy
-    allowed: Array  # (N,) total energy in nats; +inf for policies that are not allowed
+    allowed_energy: Array  # (N,) total energy in nats; +inf for excluded motions
 
     @property
     def best(self) -> int:
-        return int(np.argmin(self.allowed))
+        return int(np.argmin(self.allowed_energy))
 
     @property
     def least(self) -> float:
-        return float(self.allowed.min())
+        return float(self.allowed_energy.min())
 
     @property
     def terms(self) -> dict[str, float]:
-        return self.energy.of(self.best, self.allowed)
+        return self.energy.of(self.best, self.allowed_energy)
 
 
 class _Evaluator:
-    """Evaluates policies in one situation."""
+    """Evaluates candidate motions in one situation."""
 
     def __init__(
         self, current: Array, attractor: Array, surroundings: Surroundings, robot: Robot, belief: PoseBelief
@@ -199,32 +199,32 @@ class _Evaluator:
         present_gap = float(surroundings.gaps(np.zeros((1, 1, 3)), np.zeros(1), max_gap=WALL_COST_RANGE_M)[0, 0])
         self._min_gap = min(0.0, present_gap) - GAP_TOLERANCE_M
 
-    def evaluate(self, policies: Array, *, braking_is_free: bool = False) -> _Evaluation:
-        """Expected free energy of those of the policies (N, 5) into directions that the scanner sees.
+    def evaluate(self, motions: Array, *, braking_is_free: bool = False) -> _Evaluation:
+        """Expected free energy of candidate motions (N, 5); `_visible_motions` first removes or slows some of them.
 
-        With ``braking_is_free``, policy 0, which brakes, is always allowed, even if an obstacle may approach meanwhile.
+        With ``braking_is_free``, motion 0, which brakes, is never excluded, even if an obstacle may approach meanwhile.
         """
-        policies = _visible_policies(policies, self.surroundings)
-        poses, times, standing_after = motion.rollouts(self.current, policies, self.robot)
+        motions = _visible_motions(motions, self.surroundings)
+        poses, times, standing_after = motion_model.rollouts(self.current, motions, self.robot)
         deviation = np.sqrt(self.belief.variance / 2)
         gaps = self.surroundings.gaps(poses, times, standing_after, WALL_COST_RANGE_M + 2 * deviation)
         free = np.all(gaps >= self._min_gap, axis=1)
         if braking_is_free:
             free[0] = True
-        metres = self._risk_metres(policies, poses, gaps, deviation)
+        metres = self._risk_metres(motions, poses, gaps, deviation)
         ambiguity, information = self.belief.ambiguity_and_gain(poses, self.attractor, float(times[-1]))
-        energy = ExpectedFreeEnergy(NATS_PER_METRE * metres, ambiguity, information, np.zeros(len(policies)))
-        return _Evaluation(policies, poses, energy, np.where(free, energy.total, np.inf))
+        energy = ExpectedFreeEnergy(NATS_PER_METRE * metres, ambiguity, information, np.zeros(len(motions)))
+        return _Evaluation(motions, poses, energy, np.where(free, energy.total, np.inf))
 
-    def _risk_metres(self, policies: Array, poses: Array, gaps: Array, deviation: float) -> Array:
+    def _risk_metres(self, motions: Array, poses: Array, gaps: Array, deviation: float) -> Array:
         """Risk (N,) in m to go, with the ``deviation`` m of the belief's position.
 
-        It is the distance to go, on average on the way and at the end, where the last pose stands for all that follows;
-        the metres of the motion, more if its narrowest gap is small; and the change of velocity.
+        It is the sum of the mean distance to go during the motion, the distance to go at its end, additional metres if
+        its narrowest gap is small, and the cost of the change of velocity.
         """
         distance = efe.expected_distance(remaining_distance(poses, self.attractor, self.robot), self.belief.variance)
         closeness = efe.expected_square(1 - gaps.min(axis=1) / WALL_COST_RANGE_M, deviation / WALL_COST_RANGE_M)
-        effort = CHANGE_COST_S * np.hypot(*(policies[:, :2] - self.current[:2]).T)
+        effort = CHANGE_COST_S * np.hypot(*(motions[:, :2] - self.current[:2]).T)
         near_obstacles = MAX_WALL_COST * closeness * path_lengths(poses)
         return np.asarray(distance.mean(axis=1) + distance[:, -1] + near_obstacles + effort)
 
@@ -247,12 +247,12 @@ def remaining_distance(poses: Array, attractor: Array, robot: Robot) -> Array:
     return np.asarray(distance + turn * robot.max_speed / robot.max_turn * np.minimum(1.0, distance / HEADING_FADE_M))
 
 
-def _visible_policies(policies: Array, surroundings: Surroundings) -> Array:
-    """Removes policies (N, 5) into directions that the scanner does not see, or slows them if the base may not turn."""
-    speed = np.hypot(policies[:, 0], policies[:, 1])
-    too_fast = speed > BLIND_SPEED if not surroundings.may_turn else speed > motion.STANDING_SPEED
-    blind = ~surroundings.sees(np.arctan2(policies[:, 1], policies[:, 0])) & too_fast
+def _visible_motions(motions: Array, surroundings: Surroundings) -> Array:
+    """Removes motions (N, 5) into directions that the scanner does not see; if the base may not turn, slows them."""
+    speed = np.hypot(motions[:, 0], motions[:, 1])
+    too_fast = speed > BLIND_SPEED if not surroundings.may_turn else speed > motion_model.STANDING_SPEED
+    blind = ~surroundings.sees(np.arctan2(motions[:, 1], motions[:, 0])) & too_fast
     if surroundings.may_turn:
-        return policies[~blind]
+        return motions[~blind]
     scale = np.where(blind, BLIND_SPEED / np.maximum(speed, 1e-9), 1.0)
-    return np.column_stack([policies[:, :2] * scale[:, None], policies[:, 2:]])
+    return np.column_stack([motions[:, :2] * scale[:, None], motions[:, 2:]])
