@@ -177,7 +177,7 @@ class Prediction(Stamped):
 class Map(Stamped):
     """The map that the mapper has built so far; the origin of the frame map is where mapping began."""
 
-    grid: OccupancyGrid
+    grid: OccupancyGrid  # occupied, free and unknown cells
     poses: Poses  # (K, 3) base_link in map, key scans in order of time
     closures: Points = np.zeros((0, 2), np.float32)  # (2 C, 2) m in map, both ends of each loop closure
     frame_id: Name = "map"
