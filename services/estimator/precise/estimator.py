@@ -24,7 +24,7 @@ from services.estimator.precise.hypotheses import (
     weigh,
 )
 from services.estimator.precise.likelihood import Likelihood
-from services.estimator.precise.local_map import LocalMap, LocalMapScan, LocalScan
+from services.estimator.precise.local_map import ChangeRate, LocalMap, LocalMapScan, LocalScan
 from services.estimator.precise.motion_model import (
     MotionCandidate,
     decouple,
@@ -54,18 +54,23 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from services.estimator.precise.global_seeds import Seeds
     from services.estimator.precise.likelihood import Evidence
+    from services.estimator.precise.surface_evidence import SurfaceEvidence
     from services.estimator.shared.generative_models import Expected, GenerativeModel
 
 START_COVARIANCE = np.diag([0.25, 0.25, 0.09])  # of a pose given without one
 MAX_SEARCH_INTERVAL = 150  # scans between two searches without success; the interval doubles from 1
 # Probability (a guess) that a match with the local map is wrong, and the right motion one of many that fit the map.
 WRONG_MATCH = 1e-6
+# A scan that the map predicts worse than the last one by more than this, in nats, may be matched at a wrong pose (a
+# guess). Then a wider area is searched.
+MAX_FIT_DROP = 20.0
 # Smaller errors of the map, divided by the scanner's noise, cannot be told from the noise of one scan (a guess).
 SIGNIFICANT_MAP_ERROR = 0.25
 # Of the beams at surfaces that the map lacks, at most this fraction ends at one of its surfaces by chance. The map
 # explained less than 5 to 9 % of the scan at nine of ten wrong poses in the buildings used for development.
 EXPLAINED_BY_CHANCE = 0.1
 UNKNOWN_SIGMA_M = 100.0  # published where the map is unknown
+SUDDEN_CHANGES = 0.01  # a less probable number of changes (a guess) may be due to a kidnapping, so a search is due soon
 TARGET_BEAMS = 2000  # a scan with at least twice as many is thinned, because the time of a search grows with the beams
 
 
@@ -120,13 +125,14 @@ class PreciseEstimator:
         self._was_tracking = False
         self._unknown_place = UnknownPlace()
         self._local_map = LocalMap(self.mount)
+        self._change_rate = ChangeRate()
         self._precision = Precision.before_first_scan(self._map_cell)
         self._scans_since_search, self._search_interval = 0, 1
 
         # The last scan
         self._stamp: float | None = None
         self._odom: Array | None = None
-        self._explained = 1.0  # fraction of its beams that end at surfaces of the map
+        self._log_fit = 0.0  # nats, see the function of this name
         self._last: LocalScan | None = None
 
         # The present scan
@@ -255,22 +261,21 @@ class PreciseEstimator:
     ) -> tuple[ScanMatch, float]:
         """Matches the scan to the map near the predicted pose of each hypothesis.
 
-        If the map explains much less than before, searches a wider area. Also returns the fraction of the beams that
-        the map explains at the first pose.
+        If the map predicts it much worse than the last scan, searches a wider area. Also returns the fraction of the
+        beams that the map explains at the first pose.
         """
         widest = _prior_of([each[-1] for each in motions])
-        poses, evidence = view.descend(np.array([each[-2].mean for each in motions]), widest)
-        explained = view.surface_evidence(poses).explained[0]
-        if explained < self._explained - self.settings.max_explained_drop:
+        predicted = np.array([each[-2].mean for each in motions])
+        poses, evidence = view.descend(predicted, widest)
+        if _log_fit(view, view.surface_evidence(poses)) < self._log_fit - MAX_FIT_DROP:
             extra_starts = np.zeros((0, 3))
             if not with_odometry:
                 extra_starts = reachable_poses(self.settings.motion, self.modes[0].pose, period, COARSE_SIGMA_M)
-            wider_poses, wider_evidence = search_around(view, poses, widest, extra_starts)
+            wider_poses, wider_evidence = search_around(view, predicted, widest, extra_starts)
             before, after = view.surface_evidence(np.stack([poses[0], wider_poses[0]])).log_likelihood
             if after > before:
                 poses, evidence = wider_poses, wider_evidence
-                explained = view.surface_evidence(poses).explained[0]
-        return ScanMatch(motions, poses, evidence), float(explained)
+        return ScanMatch(motions, poses, evidence), float(view.surface_evidence(poses).explained[0])
 
     def _match_local_map(self, view: View, match: ScanMatch) -> ScanMatch:
         """Matches the scan to the map again, near the motion that scan matching to the local map gives.
@@ -392,14 +397,18 @@ class PreciseEstimator:
             local = self._local_map.to_local(modes[0].pose)
         poses = np.array([mode.pose for mode in modes])
         states = view.surface_evidence(poses)
+        self._log_fit = _log_fit(view, states)
         seen, appeared = self._local_map.find_old_beams(local, view, states.weights[0] > 0.5)
         old, small = seen | appeared | view.surfaces.small, view.surfaces.small
 
         # Changes are equally probable at all hypotheses. If there are suddenly more of them, a search is due soon.
-        changes = self._local_map.count_changes(self._last, LocalScan(local, view), period) if self._last else 0
-        log_one_change = float(np.log(min(0.5, self.settings.change_rate * period)))
-        log_change = changes * log_one_change + _log_unmapped(view, ~appeared | seen | small)
-        if log_change <= self._log_change + log_one_change:
+        log_changes = 0.0
+        if self._last:
+            changes = self._local_map.count_changes(self._last, LocalScan(local, view))
+            log_changes = self._change_rate.log_probability(changes, period)
+            self._change_rate.learn(changes, period)
+        log_change = log_changes + _log_unmapped(view, ~appeared | seen | small)
+        if log_changes < np.log(SUDDEN_CHANGES):
             self._search_interval = 1
 
         present, surroundings = _log_at_poses(view, poses, old, np.array([mode.surroundings for mode in modes]))
@@ -442,7 +451,6 @@ class PreciseEstimator:
         min_log_unknown = max(mode.log_weight for mode in modes) + float(np.log(self.settings.unknown_probability))
         log_unknown = max(unknown.log_evidence + unknown.present, min_log_unknown)
         self.modes, unknown.weight = weigh(modes, log_unknown, self.settings.max_hypotheses)
-        self._explained = self.modes[0].explained
 
     def _add_key_scan(self, view: View) -> None:
         """Makes the present scan a key scan: keeps its evidence, and adds its surfaces to the local map."""
@@ -658,9 +666,14 @@ def _fraction_not_by_chance(explained: float) -> float:
 def _log_reference(view: View, skip: npt.NDArray[np.bool_]) -> float:
     """Log likelihood in nats of the scan, without the beams in ``skip`` (B,), if all surfaces were known.
 
-    The next two functions return likelihoods relative to this reference.
+    The next functions return likelihoods relative to this reference.
     """
     return float(view.surfaces.known_log_density[~skip].sum())
+
+
+def _log_fit(view: View, states: SurfaceEvidence) -> float:
+    """Log likelihood in nats, minus `_log_reference`, of all beams at the first of some poses in the map."""
+    return float(states.log_likelihood[0]) - _log_reference(view, np.zeros(len(view.ranges), np.bool_))
 
 
 def _log_unmapped(view: View, skip: npt.NDArray[np.bool_]) -> float:

@@ -6,6 +6,7 @@ every scan. It gives the motion where the map does not show the surroundings.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass, field, replace
 
@@ -30,8 +31,8 @@ MATCHED_RADIUS_M = 0.08  # a point is matched if it is this near to one of the l
 SEEN_RADIUS_M = 0.15  # and on a surface seen before if it is this near; far away, neighbouring beams are this far apart
 MIN_POINTS = 20  # of a scan that must have a partner in the local map
 MAX_SQUARED_DISTANCE = 4.0  # squared standard deviations of the result from the prior
+CHANGE_MEMORY_S = 30.0  # after which a change of the surroundings counts by 1 / e (a guess)
 PASSED_M = 0.3  # behind a surface, from where a beam counts as having passed through it
-MIN_CHANGED_M, WALKING_SPEED = 0.2, 1.5  # m and m/s, see `LocalMap.count_changes`
 MIN_MATCHED_FRACTION = 0.5  # of a scan's points, else there is no match
 CLEAR_MATCHED_FRACTION = 0.8  # if fewer match, matching is repeated from `EXTRA_HEADINGS_RAD`
 EXTRA_HEADINGS_RAD = np.array([-0.3, -0.15, 0.15, 0.3])
@@ -66,6 +67,30 @@ class LocalMapScan(LocalScan):
     mapped: npt.NDArray[np.bool_]  # (B,) beams that end at surfaces of the map
     log_change: float  # nats, log probability of what had changed since the scan before
     log_unknown: float  # nats, evidence before this scan that the robot is at none of the hypotheses
+
+
+@dataclass
+class ChangeRate:
+    """Rate at which surfaces in view vanish or appear, learned while driving.
+
+    The rate has a gamma distribution, so the number of changes in a given time has a negative binomial distribution.
+    The prior is Jeffreys', with as much time without a change as is remembered.
+    """
+
+    changes: float = 0.5
+    duration: float = CHANGE_MEMORY_S
+
+    def log_probability(self, changes: int, period: float) -> float:
+        """Log probability in nats of a number of changes within ``period`` s."""
+        share = period / (self.duration + period)
+        combinations = math.lgamma(self.changes + changes) - math.lgamma(self.changes) - math.lgamma(changes + 1)
+        return combinations + self.changes * math.log1p(-share) + changes * math.log(share)
+
+    def learn(self, changes: int, period: float) -> None:
+        """Learns from a number of changes within ``period`` s, and forgets earlier ones exponentially."""
+        keep, prior = math.exp(-period / CHANGE_MEMORY_S), ChangeRate()
+        self.changes = prior.changes + keep * (self.changes - prior.changes) + changes
+        self.duration = prior.duration + keep * (self.duration - prior.duration) + period
 
 
 @dataclass
@@ -139,25 +164,18 @@ class LocalMap:
             free |= inside & (key.view.nearest_of_neighbours[beam] > ranges + SEEN_RADIUS_M)
         return free
 
-    def count_changes(self, last: LocalScan, now: LocalScan, period: float) -> int:
-        """Number of objects that vanished or appeared between two scans.
+    def count_changes(self, last: LocalScan, now: LocalScan) -> int:
+        """Number of surfaces of which most beams vanished or appeared between two scans."""
+        return self._count_passed(last, now) + self._count_passed(now, last)
 
-        Narrower changes than what a walking person can cover or uncover in ``period`` s do not count, and wider ones
-        count as several objects.
-        """
-        width = MIN_CHANGED_M + WALKING_SPEED * period
-        return self._count_passed(last, now, width) + self._count_passed(now, last, width)
-
-    def _count_passed(self, seen: LocalScan, by: LocalScan, width: float) -> int:
-        """Number of objects of ``width`` m in the scan ``seen`` that beams of the scan ``by`` pass through."""
+    def _count_passed(self, seen: LocalScan, by: LocalScan) -> int:
+        """Number of surfaces in the scan ``seen``, through most of whose points beams of the scan ``by`` pass."""
         points = se2.transform(se2.compose(seen.pose, self.mount), seen.view.points)
         ranges, beam, inside = _beams_towards(by.view, se2.compose(by.pose, self.mount), points)
         passed = inside & (by.view.nearest_of_neighbours[beam] > ranges + PASSED_M)
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], passed.astype(int), [0]])))
-        first, last = edges[::2], edges[1::2] - 1
-        many = last - first + 1 >= MIN_BEAMS
-        widths = np.hypot(*(points[last[many]] - points[first[many]]).T) if len(points) else np.zeros(0)
-        return int((widths[widths > width] / width).sum())
+        surface = np.cumsum(seen.view.surfaces.starts)[seen.view.returned]
+        beams, passed_beams = np.bincount(surface), np.bincount(surface, passed)
+        return int(((passed_beams >= MIN_BEAMS) & (passed_beams > 0.5 * beams)).sum())
 
     def match(self, starts: Array, points: Array, prior: MotionCandidate) -> Match | None:
         """Returns the pose at which a scan matches the key scans, or None if no pose matches.

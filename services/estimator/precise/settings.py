@@ -21,14 +21,12 @@ class PreciseSettings:
 
     # Following
     min_explained_share: float = 0.75  # if the map explains a smaller fraction of beams, recent scans give the motion
-    max_explained_drop: float = 0.1  # if this fraction falls by more from scan to scan, a wider area is searched
     min_constraining_share: float = 0.004  # fraction of the beams needed to fix the position along a corridor
 
     # Belief. The probabilities are guesses.
     unknown_probability: float = 1e-5  # least probability that the robot is at none of the hypotheses
-    unmapped_share: float = 1e-3  # probability, if so, that it is at no place on the map
+    unmapped_share: float = 0.01  # probability, if so, that it is at no place that a search of the map finds
     all_changed_probability: float = 1e-2  # that nothing around the start is as the map shows it
-    change_rate: float = 0.015  # 1/s, at which a surface in view is taken away or put there
     tracking_probability: float = 0.999  # of the pose being within 0.2 m and 5 degrees of the truth
     # Weight of the second hypothesis above which the belief is ambiguous. It is at any weight if only other hypotheses
     # keep it from being tracked.

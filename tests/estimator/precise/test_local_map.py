@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,7 +14,14 @@ from common.geometry.world import World
 from lab.accuracy.scenes import Scene
 from services.estimator.precise.gauss_newton import View
 from services.estimator.precise.likelihood import Likelihood
-from services.estimator.precise.local_map import MIN_DISTANCE_M, LocalMap, LocalMapScan, LocalScan, _beams_towards
+from services.estimator.precise.local_map import (
+    MIN_DISTANCE_M,
+    ChangeRate,
+    LocalMap,
+    LocalMapScan,
+    LocalScan,
+    _beams_towards,
+)
 from services.estimator.precise.motion_model import MotionCandidate
 from services.estimator.shared.generative_models import RayCaster
 from tests.estimator.models import ROOM
@@ -132,15 +141,33 @@ def test_surface_in_place_of_another():
 def test_changes_between_scans():
     scene = Scene.of(ROOM, 361, 1)
     made, first, now = LocalMap(np.array(scene.scanner.mount)), view(scene, HERE), view(scene, HERE)
-    assert made.count_changes(LocalScan(HERE, first), LocalScan(HERE, now), 0.1) == 0
-    for factor in (0.5, 2.0):
-        counts = [
-            made.count_changes(LocalScan(HERE, first), LocalScan(HERE, changed(now, slice(100, last), factor)), 0.1)
-            for last in (103, 170, 240)
-        ]
-        assert counts[0] == 0 < counts[1] < counts[2]
+
+    def changes(pose, scan):
+        return made.count_changes(LocalScan(HERE, first), LocalScan(pose, scan))
+
+    assert changes(HERE, now) == 0
+    for factor in (0.5, 2.0):  # something appears, vanishes
+        assert changes(HERE, changed(now, slice(100, 102), factor)) == 0  # too few beams for a surface
+        one = changes(HERE, changed(now, slice(100, 180), factor))
+        assert one > 0
+        assert changes(HERE, changed(changed(now, slice(100, 180), factor), slice(250, 330), factor)) > one
     step = se2.compose(HERE, [0.05, 0.0, 0.1])
-    assert made.count_changes(LocalScan(HERE, first), LocalScan(step, view(scene, step)), 0.1) == 0
+    assert changes(step, view(scene, step)) == 0
+
+
+def test_change_rate():
+    """The numbers of changes have a distribution, which follows their rate and forgets it."""
+    rate, period = ChangeRate(), 0.2
+    assert sum(math.exp(rate.log_probability(n, period)) for n in range(100)) == pytest.approx(1)
+    quiet = rate.log_probability(5, period)
+    for _ in range(500):
+        rate.learn(5, period)
+    assert sum(n * math.exp(rate.log_probability(n, period)) for n in range(100)) == pytest.approx(5, rel=0.5)
+    busy = rate.log_probability(5, period)
+    for _ in range(3000):
+        rate.learn(0, period)
+    assert rate.log_probability(5, period) == pytest.approx(quiet, abs=5)
+    assert busy > quiet + 15
 
 
 def test_beams_of_a_corrected_scan():

@@ -44,7 +44,6 @@ class Calibration:
     motion: MotionNoise
     scans: int  # held out
     usual: float  # share of a scan's beams that end at surfaces of the map: median over the scans
-    unusual: float  # the same share, which 95 of 100 scans exceed
     inflation: float  # factor on the covariance
     floor_position: float  # m, remaining deviation in x and in y: error of the reference poses and of the map
     floor_heading: float  # rad
@@ -54,11 +53,9 @@ class Calibration:
     coverage: tuple[tuple[float, float], ...]  # pairs of a range's cumulative probability and the share of beams below
 
     def settings(self) -> PreciseSettings:
-        """Parameters of the estimator; the thresholds of explained beams are relative to the usual share here."""
-        default = PreciseSettings()
+        """Parameters of the estimator; the threshold of explained beams is relative to the usual share here."""
         return PreciseSettings(
             min_explained_share=MIN_EXPLAINED_RATIO * self.usual,
-            max_explained_drop=max(default.max_explained_drop, self.usual - self.unusual),
             inflation=self.inflation,
             floor_position=self.floor_position,
             floor_heading=self.floor_heading,
@@ -106,7 +103,6 @@ def calibrate(model: GenerativeModel, held_out: ReferenceDrive, motion: MotionNo
         motion=motion,
         scans=len(held_out.ranges),
         usual=float(np.median(explained)),
-        unusual=float(np.quantile(explained, 0.05)),
         inflation=inflation,
         floor_position=floor[0],
         floor_heading=floor[1],

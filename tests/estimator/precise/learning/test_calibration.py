@@ -101,7 +101,6 @@ def test_covariance(learned):
     assert POSED[0] / 2 < found.floor_position < 2 * POSED[0]
     assert POSED[2] / 3 < found.floor_heading < 3 * POSED[2]
     assert found.likelihood.short == pytest.approx(SHORT, abs=0.05)
-    assert 0.7 < found.unusual <= found.usual < 1
     assert all(abs(observed - stated) < 0.12 for stated, observed in found.coverage)
 
 
