@@ -29,7 +29,7 @@ def navigate(
     estimator: Annotated[str, typer.Option(help="precise or particle-filter.")] = "precise",
     prior: Annotated[str, typer.Option(help="motion or odometry: source of the motion between scans.")] = "motion",
     slip: Annotated[float, typer.Option(min=0, max=0.5, help="Mean share of its motion that a wheel loses.")] = 0.0,
-    epistemic: Annotated[bool, typer.Option(help="Policies are also judged by the information that they gain.")] = True,
+    epistemic: Annotated[bool, typer.Option(help="Motions are also judged by the information that they gain.")] = True,
     sweep: Annotated[bool, typer.Option("--sweep", help="Scans are distorted by the robot's motion.")] = False,
     beams: Annotated[int, typer.Option(min=2, max=MAX_BEAMS, help="Number of beams.")] = 622,
     max_range: Annotated[float, typer.Option(min=0.1, max=100, help="Range of the scanner in m.")] = 25.0,

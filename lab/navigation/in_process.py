@@ -34,7 +34,7 @@ class NavigationRun:
     estimator: EstimatorOptions
     goal: tuple[float, float]  # m in map
     odometry: bool  # whether the estimator is given odometry
-    epistemic: bool  # whether policies are judged by the information that they gain
+    epistemic: bool  # whether motions are judged by the information that they gain
     limit: int  # maximum number of scans
 
 
