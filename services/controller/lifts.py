@@ -14,14 +14,16 @@ if TYPE_CHECKING:
     from common.geometry.world import World
 
 LIFT_TOLERANCE_M = 0.1  # the robot waits within this distance of the lift's place
+MIN_WAY_M = 1e-6  # as scipy takes 0 for no connection
+RIDE_LENGTH_M = 20.0  # a ride counts as much as this way on a floor (a guess)
 
 
 @dataclass(frozen=True)
 class LiftRide:
-    """A lift from the robot's floor to the goal's."""
+    """A lift from the robot's floor to the goal's, or to one on the way there."""
 
     place: Array  # (2,) m in map, of the lift on the robot's floor
-    floor: str  # of the goal
+    floor: str  # at which the robot leaves the lift
 
     def is_at_lift(self, pose: Array) -> bool:
         """Whether the robot at ``pose`` (3,) is at the lift."""
@@ -35,25 +37,32 @@ class LiftRide:
 
 
 def plan_ride(world: World, place: Array, goal: Array, refusal: Callable[[Array], str | None]) -> LiftRide | str | None:
-    """The lift with the shortest way, in straight lines, from a ``place`` (2,) to a goal (2,) on another floor.
+    """The first ride on the shortest way, in straight lines, from a ``place`` (2,) to a goal (2,) on another floor.
 
     ``refusal`` returns the reason why a lift (2,) cannot be reached from here, or None if it can. Returns None if the
-    goal is on the same floor, and the reason to refuse it if no lift leads there.
+    goal is on the same floor, and the reason to refuse it if no lifts lead there.
     """
     here, there = world.floor_at(place), world.floor_at(goal)
     if here is None or there is None or here.name == there.name:
         return None
-    ways = []
-    for lift in world.lifts:
-        if here.name in lift and there.name in lift:
-            enter, leave = here.to_map(lift[here.name]), there.to_map(lift[there.name])
-            ways.append((float(np.hypot(*(enter - place[:2])) + np.hypot(*(goal - leave))), enter))
-    if not ways:
-        return f"it is on floor {there.name!r}, the robot is on floor {here.name!r}, and no lift stops at both"
-    ways.sort(key=lambda way: way[0])
+    from scipy.sparse.csgraph import dijkstra  # slow, and needed only with floors
+
+    stops = [(number, name) for number, lift in enumerate(world.lifts) for name in lift]
+    places = np.array([*(world.floor(name).to_map(world.lifts[number][name]) for number, name in stops), goal[:2]])
+    lifts = np.array([*(number for number, _ in stops), -1])
+    floors = np.array([*(name for _, name in stops), there.name])
+    way = np.hypot(*(places[:, None] - places).transpose(2, 0, 1)) + MIN_WAY_M
+    same_floor = (floors[:, None] == floors) & (floors != here.name)  # here, the robot drives to the first lift only
+    length = np.where(same_floor, way, np.where(lifts[:, None] == lifts, RIDE_LENGTH_M, np.inf))
+    to_goal, following = dijkstra(length, directed=False, indices=len(stops), return_predecessors=True)
+    rides = [k for k in range(len(stops)) if floors[k] == here.name and np.isfinite(to_goal[k])]
+    if not rides:
+        return f"it is on floor {there.name!r}, the robot is on floor {here.name!r}, and no lifts connect the two"
+    rides.sort(key=lambda k: np.hypot(*(places[k] - place[:2])) + to_goal[k])
     problems = []
-    for _, enter in ways:
-        if (problem := refusal(enter)) is None:
-            return LiftRide(enter, there.name)
-        problems.append(problem)
-    return f"the lift to floor {there.name!r} cannot be reached: {problems[0]}"
+    for k in rides:
+        ride = LiftRide(places[k], str(floors[following[k]]))
+        if (problem := refusal(ride.place)) is None:
+            return ride
+        problems.append(f"the lift to floor {ride.floor!r} cannot be reached: {problem}")
+    return problems[0]

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from common.messages.definitions import Status
 from common.messages.topics import GOAL, STATUS
 from common.robot.robot import Robot
+from services.controller.lifts import RIDE_LENGTH_M, LiftRide, plan_ride
 from services.controller.navigator import Navigator
 from services.controller.policies.planner import GeodesicPolicy
 from services.controller.service import ControllerService
@@ -129,13 +132,71 @@ def test_taken_to_a_wrong_floor():
     assert reasons(log)[-1] == "driving to the lift to floor 'ground'"
 
 
+def test_two_lifts_in_a_row(make):
+    """The robot is taken to a floor on the way, and drives to the second lift there."""
+    lifts = [{"ground": (5, 2), "first": (4, 3)}, {"first": (1, 1), "second": (1, 2)}]
+    tower = building(lifts, **FLOORS, second=room(5, 4))
+    navigator, second = make(tower), tower.floor("second")
+    session(navigator, START, [None], tower)
+    navigator.on_goal(goal(4, 2, map_id="second"))
+    log = session(navigator, START, [None] * 150, tower, first=1)
+    assert reasons(log)[-1] == "waiting to be taken to floor 'first'"
+    log = session(navigator, tower.floor("first").to_map([4, 3, 2]), [None] * 200, tower, first=151)
+    assert reasons(log)[-1] == "waiting to be taken to floor 'second'"
+    log = session(navigator, second.to_map([1, 2, 0]), [None] * 200, tower, first=351)
+    assert log[-1][1].state == "reached"
+    np.testing.assert_allclose(second.from_map(log[-1][2])[:2], [4, 2], atol=0.02)
+
+
+def test_goal_at_a_lift():
+    navigator = Navigator(world=TOWER)
+    session(navigator, START, [None], TOWER)
+    navigator.on_goal(goal(1, 3, map_id="first"))
+    log = session(navigator, START, [None], TOWER, first=1)
+    assert reasons(log) == ["driving to the lift to floor 'first'"]
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_shortest_way(seed):
+    """It is at most as long as that through any other two lifts."""
+    rng = np.random.default_rng(seed)
+    names = [f"floor-{k}" for k in range(4)]
+    lifts = [{str(name): tuple(rng.uniform(1, 3, 2)) for name in rng.choice(names, 2, replace=False)} for _ in range(5)]
+    tower = building(lifts, **{name: room(6, 4) for name in names})
+    start, end = tower.floor(names[0]).to_map([1, 1]), tower.floor(names[3]).to_map([5, 3])
+    ride = plan_ride(tower, start, end, lambda place: None)
+
+    def length(place, floor, used):
+        """Length of the shortest way, by enumeration."""
+        ways = [np.hypot(*(end - place))] if floor == names[3] else []
+        for number in set(range(5)) - used:
+            if floor in lifts[number]:
+                (other,) = set(lifts[number]) - {floor}
+                enter, leave = (tower.floor(name).to_map(lifts[number][name]) for name in (floor, other))
+                way = np.hypot(*(enter - place)) + RIDE_LENGTH_M
+                ways.append(way + length(leave, other, {*used, number}))
+        return min(ways, default=np.inf)
+
+    shortest = length(start, names[0], set())
+    assert isinstance(ride, str) == np.isinf(shortest)
+    if isinstance(ride, LiftRide):
+        (number,) = (
+            k
+            for k, lift in enumerate(lifts)
+            if names[0] in lift and np.allclose(tower.floor(names[0]).to_map(lift[names[0]]), ride.place)
+        )
+        leave = tower.floor(ride.floor).to_map(lifts[number][ride.floor])
+        way = np.hypot(*(ride.place - start)) + RIDE_LENGTH_M + length(leave, ride.floor, {number})
+        assert way == pytest.approx(shortest, abs=1e-3)
+
+
 def test_no_lift(make):
     navigator = make(STAIRS)
     session(navigator, START, [None], STAIRS)
     navigator.on_goal(goal(4, 1, map_id="first"))
     ((command, status, _),) = session(navigator, START, [None], STAIRS, first=1)
     assert (status.refused, command.twist.array().any()) == (True, False)
-    assert "it is on floor 'first', the robot is on floor 'ground', and no lift stops at both" in status.reason
+    assert "it is on floor 'first', the robot is on floor 'ground', and no lifts connect the two" in status.reason
 
 
 def test_no_lift_and_carried_by_hand(make):
@@ -148,7 +209,7 @@ def test_no_lift_and_carried_by_hand(make):
     assert log[-1][1].state == "reached"
     navigator.on_goal(goal(4, 1, map_id="ground"))
     ((_, status, _),) = session(navigator, log[-1][2], [None], STAIRS, first=222)
-    assert "no lift stops at both" in status.reason
+    assert "no lifts connect the two" in status.reason
 
 
 def test_lift_that_cannot_be_reached(make):
