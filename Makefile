@@ -103,13 +103,13 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	$(BIN)/presage experiment --out $(RESULTS) all
 	$(BIN)/presage experiment --out $(RESULTS) navigation
 	$(BIN)/presage experiment --out $(RESULTS) navigation --start unknown
-	$(BIN)/presage experiment --out $(RESULTS) navigation --worlds office --people 10 --trials 50
+	$(BIN)/presage experiment --seed 3421 --out $(RESULTS) navigation --worlds office --people 10 --trials 50
 	$(BIN)/presage experiment --seed 2611 --out $(RESULTS)/within_2cm navigation --trials 30
-	$(BIN)/presage experiment --seed 4300 --out $(RESULTS) navigation --worlds hall --drives holonomic --max-range 4 --beams 271 --prior odometry --slip 0.05 --limit 60 --trials 50
-	$(BIN)/presage experiment --seed 4300 --out $(RESULTS) navigation --worlds hall --drives holonomic --max-range 4 --beams 271 --prior odometry --slip 0.05 --limit 60 --trials 50 --no-epistemic
+	$(BIN)/presage experiment --seed 3422 --out $(RESULTS) navigation --worlds hall --drives holonomic --max-range 4 --beams 271 --prior odometry --slip 0.05 --limit 60 --trials 50
+	$(BIN)/presage experiment --seed 3422 --out $(RESULTS) navigation --worlds hall --drives holonomic --max-range 4 --beams 271 --prior odometry --slip 0.05 --limit 60 --trials 50 --no-epistemic
 	$(BIN)/presage experiment --seed 4300 --out $(RESULTS) navigation --worlds twins --start unknown --trials 50
 	$(BIN)/presage experiment --seed 4300 --out $(RESULTS) navigation --worlds twins --start unknown --trials 50 --drives holonomic --no-epistemic
-	$(BIN)/presage experiment --seed 2611 --out $(RESULTS) docking --trials 64
+	$(BIN)/presage experiment --seed 3424 --out $(RESULTS) docking --trials 64
 	$(BIN)/presage experiment --seed 51 --out $(RESULTS) exploration
 	$(BIN)/presage bench mapping-faults --worlds 2 --seed 990 --seconds 60 --json $(RESULTS)/mapping-faults.json
 	$(BIN)/presage bench refinement --worlds 1 --seed 4110 --seconds 300 --out $(RESULTS)/refinement --json $(RESULTS)/refinement.json
@@ -118,14 +118,15 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	$(if $(PEERS),OMP_NUM_THREADS=1 $(BIN)/presage experiment --seed 3611 --out $(RESULTS) peers '$(PEERS)' --trials 5)
 	$(if $(LOGS),$(BIN)/presage map '$(LOGS)/fr079.npz' --mount 0,0,0 --poses reference --half second --no-learn -o $(RESULTS)/second_half.yaml)
 	$(if $(LOGS),$(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/fr079.npz' --mount 0,0,0 --world $(RESULTS)/second_half.yaml --exchange --every 200 --name fr079_exchanged)
+	$(if $(LOGS),$(BIN)/presage map '$(LOGS)/fr079.npz' --mount 0,0,0 --poses reference --half first --no-learn -o $(RESULTS)/first_half.yaml)
+	$(if $(LOGS),$(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/fr079.npz' --mount 0,0,0 --world $(RESULTS)/first_half.yaml --every 50 --name fr079)
 	$(if $(LOGS),$(BIN)/presage map '$(LOGS)/uwb.npz' --mount 0,0,0 --poses reference --half first --no-learn -o $(RESULTS)/first_half.yaml)
 	$(if $(LOGS),$(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/uwb.npz' --mount 0,0,0 --world $(RESULTS)/first_half.yaml --every 10 --name uwb)
-	$(BIN)/presage bench integrity --out $(RESULTS)/integrity --worlds 3 --seed 3114 --model exact --seconds 10
-	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-long-corridor --worlds 20 --seed 3116 --model exact --seconds 10 --cases long-corridor --estimators precise
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity --worlds 3 --seed 3431 --model exact --seconds 10
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-long-corridor --worlds 20 --seed 3438 --model exact --seconds 10 --cases long-corridor --estimators precise
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-50 --worlds 20 --seed 3311 --model exact --cases moved-50
-	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-100 --worlds 20 --seed 3117 --model exact --seconds 10 --cases moved-100 --estimators precise
-	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-100-development --worlds 1 --seed 57 --model exact --seconds 10 --cases moved-100 --estimators precise
-	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-single-scan --worlds 20 --seed 3115 --model exact --cases single-scan-moved-50 --estimators precise
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-100 --worlds 20 --seed 3437 --model exact --seconds 10 --cases moved-100 --estimators precise
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-single-scan --worlds 20 --seed 3436 --model exact --cases single-scan-moved-50 --estimators precise
 	for folder in $(RESULTS)/integrity*/; do cp $$folder/integrity.json docs/experiments/$$(basename $$folder).json || exit 1; done
 	cp $(RESULTS)/integrity/integrity.png $(RESULTS)/*.json $(RESULTS)/*.csv $(RESULTS)/*.png $(RESULTS)/*.pdf docs/experiments/
 	mv docs/experiments/accuracy.png docs/accuracy.png

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -63,3 +64,12 @@ def test_demo_and_development_are_installed_separately(install, tmp_path):
     assert "-e '.[dev]'" in install()
     (tmp_path / ".venv/.installed-demo").unlink()
     assert "-e '.'" in install(target="demo")
+
+
+def test_seeds_of_tables():
+    """`make tables` repeats the commands of the pages with their seeds."""
+    recipe = (ROOT / "Makefile").read_text().partition("\ntables:")[2].partition("\n\n")[0]
+    pages = "".join(page.read_text() for page in [ROOT / "README.md", *ROOT.glob("docs/*.md")])
+    seeds = set(re.findall(r"--seed \d+", recipe))
+    assert seeds
+    assert {seed for seed in seeds if seed not in pages} == set()
