@@ -80,6 +80,21 @@ def test_invalid_field(tmp_path, name, tensor):
     check_error(path, precise_weights.load)
 
 
+@pytest.mark.parametrize("older", ["none", "three times the directions"])
+def test_panoramas_of_older_versions(tmp_path, older):
+    path = precise.saved(FIELD, tmp_path)
+    model, seeds, _ = precise_weights.load(path)
+    tensors = safetensors.numpy.load_file(path)
+    panoramas = tensors.pop("panoramas_in_bytes")
+    if older != "none":
+        tensors["panoramas_in_bytes"] = np.stack([panoramas, panoramas + 1, panoramas + 2], axis=2)
+    path.write_bytes(safetensors.numpy.save(tensors))
+    path.with_suffix(".json").write_text(precise.card(FIELD).model_dump_json())
+    old_model, old_seeds, _ = precise_weights.load(path)
+    assert np.array_equal(old_model.field.phi, model.field.phi)
+    assert np.array_equal(old_seeds.panoramas, seeds.panoramas)
+
+
 def test_card_of_other_shape(tmp_path):
     path, _ = paper.saved(tmp_path)
     path.with_suffix(".json").write_text(paper.card(channels=5).model_dump_json())
