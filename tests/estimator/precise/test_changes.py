@@ -121,7 +121,7 @@ def test_wrong_map():
 def driven():
     """An estimator after a drive from the learned half to the other one, its scene, and the path."""
     made, scene = estimator(HALL, model=HalfLearned(), keep=lambda places: places[:, 0] < LEARNED)
-    x = np.linspace(3.0, 11.5, 170)
+    x = np.linspace(3.0, 11.5, 130)  # at 1 m/s
     path = np.column_stack([x, 2.5 + 0.3 * np.sin(x), 0.5 * np.sin(0.7 * x)])
     made.restart(path[0], CLOSE)
     found = drive(made, scene, path)
