@@ -39,7 +39,8 @@ def image(tmp_path_factory):
     tag = f"presage-test-{uuid.uuid4().hex[:8]}"
     builder = Compose(tag, tmp_path_factory.mktemp("build"), (0, 0))
     try:
-        builder.do("build", timeout=1200)
+        # One image after the other: at the same time, engines without BuildKit would install the same packages in each.
+        builder.do("build", timeout=1200, COMPOSE_PARALLEL_LIMIT="1")
         for scanner in ("replay", "none", "bridge_ros2"):
             builder.do("build", "simulator", timeout=300, PRESAGE_SCANNER=scanner)
         builder.do("build", "estimator", timeout=900, PRESAGE_ESTIMATOR="paper")

@@ -10,6 +10,7 @@ import pytest
 
 from common.bus.bus import Link, open_bus, wait_until
 from common.errors import UserError
+from common.geometry.world import World, save_world
 from common.messages.definitions import Belief, Health, Truth
 from common.messages.topics import BELIEF, GOAL, HEALTH, SCAN, STATUS, TRUTH
 from presage.live.latest_messages import LatestMessages
@@ -24,6 +25,19 @@ import runpy, signal
 signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell does for a script's background commands
 runpy.run_module("presage", run_name="__main__")
 """
+
+# Three rooms, so large that not all is explored when the demo carries the robot off.
+ROOMS = World(
+    name="rooms",
+    boundary=[(0, 0), (10, 0), (10, 5), (0, 5)],
+    obstacles=[
+        {"box": {"center": (4.0, 1.8), "size": (0.2, 3.6)}},
+        {"box": {"center": (7.0, 3.2), "size": (0.2, 3.6)}},
+        {"box": {"center": (1.2, 4.6), "size": (0.8, 0.5), "yaw_deg": 20}},
+        {"circle": {"center": (9.2, 4.2), "radius": 0.3}},
+    ],
+    start={"x": 1.5, "y": 1.5, "yaw_deg": 0},
+)
 
 
 def test_demo_reaches_its_goal(process, tmp_path):
@@ -65,13 +79,14 @@ def test_demo_reaches_its_goal(process, tmp_path):
 
 
 def test_demo_in_an_unknown_building(process, tmp_path):
-    file, config = tmp_path / "demo.json", tmp_path / "lockstep.yaml"
-    config.write_text("world: maze\nsimulator: {pace: lockstep, beams: 207}")
+    file, config, world = (tmp_path / name for name in ("demo.json", "lockstep.yaml", "rooms.yaml"))
+    world.write_text(save_world(ROOMS))
+    config.write_text(f"world: {world}\nsimulator: {{pace: lockstep, beams: 207}}")
     args = ("--config", str(config), "--out", str(tmp_path / "out"), "--json", str(file), "--quiet")
     running = process("presage.__main__", "demo", "--unknown", *args)
     assert running.wait(170) == 0, running.output
     numbers = json.loads(file.read_text())
-    assert numbers["world"] == "maze"
+    assert numbers["world"] == "rooms"
     for step, words in zip(numbers["steps"], ("explored a", "carried off", "a goal", "returned"), strict=True):
         assert words in step["what"]
         assert step["error_m"] < 0.1, numbers
