@@ -61,7 +61,9 @@ class Compose:
 
     def state(self, service: str) -> dict:
         """State of the service's container."""
-        (row,) = self.do("ps", "--all", "--quiet", service).split()
+        labels = (f"project={self.name}", f"service={service}", "oneoff=False")
+        filters = (word for label in labels for word in ("--filter", f"label=com.docker.compose.{label}"))
+        (row,) = docker("ps", "--all", "--quiet", *filters).stdout.split()  # takes a tenth of `docker compose ps`
         return json.loads(docker("inspect", row).stdout)[0]["State"]
 
     def health(self, service: str) -> str:
