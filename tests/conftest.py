@@ -79,7 +79,7 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if (ROOT / "tests" / "system") in item.path.parents:
             item.add_marker(pytest.mark.system)
-    starting = {"processes", "module_processes", "router", "browser"}
+    starting = {"processes", "module_processes", "router", "browser", "installed"}
     waiting = {item.path for item in items if starting & set(item.fixturenames)}
     items.sort(key=lambda item: (item.get_closest_marker("docker") is None, item.path not in waiting))
 
