@@ -186,12 +186,11 @@ def test_odometry_where_scans_confirm_it():
     assert np.sqrt(np.trace(found[-1].covariance[:2, :2])) < 0.005
 
 
-@pytest.mark.parametrize("seed", [5, 10])
-def test_slip_back_to_a_similar_place(seed):
+def test_slip_back_to_a_similar_place():
     """After a drift by the distance of two equal pillars, the scan fits at the wrong one."""
     pillars = [{"box": {"center": (x, 0.25), "size": (0.4, 0.5)}} for x in np.arange(3.0, 37.0, 0.8)]
     world = World(name="pillars", boundary=WIDE_HALL.boundary, obstacles=pillars)
-    made, scene = estimator(world, range_max=4.0, seed=seed)
+    made, scene = estimator(world, range_max=4.0, seed=5)
     path = np.concatenate([straight(6.0, 2.0, 0.4, 12.0), straight(17.05, 6.67, -0.4, 8.0)])  # pillars again from 6 m
     found = drive(made, scene, path, slip=0.05)
     error = [float(np.hypot(*off(posterior, pose)[:2])) for posterior, pose in zip(found, path, strict=True)]
