@@ -63,7 +63,8 @@ class Compose:
         """State of the service's container."""
         labels = (f"project={self.name}", f"service={service}", "oneoff=False")
         filters = (word for label in labels for word in ("--filter", f"label=com.docker.compose.{label}"))
-        (row,) = docker("ps", "--all", "--quiet", *filters).stdout.split()  # takes a tenth of `docker compose ps`
+        # Takes a sixth of the time of `docker compose ps`.
+        (row,) = docker("ps", "--all", "--quiet", *filters).stdout.split()
         return json.loads(docker("inspect", row).stdout)[0]["State"]
 
     def health(self, service: str) -> str:
