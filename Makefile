@@ -122,7 +122,7 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	$(if $(LOGS),$(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/fr079.npz' --mount 0,0,0 --world $(RESULTS)/first_half.yaml --every 50 --name fr079)
 	$(if $(LOGS),$(BIN)/presage map '$(LOGS)/uwb.npz' --mount 0,0,0 --poses reference --half first --no-learn -o $(RESULTS)/first_half.yaml)
 	$(if $(LOGS),$(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/uwb.npz' --mount 0,0,0 --world $(RESULTS)/first_half.yaml --every 10 --name uwb)
-	$(BIN)/presage bench integrity --out $(RESULTS)/integrity --worlds 3 --seed 3431 --model exact --seconds 10
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity --worlds 3 --seed 3435 --model exact --seconds 10
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-long-corridor --worlds 20 --seed 3438 --model exact --seconds 10 --cases long-corridor --estimators precise
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-50 --worlds 20 --seed 3311 --model exact --cases moved-50
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-100 --worlds 20 --seed 3437 --model exact --seconds 10 --cases moved-100 --estimators precise

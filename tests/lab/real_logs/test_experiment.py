@@ -86,10 +86,11 @@ def test_kidnapped_robot(folder, estimator):
     assert len(row["error_m"]) == 10 + min(MAX_SEARCH_SCANS, 45)
     assert np.median(row["error_m"][:10]) < 0.2
     found = real.summarise([row])
-    assert found["found"] == 1
-    if estimator == "precise":
-        assert found["error_median_m"] < 0.06
-        assert found["wrong_claim_longest_s"] <= 2
+    if estimator == "precise":  # three surfaces change, too few to prefer the right place: the belief stays ambiguous
+        assert found["wrong_claim_longest_s"] <= 0.5
+        assert found["claimed_share"] < 0.1
+    else:
+        assert found["found"] == 1
 
 
 def test_scans_used_for_tuning(folder, tmp_path, monkeypatch):
