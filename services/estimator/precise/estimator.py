@@ -132,7 +132,7 @@ class PreciseEstimator:
         # The last scan
         self._stamp: float | None = None
         self._odom: Array | None = None
-        self._log_fit = 0.0  # nats, see the function of this name
+        self._last_log_fit = 0.0  # nats, see `_log_fit`
         self._last: LocalScan | None = None
 
         # The present scan
@@ -267,7 +267,7 @@ class PreciseEstimator:
         widest = _prior_of([each[-1] for each in motions])
         predicted = np.array([each[-2].mean for each in motions])
         poses, evidence = view.descend(predicted, widest)
-        if _log_fit(view, view.surface_evidence(poses)) < self._log_fit - MAX_FIT_DROP:
+        if _log_fit(view, view.surface_evidence(poses)) < self._last_log_fit - MAX_FIT_DROP:
             extra_starts = np.zeros((0, 3))
             if not with_odometry:
                 extra_starts = reachable_poses(self.settings.motion, self.modes[0].pose, period, COARSE_SIGMA_M)
@@ -397,7 +397,7 @@ class PreciseEstimator:
             local = self._local_map.to_local(modes[0].pose)
         poses = np.array([mode.pose for mode in modes])
         states = view.surface_evidence(poses)
-        self._log_fit = _log_fit(view, states)
+        self._last_log_fit = _log_fit(view, states)
         seen, appeared = self._local_map.find_old_beams(local, view, states.weights[0] > 0.5)
         old, small = seen | appeared | view.surfaces.small, view.surfaces.small
 
@@ -673,7 +673,7 @@ def _log_reference(view: View, skip: npt.NDArray[np.bool_]) -> float:
 
 def _log_fit(view: View, states: SurfaceEvidence) -> float:
     """Log likelihood in nats, minus `_log_reference`, of all beams at the first of some poses in the map."""
-    return float(states.log_likelihood[0]) - _log_reference(view, np.zeros(len(view.ranges), np.bool_))
+    return float(states.log_likelihood[0] - view.surfaces.known_log_density.sum())
 
 
 def _log_unmapped(view: View, skip: npt.NDArray[np.bool_]) -> float:

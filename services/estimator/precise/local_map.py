@@ -88,7 +88,7 @@ class ChangeRate:
 
     def learn(self, changes: int, period: float) -> None:
         """Learns from a number of changes within ``period`` s, and forgets earlier ones exponentially."""
-        keep, prior = math.exp(-period / CHANGE_MEMORY_S), ChangeRate()
+        keep, prior = math.exp(-period / CHANGE_MEMORY_S), ChangeRate  # the prior is never forgotten
         self.changes = prior.changes + keep * (self.changes - prior.changes) + changes
         self.duration = prior.duration + keep * (self.duration - prior.duration) + period
 

@@ -162,8 +162,8 @@ def test_change_rate():
     quiet = rate.log_probability(5, period)
     for _ in range(500):
         rate.learn(5, period)
-    assert sum(n * math.exp(rate.log_probability(n, period)) for n in range(100)) == pytest.approx(5 / 2, rel=0.1)  # as
-    # the prior, with no change, counts for as much time as is remembered
+    # The prior counts for as much time as is remembered, and contains no changes.
+    assert sum(n * math.exp(rate.log_probability(n, period)) for n in range(100)) == pytest.approx(5 / 2, rel=0.1)
     busy = rate.log_probability(5, period)
     for _ in range(3000):
         rate.learn(0, period)
