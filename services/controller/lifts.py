@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from common.geometry.world import World
 
 LIFT_TOLERANCE_M = 0.1  # the robot waits within this distance of the lift's place
-MIN_WAY_M = 1e-6  # as scipy takes 0 for no connection
+MIN_WAY_M = 1e-6  # added to each way, as scipy takes 0 for no connection
 RIDE_LENGTH_M = 20.0  # a ride counts as much as this way on a floor (a guess)
 
 
@@ -47,13 +47,14 @@ def plan_ride(world: World, place: Array, goal: Array, refusal: Callable[[Array]
         return None
     from scipy.sparse.csgraph import dijkstra  # slow, and needed only with floors
 
+    # A graph of all places where a lift stops, and the goal as its last node. Its edges are ways on a floor, and rides.
     stops = [(number, name) for number, lift in enumerate(world.lifts) for name in lift]
     places = np.array([*(world.floor(name).to_map(world.lifts[number][name]) for number, name in stops), goal[:2]])
     lifts = np.array([*(number for number, _ in stops), -1])
     floors = np.array([*(name for _, name in stops), there.name])
-    way = np.hypot(*(places[:, None] - places).transpose(2, 0, 1)) + MIN_WAY_M
+    distance = np.hypot(*(places[:, None] - places).transpose(2, 0, 1)) + MIN_WAY_M
     same_floor = (floors[:, None] == floors) & (floors != here.name)  # here, the robot drives to the first lift only
-    length = np.where(same_floor, way, np.where(lifts[:, None] == lifts, RIDE_LENGTH_M, np.inf))
+    length = np.where(same_floor, distance, np.where(lifts[:, None] == lifts, RIDE_LENGTH_M, np.inf))
     to_goal, following = dijkstra(length, directed=False, indices=len(stops), return_predecessors=True)
     rides = [k for k in range(len(stops)) if floors[k] == here.name and np.isfinite(to_goal[k])]
     if not rides:

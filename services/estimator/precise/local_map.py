@@ -77,8 +77,8 @@ class ChangeRate:
     The prior is Jeffreys', with as much time without a change as is remembered.
     """
 
-    changes: float = 0.5
-    duration: float = CHANGE_MEMORY_S
+    changes: float = 0.5  # shape of the gamma distribution
+    duration: float = CHANGE_MEMORY_S  # s, its rate parameter
 
     def log_probability(self, changes: int, period: float) -> float:
         """Log probability in nats of a number of changes within ``period`` s."""
