@@ -30,7 +30,8 @@ MAX_NOISE_FACTOR = 4.0
 # must be short enough that these are nearly equal along it. `CORRELATION_LENGTH_M` is longer: it says how far along a
 # surface errors still add up instead of averaging out.
 SEGMENT_LENGTH_M = 0.5
-MAX_MAP_ERROR_M = 0.1  # larger errors are not the map's, but changes of the surroundings
+# Errors larger than this and three standard deviations of the noise are not the map's, but changes of the surroundings.
+MAX_MAP_ERROR_M = 0.1
 MIN_LEARNING_BEAMS, MIN_LEARNING_FRACTION = 30, 0.3  # of a scan's beams; nothing is learned from fewer
 DAMPING = 1e-9  # in m; keeps the inverse finite where a direction is not observed
 
@@ -102,11 +103,11 @@ class Precision:
         expected = view.expected(pose)
         surface, scale, slope = expected.ranges[0], expected.scale[0], expected.slope[0]
         with np.errstate(invalid="ignore", divide="ignore"):
-            errors = (view.ranges - surface) / slope
-            used = (np.abs(errors) < MAX_MAP_ERROR_M) & np.isfinite(scale)
+            errors, noise = (view.ranges - surface) / slope, view.likelihood.deviation(surface) / slope
+            used = (np.abs(errors) < np.hypot(MAX_MAP_ERROR_M, 3 * noise)) & np.isfinite(scale)
         if used.sum() < max(MIN_LEARNING_BEAMS, MIN_LEARNING_FRACTION * len(view.ranges)):
             return
-        errors, surface, slope = errors[used], surface[used], slope[used]
+        errors, noise, surface, slope = errors[used], noise[used], surface[used], slope[used]
         model_variance, spacing = (scale[used] / slope) ** 2, surface * view.spacing
         segments = _segment_ids(np.cumsum(view.surfaces.starts)[used], spacing)
         robust = _robust_covariance(errors, segments) - float(np.median(model_variance))
@@ -117,7 +118,6 @@ class Precision:
         if not lengths.any():
             return
         if self.cell:
-            noise = view.likelihood.deviation(surface) / slope
             jacobian = expected.jacobian[0, used] / slope[:, None]
             errors = self._learn_offset(errors, model_variance + noise**2, jacobian, lengths)
         self.scans += 1
