@@ -28,7 +28,10 @@ NEIGHBOURS, NEIGHBOUR_RADIUS_M = 10, 0.3  # points from which the normal of a su
 PARTNER_RADII_M = (0.6, 0.6, 0.4, 0.4, 0.2, 0.2, 0.1, 0.1, 0.1, 0.1)
 CAUCHY_SCALE_M = 0.02  # of the Cauchy weight of a point by its distance from the line
 MATCHED_RADIUS_M = 0.08  # a point is matched if it is this near to one of the local map
-SEEN_RADIUS_M = 0.15  # and on a surface seen before if it is this near; far away, neighbouring beams are this far apart
+# A point is on a surface seen before if it is this near to a point of the local map (far away, neighbouring beams are
+# so far apart), and within this and three standard deviations of the noise from the line through it. A wider tolerance
+# across surfaces takes much of another room for this one.
+SEEN_RADIUS_M, SEEN_ACROSS_M = 0.15, 0.05
 MIN_POINTS = 20  # of a scan that must have a partner in the local map
 MAX_SQUARED_DISTANCE = 4.0  # squared standard deviations of the result from the prior
 CHANGE_MEMORY_S = 30.0  # after which a change of the surroundings counts by 1 / e (a guess)
@@ -74,23 +77,20 @@ class ChangeRate:
     """Rate at which surfaces in view vanish or appear, learned while driving.
 
     The rate has a gamma distribution, so the number of changes in a given time has a negative binomial distribution.
-    The prior is Jeffreys', with as much time without a change as is remembered.
+    Before the first scan it is as after a time without a change (Jeffreys' prior), which is forgotten like any other.
     """
 
-    changes: float = 0.5  # shape of the gamma distribution
-    duration: float = CHANGE_MEMORY_S  # s, its rate parameter
+    remembered: float = 0.0  # changes, forgotten exponentially
 
     def log_probability(self, changes: int, period: float) -> float:
         """Log probability in nats of a number of changes within ``period`` s."""
-        share = period / (self.duration + period)
-        combinations = math.lgamma(self.changes + changes) - math.lgamma(self.changes) - math.lgamma(changes + 1)
-        return combinations + self.changes * math.log1p(-share) + changes * math.log(share)
+        shape, share = 0.5 + self.remembered, period / (CHANGE_MEMORY_S + period)
+        combinations = math.lgamma(shape + changes) - math.lgamma(shape) - math.lgamma(changes + 1)
+        return combinations + shape * math.log1p(-share) + changes * math.log(share)
 
     def learn(self, changes: int, period: float) -> None:
         """Learns from a number of changes within ``period`` s, and forgets earlier ones exponentially."""
-        keep, prior = math.exp(-period / CHANGE_MEMORY_S), ChangeRate  # the prior is never forgotten
-        self.changes = prior.changes + keep * (self.changes - prior.changes) + changes
-        self.duration = prior.duration + keep * (self.duration - prior.duration) + period
+        self.remembered = math.exp(-period / CHANGE_MEMORY_S) * self.remembered + changes
 
 
 @dataclass
@@ -144,8 +144,8 @@ class LocalMap:
         if not self.scans or not len(self._tree_of_points().data):
             return seen, appeared
         placed = se2.transform(se2.compose(local, self.mount), view.points)
-        distance, _ = self._tree_of_points().query(placed, distance_upper_bound=SEEN_RADIUS_M)
-        near = np.isfinite(distance)
+        noise = view.likelihood.deviation(view.ranges[view.returned])
+        near = self._is_on_surface(placed, np.hypot(SEEN_ACROSS_M, 3 * noise))
         free = np.zeros(len(near), np.bool_)
         free[~near] = self._in_free_space(placed[~near])
         appeared[view.returned] = free
@@ -155,6 +155,16 @@ class LocalMap:
         seen[:] = ~view.returned
         seen[view.returned] = near
         return seen, appeared
+
+    def _is_on_surface(self, points: Array, tolerance: Array | float) -> npt.NDArray[np.bool_]:
+        """Mask (K,) of local points (K, 2) in m within ``tolerance`` m of the line through a point of a key scan."""
+        normals = self._normals_of_points()
+        distance, nearest = self._tree_of_points().query(points, distance_upper_bound=SEEN_RADIUS_M)
+        near = np.isfinite(distance)
+        off = points[near] - self._points[nearest[near]]
+        across = np.full(len(points), np.inf)
+        across[near] = np.abs(np.einsum("ni,ni->n", normals[nearest[near]], off))
+        return np.asarray(across < tolerance)
 
     def _in_free_space(self, points: Array) -> npt.NDArray[np.bool_]:
         """Mask (K,) of local points (K, 2) in m that a beam of a key scan passed."""
