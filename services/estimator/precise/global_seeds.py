@@ -53,6 +53,15 @@ class Seeds:
         """Volume in m² rad of the poses that the seeds represent."""
         return max(1, len(self.places)) * SEED_SPACING_M**2 * 2 * np.pi
 
+    @property
+    def starts_factor(self) -> float:
+        """Number of starts of a search, divided by that in a map of up to `FULLY_RANKED_PLACES` places.
+
+        The more places there are, the more of them look similar. With this exponent, a scan was found in 98 % of the
+        places on 50 000 m², and with a constant number of starts in 95 %.
+        """
+        return float(max(1.0, len(self.places) / FULLY_RANKED_PLACES) ** (1 / 3))
+
     @cached_property
     def spread(self) -> Array:
         """Covariance (3, 3) of a completely unknown pose: uniform over the map and all headings."""
