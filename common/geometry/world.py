@@ -160,13 +160,16 @@ class World(WorldPart):
     @functools.cached_property
     def free_space(self) -> shapely.Geometry:
         """The free area."""
+        return shapely.difference(self._inside, self.furniture)
+
+    @functools.cached_property
+    def _inside(self) -> shapely.Geometry:
+        """The area within the walls, including that under obstacles."""
         if self.grid is not None:
-            room = self.grid.geometry.free_space
-        elif self.floors:
-            room = shapely.union_all([shapely.Polygon(ring) for ring in self.wall_rings])
-        else:
-            room = shapely.Polygon(self.boundary)
-        return shapely.difference(room, self.furniture)
+            return self.grid.geometry.free_space
+        if self.floors:
+            return shapely.union_all([shapely.Polygon(ring) for ring in self.wall_rings])
+        return shapely.Polygon(self.boundary)
 
     @functools.cached_property
     def _free_area(self) -> _Area:
@@ -308,10 +311,18 @@ class World(WorldPart):
 
     def _room(self, clearance: float) -> shapely.Geometry:
         """The part of free space at least ``clearance`` m from its edge; raises UserError if it is empty."""
-        room = shapely.buffer(self.free_space, -clearance)
-        if room.is_empty:
+        if clearance not in self._rooms:
+            # Obstacles are widened one by one, because narrowing free space with its thousand holes takes minutes.
+            widened = shapely.union_all(shapely.buffer([each.shape() for each in self.obstacles], clearance))
+            self._rooms[clearance] = shapely.difference(shapely.buffer(self._inside, -clearance), widened)
+        if shapely.is_empty(self._rooms[clearance]):
             raise self._no_room(clearance)
-        return room
+        return self._rooms[clearance]
+
+    @functools.cached_property
+    def _rooms(self) -> dict[float, shapely.Geometry]:
+        """Results of `_room`, by clearance."""
+        return {}
 
     def ray_distances(self, poses: npt.ArrayLike, angles: npt.ArrayLike) -> Array:
         """(N, B) exact distances in m from scanner poses (N, 3) in map along ``angles`` (B,) in laser.
