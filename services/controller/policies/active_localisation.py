@@ -21,7 +21,7 @@ from common.robot.scan_geometry import Sweep
 from services.controller.policies import expected_free_energy as efe
 from services.controller.policies.decision import Decision
 from services.controller.policies.expected_free_energy import NATS_PER_METRE, ExpectedFreeEnergy
-from services.controller.policies.motion_model import is_moving, turn_to_attractor
+from services.controller.policies.motion_model import turn_to_attractor
 from services.controller.policies.motion_selection import Surroundings, select_motion
 from services.controller.policies.recovery import BACKING_OFF, back_off
 
@@ -91,11 +91,16 @@ class VisitedPlaces:
             self._add(np.zeros(2))
         return motion
 
-    def give_up_if_stalled(self, place: Array) -> None:
-        """Counts the place (2,) m that the robot drives to as visited, if there was no progress for `STALLED_NS`."""
-        if self._stamp_ns is not None and self._stamp_ns - self._progress[1] > STALLED_NS:
-            self._progress = np.zeros(2), self._stamp_ns
-            self._add(place)
+    def give_up_if_stalled(self, place: Array) -> bool:
+        """Counts the place (2,) m that the robot drives to as visited, if there was no progress for `STALLED_NS`.
+
+        Returns whether that is so.
+        """
+        if self._stamp_ns is None or self._stamp_ns - self._progress[1] <= STALLED_NS:
+            return False
+        self._progress = np.zeros(2), self._stamp_ns
+        self._add(place)
+        return True
 
     def _add(self, place: Array) -> None:
         self.positions = np.concatenate([self.positions, place[None]])[-MAX_VISITED:]
@@ -154,7 +159,9 @@ class ActiveLocaliser:
         if len(poses) < 2 or (self._requested is not None and 0 <= stamp - self._requested[0] < CHOICE_PERIOD_NS):
             return None
         displacements, lengths = self._candidate_places(poses[0])
-        if self._place is not None:
+        # A place that was reached has told what it can. Were it still a candidate, the robot would stand there for as
+        # long as no other place is worth its path.
+        if self._place is not None and np.hypot(*self._place[0][:2]) > VISITED_SPACING_M:
             displacements = np.concatenate([self._place[0][None], displacements])
             lengths = np.concatenate([[np.hypot(*self._place[0][:2])], lengths])
         if not len(lengths):
@@ -193,16 +200,22 @@ class ActiveLocaliser:
         if len(poses) > 1:
             self._unknown_since_ns = None
             if self._place is not None:
-                self._visited.give_up_if_stalled(self._place[0][:2])
-                self._recovery.watch(belief.stamp_ns, moving=is_moving(velocity))
+                self._give_up_if_stalled(belief.stamp_ns, self._place[0][:2])
                 return self._drive_to(poses[0], *self._place, surroundings, velocity, len(poses))
             return Decision(reason=f"{len(poses)} places are possible: choosing where to drive to tell them apart")
         if self._unknown_since_ns is None or belief.stamp_ns < self._unknown_since_ns:
             self._unknown_since_ns = belief.stamp_ns
         if belief.stamp_ns - self._unknown_since_ns < INITIAL_WAIT_NS:
             return Decision(reason=f"the belief is {belief.state}: standing while the estimator searches", state="lost")
-        self._recovery.watch(belief.stamp_ns, moving=is_moving(velocity))
         return self._drive_to_open_space(belief, scan, surroundings, velocity)
+
+    def _give_up_if_stalled(self, stamp_ns: int, place: Array) -> None:
+        """Gives up the place (2,) m in base_link and backs off, if the robot makes no progress towards it.
+
+        It backs off because where one place cannot be reached from, others often cannot either.
+        """
+        if self._visited.give_up_if_stalled(place):
+            self._recovery.begin(stamp_ns)
 
     def _candidate_places(self, pose: Array) -> tuple[Array, Array]:
         """Displacements (M, 3) in base_link and path lengths (M,) m of the places around a hypothesis (3,)."""
@@ -259,7 +272,7 @@ class ActiveLocaliser:
         zero = np.zeros(len(gain))
         energy = ExpectedFreeEnergy(NATS_PER_METRE * (length + turn), zero, zero, gain)
         best = int(np.argmin(energy.total))
-        self._visited.give_up_if_stalled(length[best] * direction[best])
+        self._give_up_if_stalled(belief.stamp_ns, length[best] * direction[best])
         attractor = min(float(length[best]), 2.0) * direction[best]
         return self._approach(
             attractor, surroundings, velocity, Decision(reason=reason, terms=energy.of(best, energy.total))

@@ -42,7 +42,11 @@ class Recovery:
         elif self._standing_since_ns is None or stamp_ns < self._standing_since_ns:
             self._standing_since_ns = stamp_ns
         elif stamp_ns - self._standing_since_ns > STUCK_AFTER_NS:
-            self._standing_since_ns, self._backing_off_since_ns = None, stamp_ns
+            self.begin(stamp_ns)
+
+    def begin(self, stamp_ns: int) -> None:
+        """Begins to back off."""
+        self._standing_since_ns, self._backing_off_since_ns = None, stamp_ns
 
 
 def back_off(velocity: Array, surroundings: Surroundings, robot: Robot) -> SelectedMotion:

@@ -200,8 +200,30 @@ def test_backing_off_while_not_localised(state):
         if (motions := policy.prediction_request(unsure)) is not None:
             ranges = np.ones(motions.poses()[..., 0].size, np.float32)
             policy.use_predictions(PredictReply(angles=np.zeros(1, np.float32), ranges=ranges))
-        decision = policy.decide_unlocalised(unsure, np.zeros(3))
+        # It turns to and fro by little, as the noise of the scans wants, and gets nowhere.
+        decision = policy.decide_unlocalised(unsure, np.array([0.0, 0.0, 0.2 * (-1) ** number]))
     assert (decision.reason, decision.recovering) == ("stuck: backing off", True)
+
+
+def test_place_that_was_reached():
+    """It is no longer a candidate: the robot would stand there as long as no other place is worth its path."""
+    policy, pose = GeodesicPolicy(Robot(), HALL), np.array([5.0, 1.5, 0.0])
+    policy.set_goal(np.array([9.0, 1.5]))
+    hypotheses = [BeliefHypothesis(pose=Pose(x=x, y=1.5), weight=0.5) for x in (5, 7)]
+    unsure = belief(0, pose, "ambiguous").model_copy(update={"hypotheses": hypotheses})
+    policy.observe(scan(0, pose, HALL), unsure)
+    motions = policy.prediction_request(unsure)
+    policy.use_predictions(PredictReply(ranges=np.ones(motions.poses()[..., 0].size, np.float32)))
+
+    def candidates(seconds, velocity):
+        now = unsure.model_copy(update={"stamp_ns": round(seconds * 1e9)})
+        policy.decide_unlocalised(now, velocity)
+        return policy.prediction_request(now).displacements
+
+    place = candidates(1, np.zeros(3))[0]
+    on_the_way = candidates(2, np.array([*place[:2], 0.0]) / 2)
+    assert on_the_way[0] == pytest.approx([*place[:2] / 2, place[2]])
+    assert np.hypot(*candidates(3, np.array([*place[:2], 0.0]) / 2)[:, :2].T).min() > 0.25
 
 
 @pytest.mark.parametrize("kind", KINDS)
