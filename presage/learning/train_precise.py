@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from dataclasses import dataclass, field, replace
@@ -115,7 +116,9 @@ def _train(
 
     beams_per_sweep = max(options.recipe.beams_per_sweep, BEAMS_PER_SAMPLE * len(scans["train"]))
     recipe = replace(options.recipe, beams_per_sweep=beams_per_sweep)
-    field = learn_field(Beams.of(poses["train"], mount, angles, scans["train"]), recipe, report)
+    field = learn_field(
+        Beams.of(poses["train"], mount, angles, scans["train"]), recipe, report, threads=os.cpu_count() or 1
+    )
     # The weights are stored in half precision, so that the model is evaluated with the same precision.
     field = replace(field, phi=field.phi.astype(np.float16).astype(np.float32))
     report("precision", 1.0)

@@ -10,7 +10,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -56,19 +59,23 @@ def learn_field(
     beams: Beams,
     recipe: Recipe,
     report: Callable[[str, float], None] = lambda _title, _done: None,
+    threads: int = 1,
 ) -> DistanceField:
-    """Learns the field that predicts the beams; calls ``report`` with the name of the stage and the share done."""
+    """Learns the field that predicts the beams; calls ``report`` with the name of the stage and the share done.
+
+    The result does not depend on the number of ``threads``.
+    """
     report("surfaces", 0.0)
     beams = beams.part(has_neighbours(beams.ends()))
     field = field_of_surfaces(beams, recipe.resolution)
     rng = np.random.default_rng(recipe.seed)
-    phi = _clear_passed_nodes(field, beams)
+    phi = _clear_passed_nodes(field, beams, threads)
     for sweep in range(recipe.sweeps):
         report("prediction errors", sweep / recipe.sweeps)
         # Sorted, because neighbouring beams of a scan need the same part of the field: a third less time.
         sample = np.sort(rng.integers(0, len(beams.ranges), min(recipe.beams_per_sweep, len(beams.ranges))))
         rate = 1 / (1 + sweep / 2)  # decreases, so that the noise averages out in the last sweeps
-        phi = _descend(DistanceField(phi, field.origin, field.resolution), beams, sample, rate)
+        phi = _descend(DistanceField(phi, field.origin, field.resolution), beams, sample, rate, threads)
     return DistanceField(phi, field.origin, field.resolution)
 
 
@@ -118,18 +125,32 @@ def measure_ripple(field: DistanceField, lasers: Array, angles: Array) -> float:
     return float(np.sqrt(np.mean(((left + right)[flat] / 2) ** 2) / 1.5)) if flat.any() else 0.0
 
 
-def _clear_passed_nodes(field: DistanceField, beams: Beams) -> Floats:
+def _clear_passed_nodes(field: DistanceField, beams: Beams, threads: int) -> Floats:
     """Phi, made positive at the nodes that most beams near them pass.
 
     Beside an outer corner, noise along the beams resembles a surface, and its plane may reach into free space.
     """
-    ended, passed = np.zeros((2, *field.phi.shape))
-    starts, h = beams.starts - field.origin, field.resolution
-    count_at_nodes(starts, beams.unit(), beams.ranges, h, PASSING_CELLS * h, PASSED_DEPTH_M, ended, passed)
+    h = field.resolution
+
+    def count(part: Beams) -> Array:
+        counts = np.zeros((2, *field.phi.shape))
+        starts = part.starts - field.origin
+        count_at_nodes(starts, part.unit(), part.ranges, h, PASSING_CELLS * h, PASSED_DEPTH_M, *counts)
+        return counts
+
+    ended, passed = sum(_map_parts(count, beams, threads))
     return np.where(are_mostly_passed(ended, passed), np.maximum(field.phi, np.float32(PASSING_CELLS * h)), field.phi)
 
 
-def _descend(field: DistanceField, beams: Beams, sample: npt.NDArray[np.intp], rate: float) -> Floats:
+def _map_parts(function: Callable[[Beams], Any], beams: Beams, threads: int) -> list[Any]:
+    """Applies a function to as many parts of the beams as there are threads, each in its own thread."""
+    edges = np.linspace(0, len(beams.ranges), threads + 1).astype(int)
+    parts = [beams.part(slice(*pair)) for pair in pairwise(edges)]
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(function, parts))
+
+
+def _descend(field: DistanceField, beams: Beams, sample: npt.NDArray[np.intp], rate: float, threads: int) -> Floats:
     """One sweep of prediction over a sample of the beams.
 
     Since dr = dphi / |n . u|, an error e = o - r requires dphi = e |n . u| where the beam ends, with weight
@@ -138,17 +159,24 @@ def _descend(field: DistanceField, beams: Beams, sample: npt.NDArray[np.intp], r
     ended, passed, up, norm = np.zeros((4, field.phi.size))
     for begin in range(0, len(sample), BEAMS_AT_ONCE):
         part = beams.part(sample[begin : begin + BEAMS_AT_ONCE])
-        _add_errors(field, part, ended, passed, up, norm)
+        _add_errors(field, part, ended, passed, up, norm, threads)
     absent = are_mostly_passed(ended, passed)
     phi = np.where(absent, np.maximum(field.phi.ravel(), CARVED_DISTANCE_CELLS * field.resolution), field.phi.ravel())
     step = np.divide(up, norm + 1.0, out=np.zeros_like(up))
     return np.asarray(phi.astype(np.float32) + rate * step, np.float32).reshape(field.phi.shape)
 
 
-def _add_errors(field: DistanceField, beams: Beams, ended: Array, passed: Array, up: Array, norm: Array) -> None:
+def _add_errors(
+    field: DistanceField, beams: Beams, ended: Array, passed: Array, up: Array, norm: Array, threads: int
+) -> None:
     """Adds to each node (ny * nx,) the beams that ended and passed there, their weighted errors and their weights."""
-    traced = field.trace(np.column_stack([beams.starts, beams.directions]), np.zeros(1))
-    ranges, facing, unit = traced.ranges[:, 0], traced.facing[:, 0], beams.unit()
+
+    def trace(part: Beams) -> Array:
+        traced = field.trace(np.column_stack([part.starts, part.directions]), np.zeros(1))
+        return np.column_stack([traced.ranges, traced.facing])
+
+    ranges, facing = np.concatenate(_map_parts(trace, beams, threads)).T
+    unit = beams.unit()
     error = beams.ranges - ranges
     good = np.isfinite(ranges) & (np.abs(error) < MAX_ERROR_M) & (facing > MIN_FACING)
     behind = np.where(np.isfinite(ranges), error, 0.0) * facing  # m, perpendicular to the surface

@@ -44,8 +44,8 @@ class Beams:
         """Unit directions (R, 2) in map."""
         return np.stack([np.cos(self.directions), np.sin(self.directions)], -1)
 
-    def part(self, which: np.ndarray) -> Beams:
-        """Returns the beams that a mask or indices select."""
+    def part(self, which: np.ndarray | slice) -> Beams:
+        """Returns the beams that a mask, indices or a slice select."""
         return Beams(self.starts[which], self.directions[which], self.ranges[which])
 
     def joined(self, other: Beams) -> Beams:
