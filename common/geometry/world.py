@@ -312,7 +312,7 @@ class World(WorldPart):
     def _room(self, clearance: float) -> shapely.Geometry:
         """The part of free space at least ``clearance`` m from its edge; raises UserError if it is empty."""
         if clearance not in self._rooms:
-            # Obstacles are widened one by one, because narrowing free space with its thousand holes takes minutes.
+            # Obstacles are widened one by one, because narrowing a free space with thousands of holes takes a minute.
             widened = shapely.union_all(shapely.buffer([each.shape() for each in self.obstacles], clearance))
             self._rooms[clearance] = shapely.difference(shapely.buffer(self._inside, -clearance), widened)
         if shapely.is_empty(self._rooms[clearance]):

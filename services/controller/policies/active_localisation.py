@@ -48,7 +48,9 @@ INITIAL_WAIT_NS = 1_000_000_000  # time for the estimator to localise before the
 CORRELATION_LENGTH_M = 1.0  # scans from places this far apart are nearly independent
 MAX_VISITED = 100  # positions kept, VISITED_SPACING_M apart
 VISITED_SPACING_M = 0.25
-STALLED_NS = 3_000_000_000  # after this time without motion, the robot gives up the place
+STALLED_NS = 3_000_000_000  # after this time without progress, the robot gives up the place
+REACHED_M = 0.1  # a place nearer than this was reached
+PROGRESS_RAD = 0.5  # a turn by this, or a motion by `VISITED_SPACING_M`, is progress; turning to and fro by less is not
 MAX_USEFUL_ROOM_M = 5.0  # more free distance than this is no advantage
 WINDOW_RAD = 0.35  # the room (free distance) in a direction is the shortest range this far to either side of it
 MIN_ROOM_M = 0.7  # if every direction has less, the robot turns on the spot
@@ -75,30 +77,34 @@ class VisitedPlaces:
     def __init__(self) -> None:
         self.positions = np.zeros((1, 2))  # (V, 2) m
         self._stamp_ns: int | None = None
-        self._progress = np.zeros(2), 0  # m and ns, where and when the robot last made progress
+        self._progress = np.zeros(3), 0  # pose in base_link and stamp in ns at which the robot last made progress
 
     def move(self, stamp_ns: int, velocity: Array) -> Array:
         """Integrates the latest command (3,) up to a stamp; returns the motion (3,) since the stamp before."""
         seconds = 0.0 if self._stamp_ns is None else max(0.0, (stamp_ns - self._stamp_ns) * 1e-9)
         motion = velocity * seconds
         self.positions = se2.rotate(-motion[2], self.positions - motion[:2])
-        place, since_ns = self._progress
-        self._progress = se2.rotate(-motion[2], place - motion[:2]), since_ns
-        if self._stamp_ns is None or np.hypot(*self._progress[0]) > VISITED_SPACING_M:
-            self._progress = np.zeros(2), stamp_ns
-        self._stamp_ns = stamp_ns
+        first, self._stamp_ns = self._stamp_ns is None, stamp_ns
+        pose = se2.between(motion, self._progress[0])
+        self._progress = pose, self._progress[1]
+        if first or np.hypot(*pose[:2]) > VISITED_SPACING_M or abs(pose[2]) > PROGRESS_RAD:
+            self.restart_clock()
         if np.hypot(*self.positions.T).min() > VISITED_SPACING_M:
             self._add(np.zeros(2))
         return motion
 
+    def restart_clock(self) -> None:
+        """Waits for progress from now on."""
+        self._progress = np.zeros(3), self._stamp_ns or 0
+
     def give_up_if_stalled(self, place: Array) -> bool:
         """Counts the place (2,) m that the robot drives to as visited, if there was no progress for `STALLED_NS`.
 
-        Returns whether that is so.
+        Returns whether it was given up.
         """
         if self._stamp_ns is None or self._stamp_ns - self._progress[1] <= STALLED_NS:
             return False
-        self._progress = np.zeros(2), self._stamp_ns
+        self.restart_clock()
         self._add(place)
         return True
 
@@ -159,9 +165,7 @@ class ActiveLocaliser:
         if len(poses) < 2 or (self._requested is not None and 0 <= stamp - self._requested[0] < CHOICE_PERIOD_NS):
             return None
         displacements, lengths = self._candidate_places(poses[0])
-        # A place that was reached has told what it can. Were it still a candidate, the robot would stand there for as
-        # long as no other place is worth its path.
-        if self._place is not None and np.hypot(*self._place[0][:2]) > VISITED_SPACING_M:
+        if self._place is not None:
             displacements = np.concatenate([self._place[0][None], displacements])
             lengths = np.concatenate([[np.hypot(*self._place[0][:2])], lengths])
         if not len(lengths):
@@ -189,11 +193,17 @@ class ActiveLocaliser:
         motion = self._visited.move(belief.stamp_ns, velocity)
         if self._place is not None:
             self._place = (se2.between(motion, self._place[0]), self._place[1])
+            # A place that was reached has told what it can. Were it kept, the robot would stay there for as long as no
+            # other place is worth its path.
+            if np.hypot(*self._place[0][:2]) < REACHED_M:
+                self._place = None
+        self._recovery.watch(belief.stamp_ns, moving=True)  # here, progress decides when the robot backs off
         static = np.zeros(len(points), bool)
         surroundings = Surroundings(
             _no_walls, points, static, 0.0, self.min_point_distance, field_of_view=field_of_view, may_turn=self.may_turn
         )
         if self._recovery.is_active(belief.stamp_ns):
+            self._visited.restart_clock()
             action = back_off(velocity, surroundings, self.robot).action
             return Decision(action, BACKING_OFF, "blocked", recovering=True)
         poses, _ = _likely_hypotheses(belief)
@@ -202,17 +212,19 @@ class ActiveLocaliser:
             if self._place is not None:
                 self._give_up_if_stalled(belief.stamp_ns, self._place[0][:2])
                 return self._drive_to(poses[0], *self._place, surroundings, velocity, len(poses))
+            self._visited.restart_clock()
             return Decision(reason=f"{len(poses)} places are possible: choosing where to drive to tell them apart")
         if self._unknown_since_ns is None or belief.stamp_ns < self._unknown_since_ns:
             self._unknown_since_ns = belief.stamp_ns
         if belief.stamp_ns - self._unknown_since_ns < INITIAL_WAIT_NS:
+            self._visited.restart_clock()
             return Decision(reason=f"the belief is {belief.state}: standing while the estimator searches", state="lost")
         return self._drive_to_open_space(belief, scan, surroundings, velocity)
 
     def _give_up_if_stalled(self, stamp_ns: int, place: Array) -> None:
         """Gives up the place (2,) m in base_link and backs off, if the robot makes no progress towards it.
 
-        It backs off because where one place cannot be reached from, others often cannot either.
+        From where the robot cannot reach one place, it often cannot reach others.
         """
         if self._visited.give_up_if_stalled(place):
             self._recovery.begin(stamp_ns)

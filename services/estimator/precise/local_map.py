@@ -29,8 +29,9 @@ PARTNER_RADII_M = (0.6, 0.6, 0.4, 0.4, 0.2, 0.2, 0.1, 0.1, 0.1, 0.1)
 CAUCHY_SCALE_M = 0.02  # of the Cauchy weight of a point by its distance from the line
 MATCHED_RADIUS_M = 0.08  # a point is matched if it is this near to one of the local map
 # A point is on a surface seen before if it is this near to a point of the local map (far away, neighbouring beams are
-# so far apart), and within this and three standard deviations of the noise from the line through it. A wider tolerance
-# across surfaces takes much of another room for this one.
+# so far apart), and this near to the line through it, with three standard deviations of the noise added in quadrature.
+# A wider tolerance across surfaces takes much of another room for this one. Through a point with too few neighbours
+# there is no line, and the first distance alone counts.
 SEEN_RADIUS_M, SEEN_ACROSS_M = 0.15, 0.05
 MIN_POINTS = 20  # of a scan that must have a partner in the local map
 MAX_SQUARED_DISTANCE = 4.0  # squared standard deviations of the result from the prior
@@ -77,7 +78,8 @@ class ChangeRate:
     """Rate at which surfaces in view vanish or appear, learned while driving.
 
     The rate has a gamma distribution, so the number of changes in a given time has a negative binomial distribution.
-    Before the first scan it is as after a time without a change (Jeffreys' prior), which is forgotten like any other.
+    The shape is Jeffreys' 0.5 plus the remembered changes. The duration is always `CHANGE_MEMORY_S`, at first for an
+    assumed time without a change, later for the time remembered. Periods must be much shorter than that.
     """
 
     remembered: float = 0.0  # changes, forgotten exponentially

@@ -30,7 +30,8 @@ MAX_NOISE_FACTOR = 4.0
 # must be short enough that these are nearly equal along it. `CORRELATION_LENGTH_M` is longer: it says how far along a
 # surface errors still add up instead of averaging out.
 SEGMENT_LENGTH_M = 0.5
-# Errors larger than this and three standard deviations of the noise are not the map's, but changes of the surroundings.
+# Larger errors, with three standard deviations of the noise added in quadrature, are not the map's, but changes of the
+# surroundings.
 MAX_MAP_ERROR_M = 0.1
 MIN_LEARNING_BEAMS, MIN_LEARNING_FRACTION = 30, 0.3  # of a scan's beams; nothing is learned from fewer
 DAMPING = 1e-9  # in m; keeps the inverse finite where a direction is not observed

@@ -26,6 +26,17 @@ def test_clearance(seed):
     np.testing.assert_allclose(world.clearance(points), np.where(inside, distance, -distance), atol=1e-12)
 
 
+@given(st.integers(0, 2**32 - 1), st.floats(0.01, 0.5))
+def test_room_for_a_robot(seed, clearance):
+    """Widening each obstacle leaves the same room as narrowing the free space, also where obstacles overlap."""
+    rng = np.random.default_rng(seed)
+    boxes = [{"box": {"center": rng.uniform(0, 6, 2).tolist(), "size": (1.0, 0.5), "yaw_deg": 30}} for _ in range(8)]
+    disc = {"circle": {"center": (3.0, 3.0), "radius": 0.5}}
+    world = World(name="w", boundary=[(0, 0), (6, 0), (6, 4), (4, 4), (4, 6), (0, 6)], obstacles=[*boxes, disc])
+    narrowed = shapely.buffer(world.free_space, -clearance)
+    assert shapely.area(shapely.symmetric_difference(world._room(clearance), narrowed)) < 1e-3
+
+
 def test_no_free_space():
     everything = {"box": {"center": (1.0, 1.0), "size": (9.0, 9.0)}}
     full = World(name="w", boundary=[(0, 0), (2, 0), (2, 2), (0, 2)], obstacles=[everything])

@@ -7,7 +7,7 @@ import pytest
 
 from common.messages.definitions import BeliefHypothesis, Pose
 from common.robot.robot import Robot
-from services.controller.policies.active_localisation import ActiveLocaliser
+from services.controller.policies.active_localisation import ActiveLocaliser, VisitedPlaces
 from services.controller.policies.free_space import FreeSpace
 from services.controller.policies.geodesic_field import FreeSpaceGraph
 from services.controller.policies.recovery import Recovery
@@ -28,3 +28,20 @@ def test_weight_of_the_second_hypothesis(weight, counted):
         assert motions is None
     else:
         assert motions.weights.tolist() == pytest.approx([1 - weight, counted])
+
+
+def test_time_for_progress():
+    """It counts from when the robot may drive: not while it waits or backs off. A turn by half a radian is progress."""
+    visited = VisitedPlaces()
+    away = np.array([1.0, 0.0])
+    visited.move(0, np.zeros(3))
+    visited.move(4_000_000_000, np.zeros(3))
+    visited.restart_clock()
+    assert not visited.give_up_if_stalled(away)
+    visited.move(6_000_000_000, np.array([0.0, 0.0, 0.3]))
+    visited.move(8_000_000_000, np.zeros(3))
+    assert not visited.give_up_if_stalled(away)
+    visited.move(9_500_000_000, np.zeros(3))
+    assert visited.give_up_if_stalled(away)
+    assert not visited.give_up_if_stalled(away)
+    assert visited.positions[-1].tolist() == away.tolist()

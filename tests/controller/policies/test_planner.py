@@ -200,13 +200,13 @@ def test_backing_off_while_not_localised(state):
         if (motions := policy.prediction_request(unsure)) is not None:
             ranges = np.ones(motions.poses()[..., 0].size, np.float32)
             policy.use_predictions(PredictReply(angles=np.zeros(1, np.float32), ranges=ranges))
-        # It turns to and fro by little, as the noise of the scans wants, and gets nowhere.
+        # It turns to and fro a little, because of noise in the scans, and gets nowhere.
         decision = policy.decide_unlocalised(unsure, np.array([0.0, 0.0, 0.2 * (-1) ** number]))
     assert (decision.reason, decision.recovering) == ("stuck: backing off", True)
 
 
 def test_place_that_was_reached():
-    """It is no longer a candidate: the robot would stand there as long as no other place is worth its path."""
+    """It is no longer a candidate: the robot would stay there for as long as no other place is worth its path."""
     policy, pose = GeodesicPolicy(Robot(), HALL), np.array([5.0, 1.5, 0.0])
     policy.set_goal(np.array([9.0, 1.5]))
     hypotheses = [BeliefHypothesis(pose=Pose(x=x, y=1.5), weight=0.5) for x in (5, 7)]

@@ -124,7 +124,7 @@ def test_seen_surfaces():
     assert np.flatnonzero(~seen).tolist() == list(range(100, 150))
     assert not arrived.any()
     behind = replace(scan, ranges=scan.ranges + 0.14)  # another room, whose walls are near those of this one
-    assert made.find_old_beams(here, behind, mapped)[0].mean() < 0.5  # those that meet walls at a shallow angle
+    assert made.find_old_beams(here, behind, mapped)[0].mean() < 0.5  # only beams that meet walls at a shallow angle
 
 
 def test_surface_in_place_of_another():
