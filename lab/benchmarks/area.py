@@ -18,6 +18,7 @@ from common.geometry.se2 import Array
 from lab.accuracy.runner import quick_field
 from lab.accuracy.scenes import TIM571, Scene
 from lab.accuracy.tasks import is_at
+from lab.experiments.results import markdown
 from lab.integrity import changes
 from lab.integrity.buildings import Building, make_building
 from lab.workers import pool
@@ -25,18 +26,15 @@ from presage.terminal.output import check_file, make_folder, provenance, write_j
 from services.estimator.factory import ScannerGeometry
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.field import DistanceField, FieldModel
-from services.estimator.precise.gauss_newton import View
 from services.estimator.precise.global_seeds import Seeds
 from services.estimator.precise.learning.field_learning import seed_places
-from services.estimator.precise.settings import PreciseSettings
 from services.estimator.shared.interface import Observation
 
 SCANNER = TIM571.with_beams(622)
 SCANS = 300  # from which the field of each building is learned
 CELL_M = 0.04
 GAP_CELLS = 10  # between buildings
-SEED_POSITION_M, SEED_HEADING_RAD = 0.5, 0.3  # from a seed with a smaller error, a descent finds the pose
-SHARES = ("found", "wrongly_tracking", "ambiguous", "seeded")
+SHARES = ("found", "wrongly_tracking", "ambiguous")
 
 
 @dataclass(frozen=True)
@@ -162,17 +160,33 @@ def _measure(site: Site, places: int, moved: float, seed: int, console: Console)
         for _ in track(range(places), title, console=console, transient=True)
     ]
     values = np.array(trials)
-    milliseconds = values[:, 4] * 1e3
+    milliseconds = values[:, 3] * 1e3
     return {
         "area_m2": round(site.area),
         "moved": moved,
-        **dict(zip(SHARES, values[:, :4].mean(axis=0).tolist(), strict=True)),
+        **dict(zip(SHARES, values[:, :3].mean(axis=0).tolist(), strict=True)),
         "ms_median": float(np.median(milliseconds)),
         "ms_p95": float(np.quantile(milliseconds, 0.95)),
-        "ms_ranking": float(np.median(values[:, 5]) * 1e3),
         "seeds": len(site.seeds.places),
         "model_mb": sum(each.nbytes for each in (site.model.field.phi, site.seeds.places, site.seeds.panoramas)) / 1e6,
     }
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """The Markdown table of docs/maps.md."""
+    cells = [
+        [
+            f"{row['area_m2']}",
+            f"{row['moved']:.0%}",
+            *(f"{row[share]:.1%}" for share in ("found", "wrongly_tracking")),
+            f"{row['ms_median']:.0f}, {row['ms_p95']:.0f}",
+            f"{row['model_mb']:.0f}",
+        ]
+        for row in rows
+    ]
+    return markdown(
+        ("m²", "furniture moved", "found", "wrongly `tracking`", "ms: median, 95 %", "model in memory (MB)"), cells
+    )
 
 
 def _scan(site: Site, moved: float, rng: np.random.Generator) -> tuple[Observation, Array]:
@@ -188,26 +202,10 @@ def _scan(site: Site, moved: float, rng: np.random.Generator) -> tuple[Observati
 
 
 def _trial(estimator: PreciseEstimator, observation: Observation, truth: Array) -> tuple[float, ...]:
-    """Found, wrongly tracking, ambiguous and seeded (0 or 1); seconds of the update, and of ranking the seeds in it."""
+    """Found, wrongly tracking and ambiguous (0 or 1), and seconds of the update."""
     estimator.restart()
     began = time.process_time()
     posterior = estimator.update(observation)
     seconds = time.process_time() - began
     found = is_at(posterior.pose, truth)
-    view = View(
-        estimator.model,
-        estimator.likelihood,
-        estimator.mount,
-        observation.angles,
-        observation.ranges,
-        observation.range_max,
-    )
-    began = time.process_time()
-    ranked = estimator.seeds.rank(view, PreciseSettings().ranked_seeds)
-    ranking = time.process_time() - began
-    errors = se2.difference(ranked, truth)
-    seeded = bool(
-        ((np.hypot(errors[:, 0], errors[:, 1]) < SEED_POSITION_M) & (np.abs(errors[:, 2]) < SEED_HEADING_RAD)).any()
-    )
-    wrong = posterior.state == "tracking" and not found
-    return found, wrong, posterior.state == "ambiguous", seeded, seconds, ranking
+    return found, posterior.state == "tracking" and not found, posterior.state == "ambiguous", seconds

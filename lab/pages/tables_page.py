@@ -33,6 +33,7 @@ MODULES = {
     "visits": "lab.benchmarks.visits",
     "mapping-faults": "lab.benchmarks.mapping_faults",
     "live-refinement": "lab.benchmarks.live_refinement",
+    "area": "lab.benchmarks.area",
 }
 # Results with and without the terms of information, in one table.
 COMPARED = {
