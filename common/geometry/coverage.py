@@ -21,7 +21,7 @@ SPACING_M = 0.05  # between the points that stand for an area
 
 def reachable_area(world: World, radius: float, start: Array) -> shapely.Geometry:
     """The area that a disc of ``radius`` m can cover, coming from ``start`` (3,)."""
-    room = shapely.buffer(world.free_space, -radius)
+    room = world.space_with_clearance(radius)
     parts = [part for part in shapely.get_parts(room) if shapely.distance(part, shapely.Point(start[:2])) < 0.01]
     return shapely.buffer(shapely.union_all(parts), radius)
 

@@ -310,18 +310,23 @@ class World(WorldPart):
         return np.array([*shapely.get_coordinates(nearest)[0], 0.0])
 
     def _room(self, clearance: float) -> shapely.Geometry:
-        """The part of free space at least ``clearance`` m from its edge; raises UserError if it is empty."""
-        if clearance not in self._rooms:
+        """`space_with_clearance`; raises UserError if it is empty."""
+        room = self.space_with_clearance(clearance)
+        if shapely.is_empty(room):
+            raise self._no_room(clearance)
+        return room
+
+    def space_with_clearance(self, clearance: float) -> shapely.Geometry:
+        """The part of free space at least ``clearance`` m from its edge."""
+        if clearance not in self._spaces:
             # Obstacles are widened one by one, because narrowing a free space with thousands of holes takes a minute.
             widened = shapely.union_all(shapely.buffer([each.shape() for each in self.obstacles], clearance))
-            self._rooms[clearance] = shapely.difference(shapely.buffer(self._inside, -clearance), widened)
-        if shapely.is_empty(self._rooms[clearance]):
-            raise self._no_room(clearance)
-        return self._rooms[clearance]
+            self._spaces[clearance] = shapely.difference(shapely.buffer(self._inside, -clearance), widened)
+        return self._spaces[clearance]
 
     @functools.cached_property
-    def _rooms(self) -> dict[float, shapely.Geometry]:
-        """Results of `_room`, by clearance."""
+    def _spaces(self) -> dict[float, shapely.Geometry]:
+        """Results of `space_with_clearance`, by clearance."""
         return {}
 
     def ray_distances(self, poses: npt.ArrayLike, angles: npt.ArrayLike) -> Array:

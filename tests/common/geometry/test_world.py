@@ -27,14 +27,14 @@ def test_clearance(seed):
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.01, 0.5))
-def test_room_for_a_robot(seed, clearance):
-    """Widening each obstacle leaves the same room as narrowing the free space, also where obstacles overlap."""
+def test_space_with_clearance(seed, clearance):
+    """It is the same as free space that is narrowed, also where obstacles overlap."""
     rng = np.random.default_rng(seed)
     boxes = [{"box": {"center": rng.uniform(0, 6, 2).tolist(), "size": (1.0, 0.5), "yaw_deg": 30}} for _ in range(8)]
     disc = {"circle": {"center": (3.0, 3.0), "radius": 0.5}}
     world = World(name="w", boundary=[(0, 0), (6, 0), (6, 4), (4, 4), (4, 6), (0, 6)], obstacles=[*boxes, disc])
     narrowed = shapely.buffer(world.free_space, -clearance)
-    assert shapely.area(shapely.symmetric_difference(world._room(clearance), narrowed)) < 1e-3
+    assert shapely.area(shapely.symmetric_difference(world.space_with_clearance(clearance), narrowed)) < 1e-3
 
 
 def test_no_free_space():
