@@ -57,8 +57,8 @@ class Seeds:
     def starts_factor(self) -> float:
         """Number of starts of a search, divided by that in a map of up to `FULLY_RANKED_PLACES` places.
 
-        The more places there are, the more of them look similar. The exponent was chosen on 240 scans on 50 000 m², of
-        which 236 were found, and 229 with a constant number of starts.
+        The more places there are, the more of them look similar. The exponent was chosen on 50 000 m²: of 240 scans, a
+        constant number of starts missed 11, of which this finds 7.
         """
         return float(max(1.0, len(self.places) / FULLY_RANKED_PLACES) ** (1 / 3))
 
