@@ -1,7 +1,7 @@
 """Measures learning while driving in a rough map: `python -m lab.benchmarks.live_refinement`.
 
-A drive learns in a noisy grid of 5 cm; the errors are those of another drive. Learning takes place between two scans,
-so that results do not depend on the machine; what it learned is used `DELAY_S` of the drive later.
+A drive through all rooms learns in a noisy grid of 5 cm; the errors are those of another drive. Learning takes place
+between two scans, so that results do not depend on the machine; what it learned is used `DELAY_S` of the drive later.
 """
 
 from __future__ import annotations
@@ -15,11 +15,13 @@ import numpy as np
 import psutil
 
 from common.geometry.se2 import Array
-from common.geometry.world import World, load_world
+from common.geometry.world import World
 from lab.accuracy.scenes import Scene
 from lab.benchmarks.mapping import fitted
+from lab.benchmarks.refinement import drive_for
+from lab.benchmarks.visits import PERIOD_S, office_building
 from lab.experiments.results import markdown, millimetres
-from lab.integrity.buildings import make_building
+from lab.integrity.buildings import Building, make_building
 from lab.integrity.cases import BEAMS, START_DEVIATION
 from lab.integrity.maps import noisy_grid
 from presage.terminal.output import check_file, provenance, write_json
@@ -51,7 +53,7 @@ def drive_and_learn(rough: World, scene: Scene, path: Array) -> tuple[dict[str, 
     update_ms: list[tuple[float, float]] = []  # of tracking and of the collection of key scans, CPU time
     version, pending, errors, since = None, None, [], 0.0
     for k, clean in enumerate(scene.clean(path)):
-        stamp = k / scene.scanner.rate
+        stamp = k * PERIOD_S
         observation = scene.observe(clean, stamp)
         begin = time.process_time()
         posterior = estimator.update(observation)
@@ -70,7 +72,7 @@ def drive_and_learn(rough: World, scene: Scene, path: Array) -> tuple[dict[str, 
                 "key_scans": len(drive.poses),
                 "learning_cpu_s": time.process_time() - begin,
                 "accepted": pending is not None,
-                "error_median_m": float(np.median(errors[-int(10 * scene.scanner.rate):])),
+                "error_median_m": float(np.median(errors[-round(10 / PERIOD_S):])),
             })  # fmt: skip
             print(versions[-1], flush=True)
     mean, (median, most) = np.mean(update_ms, axis=0), np.quantile(update_ms, (0.5, 0.99), axis=0)
@@ -92,20 +94,17 @@ def key_scan_bytes(keys: KeyScanCollector) -> int:
     return sum(key.ranges.nbytes for key in keys.verified.values())
 
 
-def errors_of_test_drive(rough: World, scene: Scene, version: ModelVersion | None) -> dict[str, float]:
-    """Position errors of another drive, with a version or with the rough map.
+def errors_of_test_drive(rough: World, scene: Scene, path: Array, version: ModelVersion | None) -> dict[str, float]:
+    """Position errors of another drive along poses (N, 3), with a version or with the rough map.
 
     For the aligned errors, the estimated path is first moved and turned as a whole to fit the true one best, so that an
     offset of the whole map does not count.
     """
-    path = scene.path(TEST_SECONDS)
     estimator = start_estimator(rough, scene, path[0])
     if version is not None:
         estimator.use_model(version.model, version.seeds)
     clean = scene.clean(path)
-    found = np.array(
-        [estimator.update(scene.observe(each, k / scene.scanner.rate)).pose for k, each in enumerate(clean)]
-    )
+    found = np.array([estimator.update(scene.observe(each, k * PERIOD_S)).pose for k, each in enumerate(clean)])
     errors, aligned = (np.hypot(*(poses - path)[:, :2].T) for poses in (found, fitted(found, path)))
     return {
         "position_median_m": float(np.median(errors)),
@@ -117,14 +116,17 @@ def errors_of_test_drive(rough: World, scene: Scene, version: ModelVersion | Non
 
 def refine(name: str, seed: int, seconds: float) -> dict[str, Any]:
     """Results in one world."""
-    world = load_world("office") if name == "office" else make_building(int(name)).world
+    building: Building = office_building() if name == "office" else make_building(int(name))
+    world = building.world
     rough = noisy_grid(Scene.of(world, BEAMS, [seed, ROUGH_SEED]))
     scene = Scene.of(world, BEAMS, [seed, DRIVE_SEED])
-    learned, version = drive_and_learn(rough, scene, scene.path(seconds))
+    learned, version = drive_and_learn(rough, scene, drive_for(scene, building, seconds))
+    tests = [Scene.of(world, BEAMS, [seed, TEST_SEED]) for _ in range(2)]  # both with the same noise
     before, after = (
-        errors_of_test_drive(rough, Scene.of(world, BEAMS, [seed, TEST_SEED]), each) for each in (None, version)
+        errors_of_test_drive(rough, test, drive_for(test, building, TEST_SECONDS), each)
+        for test, each in zip(tests, (None, version), strict=True)
     )
-    return {"world": world.name, "rough": before, "after": after, **learned}
+    return {"world": building.name, "rough": before, "after": after, **learned}
 
 
 def table(rows: list[dict[str, Any]]) -> str:

@@ -21,6 +21,7 @@ from services.estimator.precise.field import FieldModel
 from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.precise.learning.field_learning import Recipe, learn_field
 from services.estimator.precise.learning.map_alignment import move_into_cells
+from services.estimator.shared.generative_models import RayCaster
 from services.estimator.shared.interface import Observation
 from services.mapper.slam.pose_graph import PoseLink, optimise
 
@@ -86,7 +87,7 @@ def _localise(world: World, keys: ReferenceDrive, model: Path | None) -> tuple[A
     if model is not None:
         options = EstimatorOptions(world, model=str(model))
     else:  # a learned field, because the cells of oblique walls are staircases, which would bias the headings
-        beams = simulated_beams(world, keys, enough_scans(world), seed=0)
+        beams = simulated_beams(world, RayCaster(world), keys, enough_scans(world), seed=0)
         options = EstimatorOptions(world, generative_model=FieldModel(learn_field(beams, Recipe(0.05))))
     estimator = prepare_factory(options)(ScannerGeometry(keys.angles, keys.mount, keys.range_max))
     observations = [

@@ -31,8 +31,9 @@ from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.precise.learning.drive_learning import MIN_SCANS, LearningResult, learn_drive, replay_model
 from services.estimator.precise.learning.field_learning import Recipe
+from services.estimator.precise.learning.map_alignment import with_offset
 from services.estimator.precise.learning.surfaces import Beams
-from services.estimator.shared.generative_models import RayCaster
+from services.estimator.shared.generative_models import GenerativeModel, RayCaster
 from services.estimator.shared.model_folder import training_folder
 
 MIN_SCANS_OF_MAP, SCANS_PER_M2 = 500, 4  # scans simulated in a map: about 100 beams then meet each of its cells
@@ -85,7 +86,8 @@ def train_on_drive(options: TrainDriveOptions, drive: ReferenceDrive, console: C
         if options.former is not None:
             simulated = replayed_beams(options.former, drive, options.samples, options.recipe.seed)
         elif options.world and options.samples:
-            simulated = simulated_beams(world, drive, options.samples, options.recipe.seed)
+            model = with_offset(RayCaster(world), drive)
+            simulated = simulated_beams(world, model, drive, options.samples, options.recipe.seed)
         learned = learn_drive(drive, options.recipe, simulated, report, replayed=options.former is not None)
     card = card_of(options, world, drive, learned, time.monotonic() - start)
     weights.save(path, learned.model, learned.places, card)
@@ -166,11 +168,11 @@ def enough_scans(world: World) -> int:
     return max(MIN_SCANS_OF_MAP, round(SCANS_PER_M2 * world.free_area))
 
 
-def simulated_beams(world: World, drive: ReferenceDrive, samples: int, seed: int) -> Beams:
-    """Simulated scans of the drive's scanner at random free poses in a map, without noise."""
+def simulated_beams(world: World, model: GenerativeModel, drive: ReferenceDrive, samples: int, seed: int) -> Beams:
+    """Scans of the drive's scanner at random free poses in a map, as its ``model`` predicts them, without noise."""
     rng = np.random.default_rng(seed)
     poses = world.sample_poses(samples, rng, Robot().radius)
-    ranges = RayCaster(world).expect(se2.compose(poses, drive.mount), drive.angles).ranges
+    ranges = model.expect(se2.compose(poses, drive.mount), drive.angles).ranges
     return Beams.of(poses, drive.mount, drive.angles, np.where(ranges > drive.range_max, np.inf, ranges))
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common.geometry import se2
-from services.estimator.precise.gauss_newton import COARSE_SIGMA_M, GaussNewton, Optimiser, Prior, View, moved_back
+from services.estimator.precise.gauss_newton import COARSE_SIGMA_M, GaussNewton, Optimiser, Prior, View
 from services.estimator.precise.hypotheses import (
     FIRST_SURROUNDINGS,
     NEXT_SURROUNDINGS,
@@ -204,7 +204,7 @@ class PreciseEstimator:
     def predict(self, poses: Array, angles: Array) -> Predicted:
         """Predicts scans (see PoseEstimator); sigma combines the scanner's noise and the error the model states."""
         expected = self.model.expect(se2.compose(poses, self.mount), angles)
-        return self._predicted(moved_back(expected, self._precision.offset))
+        return self._predicted(expected.moved_back(self._precision.offset))
 
     def _view(self, observation: Observation) -> View:
         """The scan with the noise and the map's errors as learned so far, corrected for motion and thinned."""

@@ -157,7 +157,7 @@ class View:
 
     def expect(self, lasers: Array) -> Expected:
         """The scans that the model predicts at laser poses (N, 3), with its surfaces moved back by the map's offset."""
-        return moved_back(self.model.expect(lasers, self.angles), self.map_offset)
+        return self.model.expect(lasers, self.angles).moved_back(self.map_offset)
 
     def _with_map_error(self, expected: Expected) -> Expected:
         """Adds the map's error, which is perpendicular to a surface and so larger along beams that graze it."""
@@ -257,13 +257,6 @@ class View:
             (Tt @ at_laser.xi[..., None])[..., 0],
             *(Tt @ matrix @ T for matrix in matrices),
         )
-
-
-def moved_back(expected: Expected, offset: float) -> Expected:
-    """The expected scans if all surfaces were ``offset`` m farther back, perpendicular to themselves."""
-    if not offset:
-        return expected
-    return replace(expected, ranges=expected.ranges + offset * expected.slope)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -30,6 +30,10 @@ class Expected:
     def slope(self) -> Array:
         """Derivative (N, B) of the ranges by the distance to the surface: 1 / cosine of the angle of incidence."""
         return np.asarray(np.hypot(self.jacobian[..., 0], self.jacobian[..., 1]))
+
+    def moved_back(self, offset: float) -> Expected:
+        """Returns the scans if all surfaces were ``offset`` m farther back, perpendicular to themselves."""
+        return replace(self, ranges=self.ranges + offset * self.slope) if offset else self
 
     def part(self, rows: slice) -> Expected:
         """Returns the scans at some of the poses."""
@@ -69,6 +73,7 @@ class RayCaster:
 
     world: World
     ripple: float = 0.0
+    offset: float = 0.0  # m, distance of the real surfaces behind those of the world, as in a map of cells
 
     def expect(self, lasers: Array, angles: Array) -> Expected:
         """Predicts scans; see GenerativeModel."""
@@ -84,7 +89,7 @@ class RayCaster:
             hits = np.isfinite(further)
             derivatives[hits, 2] *= ranges[inside][hits] / np.maximum(further[hits], PASSED_M)
             jacobian[inside] = derivatives
-        return Expected(ranges, np.full(ranges.shape, EXACT_SCALE_M), jacobian)
+        return Expected(ranges, np.full(ranges.shape, EXACT_SCALE_M), jacobian).moved_back(self.offset)
 
     def expect_behind(self, lasers: Array, angles: Array, ranges: Array) -> Array:
         """Ranges to the next surface; see GenerativeModel."""

@@ -28,7 +28,7 @@ from services.estimator.precise.learning.field_learning import (
     seed_places,
     seen_cells,
 )
-from services.estimator.precise.learning.map_alignment import align_to_map
+from services.estimator.precise.learning.map_alignment import align_to_map, with_offset
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.noise import estimate_noise, robust_excess
@@ -68,6 +68,7 @@ def learn_version(
     """
     tracked = remove_moving_objects(keys)
     sigma = estimate_noise(tracked.ranges, tracked.angles)
+    original, present = (with_offset(model, tracked) for model in (original, present))
     error = _estimate_map_error(original, tracked, sigma)
     replayed = replay_model(original, places, tracked, min(len(places), MAX_REPLAYED_SCANS), recipe.seed)
     overlapping, elsewhere = _split_replayed_beams(replayed, tracked, error, recipe.seed)

@@ -24,6 +24,7 @@ STEPS = 5  # of Gauss-Newton
 EDGE_M = 0.005  # standard deviation of a surface's distance from the edge of its cell
 MISSING_SHARE = 0.1  # share of the surfaces that the grid does not have
 CELL_M, MAX_ELEMENTS = 0.05, 3000  # size and maximum number of the surface elements that are compared with the grid
+OFFSET_SCANS = 500  # maximum number of scans from which the distance of the surfaces from the grid's is learned
 FIRST_STEP_M, LAST_STEP_M = 0.008, 0.0005  # of the compass search
 
 
@@ -51,6 +52,21 @@ def align_to_map(original: GenerativeModel, keys: ReferenceDrive) -> ReferenceDr
     if isinstance(original, RayCaster) and original.world.grid is not None:
         keys = replace(keys, poses=move_into_cells(original.world, keys))
     return keys
+
+
+def with_offset(model: GenerativeModel, keys: ReferenceDrive) -> GenerativeModel:
+    """The model, if it is of a grid with its surfaces moved back to where the key scans measured them.
+
+    Its rays end at the front of the occupied cells, but the real surfaces are somewhere inside them.
+    """
+    if not isinstance(model, RayCaster) or model.world.grid is None:
+        return model
+    keys = keys.part(np.arange(0, len(keys.poses), 1 + len(keys.poses) // OFFSET_SCANS))
+    expected = model.expect(se2.compose(keys.poses, keys.mount), keys.angles)
+    with np.errstate(invalid="ignore"):
+        behind = (keys.ranges - expected.ranges) / expected.slope
+        used = np.abs(behind) < MAX_ERROR_M
+    return replace(model, offset=float(np.median(behind[used]))) if used.any() else model
 
 
 def move_into_cells(world: World, keys: ReferenceDrive) -> Array:
