@@ -67,6 +67,8 @@ def drive_and_learn(rough: World, scene: Scene, path: Array) -> tuple[dict[str, 
         if pending is None and (drive := keys.take_drive()) is not None:
             begin, since = time.process_time(), stamp
             pending = learn_version(original, places, estimator.model, drive)
+            if pending is not None:
+                keys.correct_poses(drive.stamps, pending.key_poses)
             versions.append({
                 "at_s": stamp,
                 "key_scans": len(drive.poses),

@@ -10,6 +10,8 @@ from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from common.processes import end_with_parent
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.key_scans import KeyScanCollector
@@ -45,19 +47,25 @@ class Learner:
         self._process: BaseProcess | None = None
         self._closed = False
         self._running: Future[EncodedVersion | None] | None = None
+        self._stamps = np.zeros(0)  # (N,) of the key scans from which a version is being learned
 
     def add(self, posterior: Posterior, observation: Observation, present: GenerativeModel) -> None:
         """Adds a scan, and starts learning if enough key scans are new; ``present`` is the model in use."""
         self.keys.add(posterior, observation)
         if self._running is None and (drive := self.keys.take_drive()) is not None:
-            self._running = self._pool.submit(self._learn, present, drive)
+            self._stamps, self._running = drive.stamps, self._pool.submit(self._learn, present, drive)
 
     def take(self) -> EncodedVersion | None:
-        """Returns the version that was learned since the last call, or None; raises RuntimeError if learning failed."""
+        """Returns the version that was learned since the last call, or None; raises RuntimeError if learning failed.
+
+        The next version starts with the poses at which the key scans agree best in this one.
+        """
         if self._running is None or not self._running.done():
             return None
         done, self._running = self._running, None
-        return done.result()
+        if (learned := done.result()) is not None:
+            self.keys.correct_poses(self._stamps, learned.version.key_poses)
+        return learned
 
     def close(self) -> None:
         """Terminates the learning process."""

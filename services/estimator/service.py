@@ -221,7 +221,7 @@ class EstimatorService(Service):
         self.log.info(
             "learned",
             version=self.field_version,
-            key_scans=learned.version.key_scans,
+            key_scans=len(learned.version.key_poses),
             range_error_mm=round(mean_error(learned.version.errors) * 1e3, 2),
             before_mm=round(mean_error(learned.version.present_errors) * 1e3, 2),
         )

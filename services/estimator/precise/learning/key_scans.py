@@ -7,7 +7,7 @@ still tracked after driving another `VERIFIED_AFTER_M`. A pose that turns out to
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -117,6 +117,12 @@ class KeyScanCollector:
             self.mount,
             self.range_max,
         )
+
+    def correct_poses(self, stamps: Array, poses: Array) -> None:
+        """Replaces the poses of the key scans with some ``stamps`` (N,) by those (N, 3) found in learning."""
+        corrected = dict(zip(stamps.tolist(), poses, strict=True))
+        for cell, key in self.verified.items():
+            self.verified[cell] = replace(key, pose=corrected.get(key.stamp, key.pose))
 
     def _in_order(self) -> list[KeyScan]:
         return sorted(self.verified.values(), key=lambda key: key.stamp)

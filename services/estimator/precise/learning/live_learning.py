@@ -54,7 +54,7 @@ class ModelVersion:
 
     model: FieldModel
     seeds: Seeds
-    key_scans: int  # from which it was learned
+    key_poses: Array  # (N, 3) poses in map at which the key scans agree best
     errors: Array  # (K,) m, of the ranges of held-out key scans
     present_errors: Array  # (L,) m, the same with the model that was in use
 
@@ -92,7 +92,7 @@ def learn_version(
     starts = seed_places(final.field, np.concatenate([visited, free_places(final, places)]), final.seen)
     starts, scales = (values.astype(np.float32).astype(np.float64) for values in (starts, scales))  # as published
     model = replace(final, field=final.field.with_solids(starts), scales=scales, ripple=ripple)
-    return ModelVersion(model, Seeds.at(model, starts), len(keys.poses), errors, present_errors)
+    return ModelVersion(model, Seeds.at(model, starts), aligned.poses, errors, present_errors)
 
 
 def remove_moving_objects(keys: ReferenceDrive) -> ReferenceDrive:

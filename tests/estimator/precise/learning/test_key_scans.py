@@ -53,6 +53,18 @@ def test_verified_after_driving_on():
     assert drive.keys.dropped_total == 0
 
 
+def test_corrected_poses():
+    """The poses found in learning replace those of the same scans only, also where newer scans came since."""
+    drive = Drive().go(8.0)
+    before = {key.stamp: key.pose for key in drive.keys.verified.values()}
+    drive.go(3.0)
+    drive.keys.correct_poses(np.array(list(before)), np.array(list(before.values())) + np.array([0.01, 0.0, 0.0]))
+    for key in drive.keys.verified.values():
+        x = before[key.stamp][0] + 0.01 if key.stamp in before else round(key.pose[0], 2)
+        assert key.pose[0] == pytest.approx(x)
+    assert len(drive.keys) > len(before)
+
+
 @pytest.mark.parametrize("changes", [{"state": "ambiguous"}, {"protection": None}, {"protection": (0.02, 0.3, 0.01)}])
 def test_untrusted_poses(changes):
     drive = Drive().go(8, **changes)

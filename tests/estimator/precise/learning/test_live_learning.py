@@ -86,7 +86,7 @@ def test_moved_cupboard(original, version):
     assert after < 1.3 * error(model, BEFORE, *WEST) + 0.001
     before, after = (error(each, AFTER, *EAST) for each in (model, version.model))
     assert after < before + 0.0015
-    assert version.key_scans == 80
+    assert len(version.key_poses) == 80
     assert mean_error(version.errors) < mean_error(version.present_errors)
     west = drive(AFTER, *WEST, 1).poses
     assert np.hypot(*(version.seeds.places - west[0, :2]).T).min() < 0.4
@@ -99,6 +99,7 @@ def test_poses_of_a_rough_map(original):
     rough = RayCaster(grid_of("rough", replace(others, poses=others.poses + off[0])))
     version = learn_version(rough, original[1], rough, replace(scans, poses=scans.poses + off[1]), RECIPE)
     assert error(version.model, BEFORE, *WEST) < 0.003
+    assert np.abs(version.key_poses - scans.poses)[:, :2].mean() < 0.2 * np.abs(off[1, :, :2]).mean()
 
 
 def test_rooms_of_a_grid_that_were_not_entered(original):
