@@ -83,7 +83,7 @@ def map_command(options: MapOptions, console: Console, progress: Console) -> Pat
     if options.models is not None:
         # In the rough map, for the model where the drive saw nothing
         samples = 0 if rough is None else enough_scans(rough)
-        training = TrainDriveOptions(options.log, str(path), options.models, samples, former=former)
+        training = TrainDriveOptions(options.log, str(path), options.models, samples, rough=rough, former=former)
         train_on_drive(training, drive, console)
     return path
 

@@ -51,7 +51,8 @@ class TrainDriveOptions:
     recipe: Recipe = Recipe(resolution=0.05)  # noqa: RUF009 - frozen
     share: float = 1.0  # of the drive to use, from its beginning
     reading: Reading | None = None  # properties of the log that the file does not state
-    former: Path | None = None  # weights of a former model, which simulates the scans in place of the map
+    rough: World | None = None  # a map in which the scans are simulated instead
+    former: Path | None = None  # weights of a former model, which simulates the scans in place of any map
 
 
 def train_from_drive(options: TrainDriveOptions, console: Console) -> Path:
@@ -86,8 +87,9 @@ def train_on_drive(options: TrainDriveOptions, drive: ReferenceDrive, console: C
         if options.former is not None:
             simulated = replayed_beams(options.former, drive, options.samples, options.recipe.seed)
         elif options.world and options.samples:
-            model = with_offset(RayCaster(world), drive)
-            simulated = simulated_beams(world, model, drive, options.samples, options.recipe.seed)
+            simulated_in = options.rough or world
+            model = with_offset(RayCaster(simulated_in), drive)
+            simulated = simulated_beams(simulated_in, model, drive, options.samples, options.recipe.seed)
         learned = learn_drive(drive, options.recipe, simulated, report, replayed=options.former is not None)
     card = card_of(options, world, drive, learned, time.monotonic() - start)
     weights.save(path, learned.model, learned.places, card)

@@ -21,7 +21,12 @@ PEAK_DISTANCE_M, PEAK_TURN = 0.5, 0.15  # between them
 def correlative_search(
     target: Elements, moved: Elements, around: Array, window: Array, turn_step: float = TURN_STEP
 ) -> Array:
-    """The best poses (K, 3) of ``moved`` in the frame of ``target``, at most ``window`` (3,) from ``around`` (3,)."""
+    """The best poses (K, 3) of ``moved`` in the frame of ``target``, at most ``window`` (3,) from ``around`` (3,).
+
+    There are none if nothing was moved.
+    """
+    if not len(moved):
+        return np.zeros((0, 3))
     window = np.minimum(window, [np.inf, np.inf, np.pi])
     sample = moved.part(np.linspace(0, len(moved) - 1, min(len(moved), MAX_ELEMENTS)).astype(int))
     reach = np.hypot(*sample.points.T).max() + np.hypot(*window[:2])

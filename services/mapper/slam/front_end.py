@@ -147,6 +147,8 @@ class FrontEnd:
         self.stamps.append(stamp)
         if len(self.stamps) == 1:
             return self._begin_piece(np.zeros(3), scan)
+        if self._odom is None and len(self._local.elements) < MIN_PARTNERS <= len(scan.elements):
+            return self._begin_piece(self.poses[-1], scan)  # so far there was nothing that a scan could match
         prior, covariance = self._prior(motion, deviation)
         self._since_key = self._since_key + PRIOR_SCALE**2 * covariance
         found = self._register(scan, prior, period)

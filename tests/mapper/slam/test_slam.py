@@ -12,6 +12,7 @@ from common.geometry import se2
 from common.geometry.world import load_world
 from lab.accuracy.motion_distortion import observations
 from lab.accuracy.scenes import TWIN_OFFSET, TWINS, Scene
+from services.mapper.slam.correlative_search import correlative_search
 from services.mapper.slam.drive import Laser, RawDrive
 from services.mapper.slam.front_end import NO_PIECE, track_drive
 from services.mapper.slam.pose_graph import ANCHOR, LinkTable, PoseLink, Uncertainty, optimise
@@ -114,6 +115,25 @@ def test_pausing_odometry_is_no_kidnapping(pause):
     drive = driven(load_world("corridor"), truth)
     tracked = track_drive(replace(drive, odom=odom, stamps=3.2 * drive.stamps))
     assert (tracked.pieces != NO_PIECE).all()
+
+
+@pytest.mark.parametrize("odometry", [False, True])
+def test_empty_scans(odometry):
+    """A driver that is just starting may send scans without any return."""
+    world = load_world("office")
+    truth = Scene.of(world, 300, 5).path(4)
+    drive = driven(world, truth)
+    drive.ranges[:3] = np.inf
+    built = build_trajectory(replace(drive, odom=truth if odometry else None))
+    known = np.isfinite(built.poses).all(axis=1)
+    assert known[3:].all()
+    error = se2.between(built.poses[-1], built.poses[3]) - se2.between(truth[-1], truth[3])
+    assert np.hypot(*error[:2]) < 0.02
+
+
+def test_search_for_nothing():
+    seen = track_drive(driven(load_world("office"), np.array([[3.0, 1.5, 0.0]]))).key_scans.elements[0]
+    assert not len(correlative_search(seen, seen.part(np.zeros(0, int)), np.zeros(3), np.ones(3)))
 
 
 def test_look_alike_rooms_stay_apart():

@@ -142,6 +142,8 @@ def remove_contradicted(measured: Beams, replayed: Beams, h: float) -> Beams:
     A beam is contradicted if it ends at a surface that is gone, or passes through a new one: from either side, or from
     inside it.
     """
+    if not len(replayed.ranges):
+        return replayed
     cells = SurfaceCells.of(replayed, h)
     gone = cells.at(cells.contradicted_by(measured), replayed.ends())
     present = field_of_surfaces(measured, h)

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 RECIPE = Recipe(resolution=0.05, sweeps=6, beams_per_sweep=500_000)
 MAX_REPLAYED_SCANS = 2000  # predicted by the original model; at most one for each place
 PRECISE_M = 1e-3  # error of an original model whose replayed scans count as much as measured ones
-LASTING_S, LASTING_CELL_M = 3.0, 0.1  # a surface is learned if beams end near a cell of it this long after the first
+LASTING_S, LASTING_CELL_M = 3.0, 0.1  # a surface is learned if beams end in or beside its cell this long apart
 EPOCHS = 4  # parts of the key scans, of which each may contradict those before it
 ALIGNMENTS = 3  # times that the key scans are matched to the field learned from them
 ALIGNMENT_SCHEDULE_M = (0.02, 0.0, 0.0)  # added to the deviation of every beam, step by step

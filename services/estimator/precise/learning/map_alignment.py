@@ -55,9 +55,9 @@ def align_to_map(original: GenerativeModel, keys: ReferenceDrive) -> ReferenceDr
 
 
 def with_offset(model: GenerativeModel, keys: ReferenceDrive) -> GenerativeModel:
-    """The model, if it is of a grid with its surfaces moved back to where the key scans measured them.
+    """Returns the model; that of a grid with its surfaces moved back to where the key scans measured them.
 
-    Its rays end at the front of the occupied cells, but the real surfaces are somewhere inside them.
+    A grid's rays end at the front of its occupied cells, but the real surfaces are somewhere inside them.
     """
     if not isinstance(model, RayCaster) or model.world.grid is None:
         return model
