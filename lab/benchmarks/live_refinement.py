@@ -18,10 +18,9 @@ from common.geometry.se2 import Array
 from common.geometry.world import World
 from lab.accuracy.scenes import Scene
 from lab.benchmarks.mapping import fitted
-from lab.benchmarks.refinement import drive_for
-from lab.benchmarks.visits import PERIOD_S, office_building
+from lab.benchmarks.refinement import DRIVE_SEED, ROUGH_SEED, TEST_SECONDS, TEST_SEED, drive_for
+from lab.benchmarks.visits import PERIOD_S, building_of
 from lab.experiments.results import markdown, millimetres
-from lab.integrity.buildings import Building, make_building
 from lab.integrity.cases import BEAMS, START_DEVIATION
 from lab.integrity.maps import noisy_grid
 from presage.terminal.output import check_file, provenance, write_json
@@ -32,8 +31,6 @@ from services.estimator.precise.learning.key_scans import KeyScanCollector
 from services.estimator.precise.learning.live_learning import ModelVersion, learn_version
 
 DELAY_S = 15.0  # of the drive, in which a version is learned
-TEST_SECONDS = 40.0
-ROUGH_SEED, DRIVE_SEED, TEST_SEED = 5, 6, 7  # parts of the random seeds: of the rough map, the drive and the test
 
 
 def start_estimator(rough: World, scene: Scene, start: Array) -> PreciseEstimator:
@@ -118,7 +115,7 @@ def errors_of_test_drive(rough: World, scene: Scene, path: Array, version: Model
 
 def refine(name: str, seed: int, seconds: float) -> dict[str, Any]:
     """Results in one world."""
-    building: Building = office_building() if name == "office" else make_building(int(name))
+    building = building_of(name)
     world = building.world
     rough = noisy_grid(Scene.of(world, BEAMS, [seed, ROUGH_SEED]))
     scene = Scene.of(world, BEAMS, [seed, DRIVE_SEED])

@@ -18,10 +18,10 @@ from common.geometry.se2 import Array
 from common.geometry.world import World, load_world
 from lab.accuracy.scenes import Scene
 from lab.benchmarks.mapping import alignment
-from lab.benchmarks.visits import PERIOD_S, drive_through_rooms, office_building, write_drive_log
+from lab.benchmarks.visits import PERIOD_S, building_of, drive_through_rooms, write_drive_log
 from lab.experiments.results import markdown, millimetres, number
 from lab.experiments.trials import run_trials
-from lab.integrity.buildings import Building, make_building
+from lab.integrity.buildings import Building
 from lab.integrity.cases import BEAMS, START_DEVIATION
 from lab.integrity.maps import noisy_grid
 from presage.learning.map_of_log import MapOptions, map_command
@@ -70,8 +70,8 @@ def bench_refinement(
 
 def refine_and_test(job: RefinementJob) -> dict[str, Any]:
     """Errors of another drive and of the walls: in each rough map, in what a drive makes of it, and with true poses."""
-    building = office_building() if job.world == "office" else make_building(int(job.world))
-    world, roughs = _world_and_rough_maps(job)
+    building = building_of(job.world)
+    world, roughs = _world_and_rough_maps(job, building)
     out = Path(job.out) / job.world
     shutil.rmtree(out, ignore_errors=True)  # of an interrupted run
     out.mkdir()
@@ -168,12 +168,11 @@ def wall_errors(model: GenerativeModel, poses: Array, scene: Scene, frame: Array
     return np.abs(scene.world.surface_distance(se2.transform(frame, ends)))
 
 
-def _world_and_rough_maps(job: RefinementJob) -> tuple[World, dict[str, World | None]]:
+def _world_and_rough_maps(job: RefinementJob, building: Building) -> tuple[World, dict[str, World | None]]:
     """The world of a job, and the maps with which its drive begins."""
-    building = None if job.world == "office" else make_building(int(job.world))
-    world = load_world("office") if building is None else building.world
+    world = load_world("office") if job.world == "office" else building.world
     roughs: dict[str, World | None] = {GRID: noisy_grid(Scene.of(world, BEAMS, [job.seed, ROUGH_SEED]))}
-    if building is not None:
+    if job.world != "office":
         boundary, walls = list(building.boundary), list(building.walls)
         roughs[PLAN] = World(name=f"{building.name}-plan", boundary=boundary, obstacles=walls)
     return world, {**roughs, NOTHING: None}

@@ -104,7 +104,7 @@ def run_visits(job: VisitsJob) -> dict[str, Any]:
     shutil.rmtree(out, ignore_errors=True)  # of an interrupted run
     out.mkdir()
     rng = np.random.default_rng([job.seed, 40])
-    building = office_building() if job.world == "office" else make_building(int(job.world))
+    building = building_of(job.world)
     rooms = [room for room in building.rooms if room.door is not None]
     changing = [rooms[k] for k in rng.permutation(len(rooms))[: (len(rooms) + 1) // 2]]
     rows = []
@@ -235,6 +235,11 @@ def _learn_present_world(scene: Scene) -> FieldModel:
     poses, mount, angles = scene.poses(PRESENT_SCANS), np.array(scene.scanner.mount), scene.scanner.angles()
     ranges = np.array([scene.observe(clean, 0.0).ranges for clean in scene.clean(poses)])
     return FieldModel(learn_field(Beams.of(poses, mount, angles, ranges), Recipe(0.05)))
+
+
+def building_of(name: str) -> Building:
+    """The building of `office`, or of the seed in ``name``."""
+    return office_building() if name == "office" else make_building(int(name))
 
 
 def office_building() -> Building:

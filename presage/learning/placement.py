@@ -87,7 +87,7 @@ def _localise(world: World, keys: ReferenceDrive, model: Path | None) -> tuple[A
     if model is not None:
         options = EstimatorOptions(world, model=str(model))
     else:  # a learned field, because the cells of oblique walls are staircases, which would bias the headings
-        beams = simulated_beams(world, RayCaster(world), keys, enough_scans(world), seed=0)
+        beams = simulated_beams(RayCaster(world), keys, enough_scans(world), seed=0)
         options = EstimatorOptions(world, generative_model=FieldModel(learn_field(beams, Recipe(0.05))))
     estimator = prepare_factory(options)(ScannerGeometry(keys.angles, keys.mount, keys.range_max))
     observations = [

@@ -33,7 +33,7 @@ from services.estimator.precise.learning.drive_learning import MIN_SCANS, Learni
 from services.estimator.precise.learning.field_learning import Recipe
 from services.estimator.precise.learning.map_alignment import with_offset
 from services.estimator.precise.learning.surfaces import Beams
-from services.estimator.shared.generative_models import GenerativeModel, RayCaster
+from services.estimator.shared.generative_models import RayCaster
 from services.estimator.shared.model_folder import training_folder
 
 MIN_SCANS_OF_MAP, SCANS_PER_M2 = 500, 4  # scans simulated in a map: about 100 beams then meet each of its cells
@@ -51,8 +51,8 @@ class TrainDriveOptions:
     recipe: Recipe = Recipe(resolution=0.05)  # noqa: RUF009 - frozen
     share: float = 1.0  # of the drive to use, from its beginning
     reading: Reading | None = None  # properties of the log that the file does not state
-    rough: World | None = None  # a map in which the scans are simulated instead
-    former: Path | None = None  # weights of a former model, which simulates the scans in place of any map
+    rough: World | None = None  # the map that the drive refines: scans are simulated in it instead of in `world`
+    former: Path | None = None  # weights of its former model, which simulates the scans instead of both
 
 
 def train_from_drive(options: TrainDriveOptions, console: Console) -> Path:
@@ -87,9 +87,8 @@ def train_on_drive(options: TrainDriveOptions, drive: ReferenceDrive, console: C
         if options.former is not None:
             simulated = replayed_beams(options.former, drive, options.samples, options.recipe.seed)
         elif options.world and options.samples:
-            simulated_in = options.rough or world
-            model = with_offset(RayCaster(simulated_in), drive)
-            simulated = simulated_beams(simulated_in, model, drive, options.samples, options.recipe.seed)
+            model = with_offset(RayCaster(options.rough or world), drive)
+            simulated = simulated_beams(model, drive, options.samples, options.recipe.seed)
         learned = learn_drive(drive, options.recipe, simulated, report, replayed=options.former is not None)
     card = card_of(options, world, drive, learned, time.monotonic() - start)
     weights.save(path, learned.model, learned.places, card)
@@ -170,10 +169,10 @@ def enough_scans(world: World) -> int:
     return max(MIN_SCANS_OF_MAP, round(SCANS_PER_M2 * world.free_area))
 
 
-def simulated_beams(world: World, model: GenerativeModel, drive: ReferenceDrive, samples: int, seed: int) -> Beams:
-    """Scans of the drive's scanner at random free poses in a map, as its ``model`` predicts them, without noise."""
+def simulated_beams(model: RayCaster, drive: ReferenceDrive, samples: int, seed: int) -> Beams:
+    """Scans of the drive's scanner at random free poses in the model's world, without noise."""
     rng = np.random.default_rng(seed)
-    poses = world.sample_poses(samples, rng, Robot().radius)
+    poses = model.world.sample_poses(samples, rng, Robot().radius)
     ranges = model.expect(se2.compose(poses, drive.mount), drive.angles).ranges
     return Beams.of(poses, drive.mount, drive.angles, np.where(ranges > drive.range_max, np.inf, ranges))
 

@@ -23,7 +23,7 @@ def correlative_search(
 ) -> Array:
     """The best poses (K, 3) of ``moved`` in the frame of ``target``, at most ``window`` (3,) from ``around`` (3,).
 
-    There are none if nothing was moved.
+    There are none if ``moved`` is empty.
     """
     if not len(moved):
         return np.zeros((0, 3))

@@ -219,8 +219,7 @@ class FrontEnd:
         last = self.poses[-1]
         starts = [last if self._velocity is None else se2.compose(last, self._velocity * period)]
         near = elements.part(np.hypot(*elements.points.T) < SEARCH_RANGE_M)
-        if len(near):
-            starts += list(correlative_search(surface.elements, near, prior.mean, SEARCH_WINDOW))
+        starts += list(correlative_search(surface.elements, near, prior.mean, SEARCH_WINDOW))
         others = [register(surface, elements, start, prior) for start in starts]
         matches = [each for each in (found, *others) if each is not None]
         best = min(matches, key=lambda each: each.cost, default=None)

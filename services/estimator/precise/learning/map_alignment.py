@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from scipy.special import ndtr
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from common.geometry.world import World
     from services.estimator.precise.learning.calibration import ReferenceDrive
     from services.estimator.shared.generative_models import GenerativeModel
+
+Model = TypeVar("Model", bound="GenerativeModel")
 
 STEPS = 5  # of Gauss-Newton
 # The following are for maps that are grids.
@@ -54,7 +56,7 @@ def align_to_map(original: GenerativeModel, keys: ReferenceDrive) -> ReferenceDr
     return keys
 
 
-def with_offset(model: GenerativeModel, keys: ReferenceDrive) -> GenerativeModel:
+def with_offset(model: Model, keys: ReferenceDrive) -> Model:
     """Returns the model; that of a grid with its surfaces moved back to where the key scans measured them.
 
     A grid's rays end at the front of its occupied cells, but the real surfaces are somewhere inside them.
