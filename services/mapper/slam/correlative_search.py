@@ -58,6 +58,7 @@ def _peaks(scores: npt.NDArray[np.int32], turns: Array, around: Array, count: np
 
 
 def _sector(normals: Array) -> npt.NDArray[np.int64]:
+    """The sector of directions (K,) in which each of the normals (K, 2) lies."""
     angle = np.arctan2(normals[:, 1], normals[:, 0])
     return np.asarray(np.floor(angle / (2 * np.pi) * SECTORS).astype(np.int64) % SECTORS)
 

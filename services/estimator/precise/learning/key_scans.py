@@ -119,7 +119,7 @@ class KeyScanCollector:
         )
 
     def correct_poses(self, stamps: Array, poses: Array) -> None:
-        """Replaces the poses of the key scans with some ``stamps`` (N,) by those (N, 3) found in learning."""
+        """Gives the key scans taken at ``stamps`` (N,) the ``poses`` (N, 3) found in learning; some may be gone."""
         corrected = dict(zip(stamps.tolist(), poses, strict=True))
         for cell, key in self.verified.items():
             self.verified[cell] = replace(key, pose=corrected.get(key.stamp, key.pose))
