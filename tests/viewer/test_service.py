@@ -348,7 +348,7 @@ def test_answer_that_does_not_come(viewer, bus):
     bus.declare_alive("simulator")
     bus.serve(PAUSE, Inbox())  # receives the query but never answers
     with Page(where) as page:
-        page.wait_for("services", lambda m: "simulator" not in m["missing"])
+        page.wait_for("services", lambda m: "simulator" not in [each["name"] for each in m["missing"]])
         answer = page.request("pause")
         assert not answer["ok"]
         assert "no service answers" in answer["reason"]
