@@ -376,7 +376,8 @@ class PreciseEstimator:
     def _find_alternatives(self, view: View, best: Mode, candidates: list[MotionCandidate]) -> list[Mode]:
         """Other hypotheses within the motion prior that fit the scan, if it made the ``best`` one far more certain.
 
-        The pose was uncertain before this scan, and a descent from one pose finds only the nearest match.
+        The pose was uncertain before this scan, and a descent from one pose finds only the nearest match. Less probable
+        motions than that to the best one are evidence against them; none is evidence for them.
         """
         before = self.modes[0]
         doubt = 1 - self._probability_of_being_near(before)
@@ -386,7 +387,7 @@ class PreciseEstimator:
         motion = candidates[0]
         found = search_near(view, motion.mean, motion.covariance, self.seeds, self.settings, self._rng)
         at_best = before.log_evidence + _prior_of([motion]).energy(best.pose[None])[0]
-        return [replace(mode, log_evidence=at_best + mode.log_evidence) for mode in found]
+        return [replace(mode, log_evidence=min(before.log_evidence, at_best + mode.log_evidence)) for mode in found]
 
     def _weigh_hypotheses(self, view: View, modes: list[Mode], local: Array | None, period: float) -> None:
         """Weighs hypotheses by how well the map predicts those surfaces of the scan that were not seen before.
@@ -521,6 +522,7 @@ class PreciseEstimator:
 
     def _search_everywhere(self, view: View) -> list[Mode]:
         """The hypotheses in the whole map at which the scan is more probable than at an unknown place; at least one."""
+        view = replace(view, map_error=max(view.map_error, self._precision.map_error_elsewhere))
         found = search_everywhere(view, self.seeds, self.settings)
         log_unmapped = _log_reference(view, view.surfaces.small) + _log_unmapped(view, view.surfaces.small)
         return [mode for mode in found if mode.present > log_unmapped + 1] or found[:1]

@@ -35,6 +35,7 @@ SEGMENT_LENGTH_M = 0.5
 MAX_MAP_ERROR_M = 0.1
 MIN_LEARNING_BEAMS, MIN_LEARNING_FRACTION = 30, 0.3  # of a scan's beams; nothing is learned from fewer
 DAMPING = 1e-9  # in m; keeps the inverse finite where a direction is not observed
+ROOM_KEY_SCANS = 20  # in a room (a guess); in the next room, surfaces may have another mean place in their cells
 
 
 @dataclass
@@ -44,7 +45,7 @@ class Precision:
     noise_factor: float = 1.0  # standard deviation of the scanner's noise, relative to the configured one
     changed_fraction: float = 0.25  # fraction of the beams that hit no surface of the map
     cell: float = 0.0  # m, edge of the cells if the map is a grid
-    offset: float = 0.0  # m, mean distance of the real surfaces behind the front of the cells
+    offset: float = 0.0  # m, mean distance of the real surfaces behind the front of the cells, where the robot is
     offset_variance: float = 0.0  # m²
     covariance: float = 0.0  # m², of the map's errors at two beams on the same segment of a surface
     model_variance: float = 0.0  # m², mean variance of the map's errors as the model states it
@@ -65,6 +66,11 @@ class Precision:
     def map_error(self) -> float:
         """Standard deviation in m of the map's error beyond what the model states."""
         return float(np.sqrt(max(0.0, self.covariance - self.model_variance)))
+
+    @property
+    def map_error_elsewhere(self) -> float:
+        """The same in another room, where surfaces may have another mean place in their cells."""
+        return float(np.hypot(self.map_error, self.cell / np.sqrt(12)))
 
     @property
     def correlated_fraction(self) -> float:
@@ -144,6 +150,7 @@ class Precision:
         correlated_part = excess * CORRELATION_LENGTH_M
         independent_part = float(np.average(expected_variance, weights=lengths) * lengths.mean())
         variance = (correlated_part + independent_part) * float(inverse[3, 3])
+        self.offset_variance += self.cell**2 / 12 / ROOM_KEY_SCANS
         gain = self.offset_variance / (self.offset_variance + variance)
         self.offset = float(np.clip(self.offset + gain * fitted[3], 0.0, self.cell))
         self.offset_variance *= 1 - gain

@@ -58,6 +58,30 @@ def test_error_of_the_map(noise, seed):
     assert learned(WrongMap(ROOM), noise, seed) == pytest.approx(WrongMap.ERROR, rel=0.2)
 
 
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=5)
+def test_place_in_the_cells_of_another_room(seed):
+    """After a long drive where surfaces are 15 mm behind the front of their cells, they are 5 mm behind it."""
+    cell = 0.05
+    rng, precision = np.random.default_rng(seed), Precision.before_first_scan(cell)
+
+    def drive(offset, count):
+        for pose in ROOM.sample_poses(count, rng, 0.3):
+            seen = RayCaster(ROOM).expect(se2.compose(pose, MOUNT)[None], ANGLES)
+            ranges = seen.ranges[0] + offset * seen.slope[0] + 0.02 * rng.standard_normal(len(ANGLES))
+            view = View(
+                RayCaster(ROOM), Likelihood(sigma=0.02), MOUNT, ANGLES, ranges, 25.0,
+                map_error=precision.map_error, map_offset=precision.offset,
+            )  # fmt: skip
+            precision.learn_map_error(view, pose)
+
+    drive(0.015, 30)
+    assert precision.offset == pytest.approx(0.015, abs=0.003)
+    assert precision.map_error_elsewhere > 0.01  # than here
+    drive(0.005, 10)
+    assert precision.offset == pytest.approx(0.005, abs=0.003)
+
+
 @given(st.lists(st.tuples(st.integers(0, 3), st.floats(-1, 1), st.floats(0.01, 1)), min_size=2, max_size=20))
 def test_covariance_of_all_pairs(beams):
     """The fast sum over segments equals that over all pairs of two different beams on the same segment."""
