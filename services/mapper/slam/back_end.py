@@ -24,6 +24,7 @@ class BackEnd:
         # Corrected poses of the key scans. The relative pose of two key scans is known only if links connect them.
         self.poses = np.zeros((0, 3))
         self.closures: list[LoopClosure] = []
+        self._unconfirmed: list[LoopClosure] = []  # found by a wide search, and not yet supported by another one
         self._uncertainty: Uncertainty | None = None  # of the segments; computed again after a change
         self._tried: set[tuple[int, int]] = set()  # pairs of segments that were matched, with or without success
         self._joiner = PieceJoiner()
@@ -53,7 +54,9 @@ class BackEnd:
         if self._uncertainty is None:
             references = np.array([segment.reference for segment in segments], int)
             self._uncertainty = Uncertainty(self.poses, self._links(scans), references)
-        found = find_closures(segments, self.poses, self._uncertainty, self._tried, window, report)
+        found, self._unconfirmed = find_closures(
+            segments, self.poses, self._uncertainty, self._tried, self._unconfirmed, window, report
+        )
         self._add(found, scans)
 
     def join_pieces(self, scans: KeyScanGraph, *, growing: bool = False) -> bool:
@@ -117,7 +120,10 @@ class BackEnd:
     def _cut(self, segment: int, key: int, scans: KeyScanGraph) -> None:
         """Removes all links across the beginning of a ``segment``, whose first key scan is number ``key``."""
         self._cuts.add(key)
-        self.closures = [each for each in self.closures if (each.first < segment) == (each.second < segment)]
+        self.closures, self._unconfirmed = (
+            [each for each in closures if (each.first < segment) == (each.second < segment)]
+            for closures in (self.closures, self._unconfirmed)
+        )
         self._tried = {pair for pair in self._tried if (pair[0] < segment) == (pair[1] < segment)}
         self._uncertainty = None
         self.poses = optimise(self.poses, self._links(scans))

@@ -49,8 +49,8 @@ def _peaks(scores: npt.NDArray[np.int32], turns: Array, around: Array, count: np
     poses = np.column_stack([around[0] + CELL_M * (j - count[0]), around[1] + CELL_M * (i - count[1]), turns[k]])
     found: list[Array] = []
     for pose in poses:
-        off = np.abs(np.array([pose - other for other in found]).reshape(-1, 3))
-        if not ((np.hypot(off[:, 0], off[:, 1]) < PEAK_DISTANCE_M) & (se2.wrap(off[:, 2]) < PEAK_TURN)).any():
+        off = se2.difference(pose, np.array(found).reshape(-1, 3))
+        if not ((np.hypot(off[:, 0], off[:, 1]) < PEAK_DISTANCE_M) & (np.abs(off[:, 2]) < PEAK_TURN)).any():
             found.append(pose)
         if len(found) == PEAKS:
             break

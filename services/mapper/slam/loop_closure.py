@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import compress
+from operator import not_
 
 import numpy as np
 
@@ -46,15 +48,17 @@ def find_closures(
     poses: Array,
     uncertainty: Uncertainty,
     tried: set[tuple[int, int]],
+    unconfirmed: Sequence[LoopClosure],
     window: float,
     report: Callable[[float], None] = lambda _done: None,
-) -> list[LoopClosure]:
+) -> tuple[list[LoopClosure], list[LoopClosure]]:
     """Closures between pairs of segments whose position relative to one another is known to within ``window`` m.
 
     ``poses`` (N, 3) are of the key scans, ``uncertainty`` that of the segments' references, ``tried`` the pairs
-    that were tried before.
+    that were tried before, and ``unconfirmed`` the closures found then that no other one supported. Returns the
+    confirmed closures, and those that are still unconfirmed.
     """
-    found, places = [], poses[[segment.reference for segment in segments]]
+    found, places = list(unconfirmed), poses[[segment.reference for segment in segments]]
     for second in range(len(segments)):
         report(second / len(segments))
         for first in _targets(second, places, uncertainty, window, tried):
@@ -62,14 +66,15 @@ def find_closures(
             closure = _close_loop(segments, first, second, poses, uncertainty)
             if closure is not None:
                 found.append(closure)
-    return _consistent(found, poses, uncertainty)
+    confirmed = [_is_confirmed(each, found, poses, uncertainty) for each in found]
+    return list(compress(found, confirmed)), list(compress(found, map(not_, confirmed)))
 
 
 def _targets(
     second: int, places: Array, uncertainty: Uncertainty, window: float, tried: set[tuple[int, int]]
 ) -> list[int]:
     """Earlier segments near ``second``, nearest first, apart from one another."""
-    distance = np.hypot(*(places[: max(0, second - MIN_APART), :2] - places[second, :2]).T)
+    distance = np.hypot(*(places[: max(0, second - MIN_APART + 1), :2] - places[second, :2]).T)
     chosen: list[int] = []
     for first in np.argsort(distance):
         if distance[first] > MAX_DISTANCE_M + window or len(chosen) == MAX_TARGETS:
@@ -155,37 +160,34 @@ def _is_rival(match: SegmentMatch, best: SegmentMatch) -> bool:
     return match.score > RIVAL_SHARE * best.score and elsewhere
 
 
-def _consistent(closures: list[LoopClosure], poses: Array, uncertainty: Uncertainty) -> list[LoopClosure]:
-    """The closures that were found by a narrow search, or by a wide one and are supported by another closure."""
-    return [
-        closure
-        for closure in closures
-        if not closure.wide
-        or any(_supports(closure, other, poses, uncertainty) for other in closures if other is not closure)
-    ]
+def _is_confirmed(closure: LoopClosure, others: Sequence[LoopClosure], poses: Array, uncertainty: Uncertainty) -> bool:
+    """Whether a closure was found by a narrow search, or by a wide one and another closure supports it."""
+    return not closure.wide or any(
+        _supports(closure, other, poses, uncertainty) for other in others if other is not closure
+    )
 
 
 def _supports(a: LoopClosure, b: LoopClosure, poses: Array, uncertainty: Uncertainty) -> bool:
     """Whether two closures confirm one another: the loop through both closes, which would be unlikely by chance."""
     if not (uncertainty.linked(a.first, b.first) and uncertainty.linked(a.second, b.second)):
         return False
-    there = uncertainty.of_pair(a.first, b.first)
-    back = uncertainty.of_pair(a.second, b.second)
-    covariance = there + back + np.linalg.inv(a.link.information) + np.linalg.inv(b.link.information)
+    # The reference of b's second segment in the frame of that of a's first one, by way of each closure
+    by_a, covariance_by_a = _composed(
+        (a.link.pose, np.asarray(np.linalg.inv(a.link.information), float)),
+        (se2.between(poses[a.link.second], poses[b.link.second]), uncertainty.of_pair(a.second, b.second)),
+    )
+    by_b, covariance_by_b = _composed(
+        (se2.between(poses[a.link.first], poses[b.link.first]), uncertainty.of_pair(a.first, b.first)),
+        (b.link.pose, np.asarray(np.linalg.inv(b.link.information), float)),
+    )
+    off, covariance = se2.difference(by_a, by_b), covariance_by_a + covariance_by_b
     if (np.sqrt(np.diag(covariance)) > 2 * NO_SEARCH_WINDOW).any():
         return False
-    between_first = se2.between(poses[a.link.first], poses[b.link.first])
-    between_second = se2.between(poses[a.link.second], poses[b.link.second])
-    off = se2.between(se2.compose(a.link.pose, between_second), se2.compose(between_first, b.link.pose))
-    by_headings = _covariance_by_headings(a, b, poses)
-    return bool(off @ np.linalg.solve(by_headings + covariance, off) < MAX_SQUARED_DEVIATION)
+    return bool(off @ np.linalg.solve(covariance, off) < MAX_SQUARED_DEVIATION)
 
 
-def _covariance_by_headings(a: LoopClosure, b: LoopClosure, poses: Array) -> Array:
-    """Covariance (3, 3) of the loop through two closures that is due to errors of heading over its length."""
-    reach = max(
-        float(np.hypot(*se2.between(poses[i], poses[j])[:2]))
-        for i, j in ((a.link.first, b.link.first), (a.link.second, b.link.second))
-    )
-    turn = float(np.linalg.inv(a.link.information)[2, 2] + np.linalg.inv(b.link.information)[2, 2])
-    return np.diag([turn * reach**2, turn * reach**2, 0.0])
+def _composed(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[Array, Array]:
+    """The composition of two independent poses (3,), each with its covariance (3, 3)."""
+    by_first, by_second = se2.compose_jacobians(first[0], second[0])
+    covariance = by_first @ first[1] @ by_first.T + by_second @ second[1] @ by_second.T
+    return se2.compose(first[0], second[0]), covariance

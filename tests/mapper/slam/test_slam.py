@@ -14,7 +14,9 @@ from lab.accuracy.motion_distortion import observations
 from lab.accuracy.scenes import TWIN_OFFSET, TWINS, Scene
 from services.mapper.slam.correlative_search import correlative_search
 from services.mapper.slam.drive import Laser, RawDrive
+from services.mapper.slam.elements import Elements, concatenate
 from services.mapper.slam.front_end import NO_PIECE, track_drive
+from services.mapper.slam.loop_closure import LoopClosure, find_closures
 from services.mapper.slam.pose_graph import ANCHOR, LinkTable, PoseLink, Uncertainty, optimise
 from services.mapper.slam.trajectory import build_trajectory
 from tests.mapper.drives import driven
@@ -134,6 +136,44 @@ def test_empty_scans(odometry):
 def test_search_for_nothing():
     seen = track_drive(driven(load_world("office"), np.array([[3.0, 1.5, 0.0]]))).key_scans.elements[0]
     assert not len(correlative_search(seen, seen.part(np.zeros(0, int)), np.zeros(3), np.ones(3)))
+
+
+def test_search_finds_all_headings():
+    """In a square room, four headings fit alike."""
+    along = np.arange(-1.95, 2.0, 0.1)
+    wall = Elements(np.column_stack([along, np.full(40, 2.0)]), np.tile([0.0, -1.0], (40, 1)), np.full(40, 0.1))
+    room = concatenate([wall.transformed(np.array([0.0, 0.0, turn])) for turn in np.pi / 2 * np.arange(4)])
+    found = correlative_search(room, room, np.zeros(3), np.array([0.3, 0.3, np.pi]))
+    quarters = found[:, 2] / (np.pi / 2)
+    assert quarters == pytest.approx(np.round(quarters), abs=0.1)
+    assert set(np.round(quarters) % 4) == {0, 1, 2, 3}
+
+
+def test_closures_that_support_one_another():
+    """Of wide matches between the way there and back, two that agree confirm one another, also in another round."""
+    x = np.concatenate([np.arange(10.0), np.arange(9.0, -1.0, -1.0)])
+    truth = np.column_stack([x, np.zeros(20), np.where(np.arange(20) < 10, 0.0, np.pi)])
+    steps = se2.between(truth[:-1], truth[1:])
+    poses = truth[:1]
+    for step in steps + np.array([0.0, 0.0, 0.02]):  # drift of the front end
+        poses = np.vstack([poses, se2.compose(poses[-1], step)])
+    chain = [PoseLink(k, k + 1, step, np.diag([1e4, 1e4, 1e3])) for k, step in enumerate(steps)]
+    uncertainty = Uncertainty(poses, chain, np.arange(20))
+
+    def closure(first, second, error=0.0):
+        pose = se2.between(truth[first], truth[second]) + np.array([error, 0.0, 0.0])
+        return LoopClosure(first, second, PoseLink(first, second, pose, np.diag([1e4, 1e4, 1e5])), wide=True)
+
+    def confirmed(*closures):
+        found, unconfirmed = find_closures([], poses, uncertainty, set(), closures, 0.0)
+        assert len(found) + len(unconfirmed) == len(closures)
+        return found
+
+    right, other, wrong = closure(1, 18), closure(4, 15), closure(4, 15, 1.5)
+    assert confirmed(right) == []
+    assert confirmed(right, wrong) == []
+    assert confirmed(right, other) == [right, other]
+    assert confirmed(right, wrong, other) == [right, other]
 
 
 def test_look_alike_rooms_stay_apart():
