@@ -113,11 +113,13 @@ def _check(options: MapOptions) -> None:
 
 
 def _model_of(rough: World, options: MapOptions) -> Path | None:
-    """The file of the model that belongs to the map to refine, if it has one."""
-    try:
-        return None if options.models is None else weights.find(options.models, rough, options.refine)
-    except UserError:
+    """The file of the model that belongs to the map to refine, or None if it has none.
+
+    Raises UserError if the file is damaged, or belongs to another map of the same name.
+    """
+    if options.models is None or not weights.path_of(options.models, rough.name).exists():
         return None
+    return weights.find(options.models, rough, options.refine)
 
 
 def _build_poses(

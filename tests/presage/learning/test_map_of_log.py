@@ -21,6 +21,7 @@ from presage.learning.train_drive import drive_of
 from presage.logs.log import Reading
 from presage.logs.scan_files import Scans
 from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
+from services.estimator.precise.learning import weights
 from services.estimator.shared.generative_models import RayCaster
 from services.estimator.shared.interface import Observation
 from services.mapper.slam.drive import Laser
@@ -162,3 +163,11 @@ def test_refined_map_keeps_the_rough_frame(log, tmp_path):
     estimator.restart(turned[0])
     posterior = estimator.update(Observation(truth.ranges[0], truth.angles, truth.range_max, 0.0))
     assert posterior.pose[:2] == pytest.approx(turned[0, :2], abs=0.05)
+
+
+def test_damaged_model_of_the_rough_map(log, tmp_path):
+    file = weights.path_of(tmp_path, made(log, tmp_path).name)
+    file.write_bytes(b"no weights")
+    options = MapOptions(log, tmp_path / "fine.yaml", reading=HERE, refine=str(tmp_path / "made.yaml"), models=tmp_path)
+    with pytest.raises(UserError, match=file.name):
+        map_command(options, QUIET, QUIET)

@@ -91,9 +91,17 @@ def hold_out(drive: ReferenceDrive) -> tuple[ReferenceDrive, ReferenceDrive]:
 
 def range_errors(model: GenerativeModel, scans: ReferenceDrive) -> Array:
     """Errors (K,) in m of the ranges that a model predicts, where a surface is expected and was measured."""
+    errors = errors_of_beams(model, scans)
+    return errors[np.isfinite(errors)]
+
+
+def errors_of_beams(model: GenerativeModel, scans: ReferenceDrive) -> Array:
+    """Errors (N, B) in m of the ranges that a model predicts; NaN where no surface is expected or was measured."""
     expected = model.expect(se2.compose(scans.poses, scans.mount), scans.angles)
-    use = np.isfinite(scans.ranges) & np.isfinite(expected.ranges) & np.isfinite(expected.scale)
-    return np.asarray(np.abs(scans.ranges[use] - expected.ranges[use]))
+    known = np.isfinite(scans.ranges) & np.isfinite(expected.ranges) & np.isfinite(expected.scale)
+    errors = np.full(known.shape, np.nan)
+    errors[known] = np.abs(scans.ranges[known] - expected.ranges[known])
+    return errors
 
 
 def _learn_model(
@@ -128,9 +136,13 @@ def _unseen_part(measured: Beams, simulated: Beams) -> Beams:
 
 
 def replay_model(model: GenerativeModel, places: Array, drive: ReferenceDrive, samples: int, seed: int) -> Beams:
-    """Beams that a model predicts for the drive's scanner, at ``samples`` random poses at ``places`` (S, 2) m."""
+    """Beams that a model predicts for the drive's scanner, at ``samples`` random poses at ``places`` (S, 2) m.
+
+    No place is used twice if there are enough.
+    """
     rng = np.random.default_rng(seed)
-    lasers = np.column_stack([rng.choice(places, samples), rng.uniform(-np.pi, np.pi, samples)])
+    chosen = rng.choice(places, samples, replace=samples > len(places))
+    lasers = np.column_stack([chosen, rng.uniform(-np.pi, np.pi, samples)])
     expected = model.expect(lasers, drive.angles)
     known = np.isfinite(expected.scale) & (expected.ranges < drive.range_max)
     return Beams.of(lasers, np.zeros(3), drive.angles, np.where(known, expected.ranges, -np.inf))

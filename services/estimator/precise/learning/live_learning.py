@@ -13,6 +13,7 @@ from services.estimator.precise.field import FieldModel
 from services.estimator.precise.gauss_newton import Prior, View
 from services.estimator.precise.global_seeds import Seeds
 from services.estimator.precise.learning.drive_learning import (
+    errors_of_beams,
     free_places,
     hold_out,
     learn_model,
@@ -55,8 +56,8 @@ class ModelVersion:
     model: FieldModel
     seeds: Seeds
     key_poses: Array  # (N, 3) poses in map at which the key scans agree best
-    errors: Array  # (K,) m, of the ranges of held-out key scans
-    present_errors: Array  # (L,) m, the same with the model that was in use
+    errors: Array  # (K,) m, of the ranges of held-out key scans, where the model that was in use predicts them as well
+    present_errors: Array  # (K,) m, the same with the model that was in use
 
 
 def learn_version(
@@ -81,8 +82,10 @@ def learn_version(
     trial = _learn(others, overlapping, recipe, EPOCHS)
     _, unaligned = hold_out(tracked)
     errors, present_errors = (
-        range_errors(model, _match_key_scans(model, unaligned, unaligned.poses, sigma)) for model in (trial, present)
+        errors_of_beams(model, _match_key_scans(model, unaligned, unaligned.poses, sigma)) for model in (trial, present)
     )
+    common = np.isfinite(errors + present_errors)
+    errors, present_errors = errors[common], present_errors[common]
     if mean_error(errors) >= mean_error(present_errors):
         return None
     scales = learn_scales(trial.field, held_out.poses, held_out.mount, held_out.angles, held_out.ranges, sigma)
