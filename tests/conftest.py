@@ -25,7 +25,7 @@ from common.processes import end_with_this_process
 from tests.fork_server import Child
 
 ROOT = Path(__file__).resolve().parent.parent
-WAIT_TIMEOUT_S = 60.0  # for events that take well under a second on an idle machine
+WAIT_TIMEOUT_S = 120.0  # for events that take well under a second on an idle machine
 numbers = itertools.count(1)
 
 # Tests of what is not installed: PyTorch for preset paper, and pybullet for the simulator's physics.

@@ -65,10 +65,10 @@ class Visit:
             f"(arg) => {{ const {{ store, view, modes }} = presage; return {expression}; }}", argument
         )
 
-    def wait(self, condition: str, seconds: float = WAIT_TIMEOUT_S, argument: Any = None) -> None:
+    def wait(self, condition: str, argument: Any = None) -> None:
         """Until an expression is true; raises playwright's TimeoutError."""
         body = f"(arg) => {{ const {{ store, view, modes }} = presage; return Boolean({condition}); }}"
-        self.page.wait_for_function(body, arg=argument, polling=POLLING_MS, timeout=1000 * seconds)
+        self.page.wait_for_function(body, arg=argument, polling=POLLING_MS, timeout=1000 * WAIT_TIMEOUT_S)
 
     def at(self, x: float, y: float) -> tuple[float, float]:
         """Pixels of the page at which the map shows a place, m."""

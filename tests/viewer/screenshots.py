@@ -60,7 +60,7 @@ def quiet(seen: Visit) -> None:
 def still(seen: Visit) -> Image.Image:
     """A picture of the robot on its way."""
     tracked = "store.frame?.belief?.state === 'tracking' && Math.abs(store.frame.belief.x - store.frame.truth.x) < 0.1"
-    seen.wait(f"{tracked} && store.history.t.length > 60", 90)
+    seen.wait(f"{tracked} && store.history.t.length > 60")
     seen.click(*GOAL)
     seen.wait(f"{tracked} && store.frame.truth.x > 8 && store.frame.speed > 0.7")
     quiet(seen)
@@ -69,7 +69,7 @@ def still(seen: Visit) -> Image.Image:
 
 def film(seen: Visit) -> list[tuple[float, Image.Image]]:
     """Small pictures of the page until the robot is back, each with the robot's time."""
-    seen.wait("store.map && store.frame?.status?.exploration", 120)
+    seen.wait("store.map && store.frame?.status?.exploration")
     seen.page.locator("#speed").select_option("0.5")  # pictures take their time
     seen.page.add_style_tag(content=FILM_STYLE)
     seen.see("document.getElementById('legend').open = false")

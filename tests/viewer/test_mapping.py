@@ -39,7 +39,7 @@ def test_drive_explore_and_save(browser, processes):
     seen.wait("document.querySelector('#explore-label').textContent === 'Stop'")
     seen.page.locator("#explore").click()
     seen.toast("goal cancelled")
-    seen.wait("store.frame.status.exploration === null && store.frame.status.state === 'idle'", 30)
+    seen.wait("store.frame.status.exploration === null && store.frame.status.state === 'idle'")
 
     save = seen.page.locator("#save-map")
     save.locator("input").fill("here")

@@ -78,7 +78,7 @@ def test_sources():
 
 def test_frames(page):
     page.see(SEEN)
-    page.wait("window.seen.length > 60", 40)
+    page.wait("window.seen.length > 60")
     stamps, _, _ = np.array(page.see("window.seen.slice(0, 60)")).T
     steps = np.diff(stamps) * 15  # scans from frame to frame, however fast this machine lets them come
     assert np.abs(steps - np.round(steps)).max() < 0.01
@@ -87,10 +87,10 @@ def test_frames(page):
     came, rate = page.see("[window.seen.map((one) => one[1]).filter((at) => at >= store.arrivals[0]), "
                           "store.rate(store.arrivals.at(-1))]")  # fmt: skip
     assert rate == pytest.approx(1000 * (len(came) - 1) / (came[-1] - came[0]), rel=0.1)
-    page.wait("store.frame.ranges.length > 500 && store.frame.ranges.length === store.frame.predicted.length", 20)
-    page.wait("document.querySelector('#estimator-badge b').innerText === 'tracking'", 20)
-    page.wait("document.querySelectorAll('#services tr').length >= 5", 20)
-    page.wait(f"{COLOURS} > 20", 20)  # more than an empty canvas has
+    page.wait("store.frame.ranges.length > 500 && store.frame.ranges.length === store.frame.predicted.length")
+    page.wait("document.querySelector('#estimator-badge b').innerText === 'tracking'")
+    page.wait("document.querySelectorAll('#services tr').length >= 5")
+    page.wait(f"{COLOURS} > 20")  # more than an empty canvas has
 
 
 def test_goals(page):
@@ -101,15 +101,15 @@ def test_goals(page):
     goal = (x + (1.5 if x < 9 else -1.5), y)
     page.click(*goal)
     assert page.toast().startswith("Going to (")
-    page.wait(f"store.frame.status?.goal && {AWAY.format('store.frame.status.goal')} < 0.1", 10, goal)
-    page.wait("store.frame.status.state === 'reached'", 40)
-    page.wait(f"{AWAY.format('store.frame.truth')} < 0.35", 5, goal)
+    page.wait(f"store.frame.status?.goal && {AWAY.format('store.frame.status.goal')} < 0.1", argument=goal)
+    page.wait("store.frame.status.state === 'reached'")
+    page.wait(f"{AWAY.format('store.frame.truth')} < 0.35", argument=goal)
 
 
 def test_kidnapping(page):
     x = page.see("store.frame.truth.x")
     there = (13.0, 1.2) if x < 9 else (5.0, 1.2)
-    page.wait("store.frame.error < 0.1", 20)
+    page.wait("store.frame.error < 0.1")
     page.see(SEEN)
     page.page.mouse.move(*page.at(*there))
     page.page.keyboard.down("Shift")
@@ -129,38 +129,38 @@ def test_obstacles_and_keys(page):
     page.page.keyboard.press("o")
     page.click(9.0, 3.0)
     page.toast("added")
-    page.wait("store.world.obstacles.some((o) => o.name === 'box-1')", 10)
+    page.wait("store.world.obstacles.some((o) => o.name === 'box-1')")
     page.drag((9.0, 3.0), (9.0, 2.2))
-    page.wait("Math.abs(store.world.obstacles.find((o) => o.name === 'box-1').box.center[1] - 2.2) < 0.1", 10)
+    page.wait("Math.abs(store.world.obstacles.find((o) => o.name === 'box-1').box.center[1] - 2.2) < 0.1")
     page.page.get_by_role("button", name="Remove").click()
-    page.wait("!store.world.obstacles.some((o) => o.name === 'box-1')", 10)
+    page.wait("!store.world.obstacles.some((o) => o.name === 'box-1')")
 
     page.page.locator("#map").focus()
     page.page.keyboard.press("x")
     yaw = page.see("store.frame.truth.yaw")
     page.page.keyboard.down("a")
-    page.wait("store.frame.status.state === 'manual'", 10)
-    page.wait("Math.abs(Math.sin((store.frame.truth.yaw - arg) / 2)) > 0.1", 10, yaw)
+    page.wait("store.frame.status.state === 'manual'")
+    page.wait("Math.abs(Math.sin((store.frame.truth.yaw - arg) / 2)) > 0.1", argument=yaw)
     page.page.keyboard.up("a")
-    page.wait("store.frame.status.state !== 'manual'", 10)
+    page.wait("store.frame.status.state !== 'manual'")
     page.page.keyboard.press(" ")
-    page.wait("store.paused", 10)
-    page.wait("performance.now() - store.arrivals.at(-1) > 500", 10)
+    page.wait("store.paused")
+    page.wait("performance.now() - store.arrivals.at(-1) > 500")
     stood = page.see("store.frame.stamp_ns")
     page.page.keyboard.press(".")
-    page.wait("store.frame.stamp_ns > arg", 10, stood)
+    page.wait("store.frame.stamp_ns > arg", argument=stood)
     assert page.see("store.frame.stamp_ns") - stood < 0.1e9
     page.page.keyboard.press(" ")
-    page.wait("store.frame.stamp_ns > arg + 5e8", 10, stood)
+    page.wait("store.frame.stamp_ns > arg + 5e8", argument=stood)
 
 
 def test_recording(page, system):
     page.page.locator("#record").click()
-    page.wait("document.getElementById('record').getAttribute('aria-pressed') === 'true'", 10)
+    page.wait("document.getElementById('record').getAttribute('aria-pressed') === 'true'")
     began = page.see("store.frame.t")
-    page.wait("store.frame.t > arg + 2", 30, began)
+    page.wait("store.frame.t > arg + 2", argument=began)
     page.page.locator("#record").click()
-    page.wait("document.getElementById('record').getAttribute('aria-pressed') === 'false'", 10)
+    page.wait("document.getElementById('record').getAttribute('aria-pressed') === 'false'")
     middle = (began + page.see("store.frame.t")) / 2
     (name,) = [path.name for path in system.folder.glob("*.mcap")]
     page.page.locator("#open").click()
@@ -169,24 +169,24 @@ def test_recording(page, system):
     length = page.see("store.player.duration_s")
     assert length > 1.5
     page.page.locator("#player-play").click()
-    page.wait("store.player.paused", 10)  # playing on, a busy machine would pass the middle before it is looked at
+    page.wait("store.player.paused")  # playing on, a busy machine would pass the middle before it is looked at
     for share, side in ((0.1, "<"), (0.9, ">"), (0.2, "<")):
         page.page.locator("#player-seek").fill(str(round(share * length, 2)))
-        page.wait("Math.abs(store.player.position_s - arg) < 0.5", 10, share * length)
-        page.wait(f"store.frame.t {side} arg", 10, middle)
+        page.wait("Math.abs(store.player.position_s - arg) < 0.5", argument=share * length)
+        page.wait(f"store.frame.t {side} arg", argument=middle)
     page.page.locator("#player-close").click()
-    page.wait("!store.player && store.frame?.robot === 'robot'", 20)
+    page.wait("!store.player && store.frame?.robot === 'robot'")
 
 
 def test_missing_service(page, system):
     system.running["controller"].stop()
     notice = page.page.locator(".notice", has_text="controller is missing")
-    notice.wait_for(timeout=20_000)
+    notice.wait_for(timeout=1000 * WAIT_TIMEOUT_S)
     assert "python -m services.controller" in notice.locator("code").inner_text()
-    page.page.locator("#controller-badge b", has_text="missing").wait_for(timeout=20_000)
-    page.wait("store.frame.status === null", 10)
+    page.page.locator("#controller-badge b", has_text="missing").wait_for(timeout=1000 * WAIT_TIMEOUT_S)
+    page.wait("store.frame.status === null")
     system.start("controller")
-    notice.wait_for(state="detached", timeout=40_000)
+    notice.wait_for(state="detached", timeout=1000 * WAIT_TIMEOUT_S)
     page.wait("store.frame?.status?.state === 'idle'")
 
 

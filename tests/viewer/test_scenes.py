@@ -91,14 +91,14 @@ def test_scenes_on_a_phone(look, scene):
         "matchMedia('(prefers-color-scheme: dark)').matches && document.documentElement.hasAttribute('data-dark')"
     )
     assert seen.see(NAMELESS) == 0
-    seen.wait(f"{VISIBLE} === {str(scene == 'empty').lower()}", 5, "empty")
+    seen.wait(f"{VISIBLE} === {str(scene == 'empty').lower()}", argument="empty")
     if scene == "watch-only":
-        seen.wait(f"{VISIBLE} && document.getElementById('pause').disabled", 5, "watch-only")
+        seen.wait(f"{VISIBLE} && document.getElementById('pause').disabled", argument="watch-only")
     if scene == "no-estimator":
         assert "python -m services.estimator" in seen.page.locator(".notice code").inner_text()
     if scene not in {"empty", "no-estimator"}:
         seen.wait("store.frame?.status")
-        seen.wait(f"{VISIBLE} === {str(scene in STANDING).lower()} && !{OVERLAPPING}.length", 5, "why")
+        seen.wait(f"{VISIBLE} === {str(scene in STANDING).lower()} && !{OVERLAPPING}.length", argument="why")
 
 
 def test_widths_and_layouts(look):
@@ -144,7 +144,7 @@ def test_plan_drawn_and_hidden(look):
         at = seen.see("view.camera.toScreen(arg[0], arg[1])", where)
         shown = seen.see(PIXEL, at)
         seen.page.locator(f'[data-layer="{layer}"]').click()
-        seen.wait(f"{PIXEL} !== '{shown}'", 5, at)
+        seen.wait(f"{PIXEL} !== '{shown}'", argument=at)
 
 
 def test_cells_of_a_ros_map(look):
@@ -159,7 +159,7 @@ def test_cells_of_a_ros_map(look):
             at = seen.see("view.camera.toScreen(...arg)", [x, y])
             if kind == OCCUPIED:
                 near = f"'{colour}'.split(',').every((value, i) => Math.abs(value - {PIXEL}.split(',')[i]) < 3)"
-                seen.wait(near, 10, at)  # a small picture is smoothed, which rounds
+                seen.wait(near, argument=at)  # a small picture is smoothed, which rounds
             else:  # lines of the metres run through all of them
                 shown = [seen.see(PIXEL, [at[0] + off, at[1] + off]) for off in (-2, 0, 2)]
                 assert colour in shown, (kind, x, y, shown)
@@ -199,7 +199,7 @@ def test_reason_and_journal(look):
     assert len(reason) > 80
     assert why.inner_text().split(":", 1)[1].strip() == reason
     rows = seen.page.locator("#journal li")
-    seen.wait("document.querySelectorAll('#journal li').length === store.journal.length", 5)
+    seen.wait("document.querySelectorAll('#journal li').length === store.journal.length")
     assert reason in rows.first.inner_text()
     assert "idle" in rows.last.inner_text()
 
@@ -208,7 +208,7 @@ def test_goals_by_drag(look):
     seen = look("tracking")
     seen.wait("store.world && store.frame")
     seen.drag((12.0, 1.5), (12.0, 2.5))
-    seen.wait("store.frame.status.goal.yaw_tolerance === 0.15", 10)
+    seen.wait("store.frame.status.goal.yaw_tolerance === 0.15")
     assert seen.see("store.frame.status.goal.yaw") == pytest.approx(1.571, abs=0.05)
     seen.click(10.6, 3.75)
     assert "does not fit" in seen.toast(ok=False)
@@ -225,7 +225,7 @@ def test_axis_labels(look):
     seen.wait("performance.now() - store.arrivals.at(-1) > 500")
     seen.see(LARGE_NUMBERS)
     for name in ("c-energy", "c-complexity", "c-speed", "c-scan", "map"):
-        seen.wait(f"{COLOURS_AT_LEFT} === 1", 10, name)
+        seen.wait(f"{COLOURS_AT_LEFT} === 1", argument=name)
 
 
 class Fingers:
@@ -250,7 +250,7 @@ def test_zoom_and_joystick(look):
     for k in range(1, 9):
         fingers.do("touchMove", (x - 20 - 5 * k, y), (x + 20 + 5 * k, y))
     fingers.do("touchEnd")
-    seen.wait("view.camera.scale > 2.5 * arg", 5, scale)
+    seen.wait("view.camera.scale > 2.5 * arg", argument=scale)
     assert seen.see("view.camera.toWorld(150, 150)") == pytest.approx(under, abs=0.05)
     assert seen.see("[scrollY, visualViewport.scale]") == [0, 1]
     assert seen.see("store.frame.status.goal") == goal
@@ -264,9 +264,9 @@ def test_zoom_and_joystick(look):
     fingers.do("touchMove", (x, y - 24))
     seen.see("document.getElementById('banner').hidden = false")  # 40 px of something above
     fingers.do("touchMove", (x, y - 25))
-    seen.wait("window.sent.length > 3", 5)
+    seen.wait("window.sent.length > 3")
     fingers.do("touchEnd")
-    seen.wait("window.sent.at(-1).vx === 0", 5)
+    seen.wait("window.sent.at(-1).vx === 0")
     *before, last = seen.see("window.sent.filter((one) => one.action === 'drive')")
     assert all(one["vx"] > 0.2 for one in before[2:]), before
     assert (last["vx"], last["wz"]) == (0, 0)
@@ -278,7 +278,7 @@ def test_space_key_after_a_click(look):
     seen.page.locator("#reset").click()
     seen.toast("restarted")
     seen.page.keyboard.press(" ")
-    seen.wait("store.paused", 5)
+    seen.wait("store.paused")
     seen.page.locator("#pause").focus()
     seen.page.keyboard.press("Tab")
     assert seen.see("document.activeElement.id") == "step"  # the focus follows the keyboard
@@ -295,7 +295,7 @@ def test_server_that_comes_back(browser, processes):
     assert "No connection" in seen.page.locator("#banner").inner_text()
     processes.start("tests.viewer.stub_server", "--port", port)
     seen.page.locator("#banner").wait_for(state="hidden", timeout=30_000)
-    seen.wait("store.connected && store.prior && performance.now() - store.arrivals.at(-1) < 500", 20)
+    seen.wait("store.connected && store.prior && performance.now() - store.arrivals.at(-1) < 500")
     seen.page.context.close()
 
 
@@ -307,4 +307,4 @@ def test_messages_that_are_no_frame(look):
         seen.see("presage.connection.receive(arg)", text)
     seen.see("[0, 3, 4, 100].forEach((n) => presage.connection.receive(new Uint8Array(n).fill(255).buffer))")
     assert seen.see("presage.connection.undecodable") == 10
-    seen.wait("store.frame.t > arg", 10, before)
+    seen.wait("store.frame.t > arg", argument=before)
