@@ -10,6 +10,7 @@ import typer
 
 from common.bus.bus import wait_until
 from presage.cli.main import app
+from tests.conftest import WAIT_TIMEOUT_S
 from tests.recorder import sessions as made
 from tests.system.test_diagnosis import row_of
 
@@ -127,7 +128,7 @@ def test_tools_beside_a_session(presage, process, bus, link, monkeypatch):
             and all("ms" in row_of(output, name) for name in names[1:])
         )
 
-    assert wait_until(healthy, 60), outputs[-1]  # the first scans take longer
+    assert wait_until(healthy, WAIT_TIMEOUT_S), outputs[-1]  # the first scans take longer
     assert f"robot {link.robot}" in outputs[-1]
     assert "not running" in row_of(outputs[-1], "recorder")
     status, output = presage("doctor")
