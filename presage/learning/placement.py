@@ -1,7 +1,7 @@
 """Places a drive in the frame of an existing map, in which an estimator finds the poses of its key scans.
 
 In a rough map, each wall and therefore each of these poses is wrong by some centimetres. The drive is placed by their
-median, which is wrong by about a centimetre. If the map is a grid, the surfaces are then moved into its occupied cells.
+median, which is wrong by about a centimetre, and then aligned to all surfaces together.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepar
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.precise.learning.field_learning import Recipe, learn_field
-from services.estimator.precise.learning.map_alignment import move_into_cells
+from services.estimator.precise.learning.map_alignment import align_to_map, with_offset
 from services.estimator.shared.generative_models import RayCaster
 from services.estimator.shared.interface import Observation
 from services.mapper.slam.pose_graph import PoseLink, optimise
@@ -68,7 +68,8 @@ def place_drive(world: World, keys: ReferenceDrive, model: Path | None = None) -
     if model is not None:
         placed = _fit_to_found_poses(placed, found, covariances)
     elif world.grid is not None:
-        placed = move_into_cells(world, replace(keys, poses=placed))
+        keys = replace(keys, poses=placed)
+        placed = align_to_map(with_offset(RayCaster(world), keys), keys).poses
     return Placement(placed, share, float(np.median(_distance(placed[searched], found))))
 
 
