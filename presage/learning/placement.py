@@ -1,7 +1,7 @@
 """Places a drive in the frame of an existing map, in which an estimator finds the poses of its key scans.
 
 In a rough map, each wall and therefore each of these poses is wrong by some centimetres. The drive is placed by their
-median, which is wrong by about a centimetre, and then aligned to all surfaces together.
+median, which is wrong by about a centimetre. If the map is a grid, it is then aligned to all surfaces together.
 """
 
 from __future__ import annotations

@@ -376,8 +376,8 @@ class PreciseEstimator:
     def _find_alternatives(self, view: View, best: Mode, candidates: list[MotionCandidate]) -> list[Mode]:
         """Other hypotheses within the motion prior that fit the scan, if it made the ``best`` one far more certain.
 
-        The pose was uncertain before this scan, and a descent from one pose finds only the nearest match. Less probable
-        motions than that to the best one are evidence against them; none is evidence for them.
+        The pose was uncertain before this scan, and a descent from one pose finds only the nearest match. An
+        alternative loses evidence if its motion is less probable than that of the best match; it never gains any.
         """
         before = self.modes[0]
         doubt = 1 - self._probability_of_being_near(before)

@@ -65,7 +65,8 @@ def learn_version(
 ) -> ModelVersion | None:
     """Learns a field from key scans and the ``original`` model, which knows the surroundings of ``places`` (S, 2) m.
 
-    Returns None if the new field predicts held-out key scans no better than the model in use, ``present``.
+    Returns None if the new field predicts held-out key scans no better than the model in use, ``present``, where both
+    of them predict a surface.
     """
     tracked = remove_moving_objects(keys)
     sigma = estimate_noise(tracked.ranges, tracked.angles)
