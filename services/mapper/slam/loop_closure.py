@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import compress
-from operator import not_
 
 import numpy as np
 
@@ -66,8 +64,11 @@ def find_closures(
             closure = _close_loop(segments, first, second, poses, uncertainty)
             if closure is not None:
                 found.append(closure)
-    confirmed = [_is_confirmed(each, found, poses, uncertainty) for each in found]
-    return list(compress(found, confirmed)), list(compress(found, map(not_, confirmed)))
+    confirmed: list[LoopClosure] = []
+    still_unconfirmed: list[LoopClosure] = []
+    for closure in found:
+        (confirmed if _is_confirmed(closure, found, poses, uncertainty) else still_unconfirmed).append(closure)
+    return confirmed, still_unconfirmed
 
 
 def _targets(
@@ -171,7 +172,7 @@ def _supports(a: LoopClosure, b: LoopClosure, poses: Array, uncertainty: Uncerta
     """Whether two closures confirm one another: the loop through both closes, which would be unlikely by chance."""
     if not (uncertainty.linked(a.first, b.first) and uncertainty.linked(a.second, b.second)):
         return False
-    # The reference of b's second segment in the frame of that of a's first one, by way of each closure
+    # Either closure leads from a's first segment to b's second one: the pose of the latter in the frame of the former.
     by_a, covariance_by_a = _composed(
         (a.link.pose, np.asarray(np.linalg.inv(a.link.information), float)),
         (se2.between(poses[a.link.second], poses[b.link.second]), uncertainty.of_pair(a.second, b.second)),

@@ -150,7 +150,7 @@ def test_search_finds_all_headings():
 
 
 def test_closures_that_support_one_another():
-    """Of wide matches between the way there and back, two that agree confirm one another, also in another round."""
+    """Two wide matches of the way back with the way there confirm one another if they agree."""
     x = np.concatenate([np.arange(10.0), np.arange(9.0, -1.0, -1.0)])
     truth = np.column_stack([x, np.zeros(20), np.where(np.arange(20) < 10, 0.0, np.pi)])
     steps = se2.between(truth[:-1], truth[1:])
