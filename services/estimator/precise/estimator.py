@@ -175,7 +175,7 @@ class PreciseEstimator:
             self._fuse(view, k, match, float(explained_at[k]), motions[k][-1], observation)
             for k in range(len(explained_at))
         ]
-        modes += self._find_alternatives(view, modes[0], match.motions[0])
+        modes += self._find_alternatives(view, modes[0], match.motions[0], motions[0][-1])
         # Weights, also of the unknown place
         self._weigh_hypotheses(view, modes, match.local_pose, period)
         self._scan = view, observation
@@ -373,11 +373,14 @@ class PreciseEstimator:
         project_evidence(evidence, k, unobserved)
         return unobserved
 
-    def _find_alternatives(self, view: View, best: Mode, candidates: list[MotionCandidate]) -> list[Mode]:
+    def _find_alternatives(
+        self, view: View, best: Mode, candidates: list[MotionCandidate], widest: MotionCandidate
+    ) -> list[Mode]:
         """Other hypotheses within the motion prior that fit the scan, if it made the ``best`` one far more certain.
 
         The pose was uncertain before this scan, and a descent from one pose finds only the nearest match. An
-        alternative loses evidence if its motion is less probable than that of the best match; it never gains any.
+        alternative loses evidence if its motion is less probable than that of the best match; it never gains any. As in
+        `_fuse`, one of which the robot is hardly capable, according to the ``widest`` candidate, counts against it.
         """
         before = self.modes[0]
         doubt = 1 - self._probability_of_being_near(before)
@@ -387,7 +390,13 @@ class PreciseEstimator:
         motion = candidates[0]
         found = search_near(view, motion.mean, motion.covariance, self.seeds, self.settings, self._rng)
         at_best = before.log_evidence + _prior_of([motion]).energy(best.pose[None])[0]
-        return [replace(mode, log_evidence=min(before.log_evidence, at_best + mode.log_evidence)) for mode in found]
+        return [
+            replace(
+                mode,
+                log_evidence=min(before.log_evidence, at_best + mode.log_evidence) - widest.excess(mode.pose),
+            )
+            for mode in found
+        ]
 
     def _weigh_hypotheses(self, view: View, modes: list[Mode], local: Array | None, period: float) -> None:
         """Weighs hypotheses by how well the map predicts those surfaces of the scan that were not seen before.
@@ -522,7 +531,8 @@ class PreciseEstimator:
 
     def _search_everywhere(self, view: View) -> list[Mode]:
         """The hypotheses in the whole map at which the scan is more probable than at an unknown place; at least one."""
-        view = replace(view, map_error=max(view.map_error, self._precision.map_error_elsewhere))
+        if self._precision.scans:  # the map's errors were learned in one room, but the robot may be in another
+            view = replace(view, map_error=max(view.map_error, self._precision.map_error_elsewhere))
         found = search_everywhere(view, self.seeds, self.settings)
         log_unmapped = _log_reference(view, view.surfaces.small) + _log_unmapped(view, view.surfaces.small)
         return [mode for mode in found if mode.present > log_unmapped + 1] or found[:1]

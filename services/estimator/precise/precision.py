@@ -126,17 +126,19 @@ class Precision:
             return
         if self.cell:
             jacobian = expected.jacobian[0, used] / slope[:, None]
-            errors = self._learn_offset(errors, model_variance + noise**2, jacobian, lengths)
+            errors = self._learn_offset(view.map_offset, errors, model_variance + noise**2, jacobian, lengths)
         self.scans += 1
         weight = _update_weight(self.scans)
         self.covariance += weight * (error_covariance(errors, segments, lengths) - self.covariance)
         self.model_variance += weight * (float(np.average(model_variance, weights=lengths)) - self.model_variance)
 
-    def _learn_offset(self, errors: Array, expected_variance: Array, jacobian: Array, lengths: Array) -> Array:
-        """Learns the offset from the errors (K,) in m across surfaces.
+    def _learn_offset(
+        self, assumed: float, errors: Array, expected_variance: Array, jacobian: Array, lengths: Array
+    ) -> Array:
+        """Learns the offset from the errors (K,) in m across surfaces that were predicted with an ``assumed`` offset.
 
         ``expected_variance`` (K,) m² is that of the scanner's noise plus the map error that the model states. The pose
-        was fitted to the same beams with the offset so far, so both are estimated together: with ``jacobian`` (K, 3),
+        was fitted to the same beams with the assumed offset, so both are estimated together: with ``jacobian`` (K, 3),
         the derivative of the errors by the pose. Beams are weighted by their ``lengths`` (K,) of surface in m. Returns
         the errors that remain.
         """
@@ -150,9 +152,10 @@ class Precision:
         correlated_part = excess * CORRELATION_LENGTH_M
         independent_part = float(np.average(expected_variance, weights=lengths) * lengths.mean())
         variance = (correlated_part + independent_part) * float(inverse[3, 3])
-        self.offset_variance += self.cell**2 / 12 / ROOM_KEY_SCANS
+        self.offset_variance += (self.cell**2 / 12 - self.offset_variance) / ROOM_KEY_SCANS
         gain = self.offset_variance / (self.offset_variance + variance)
-        self.offset = float(np.clip(self.offset + gain * fitted[3], 0.0, self.cell))
+        self.offset += gain * (assumed + fitted[3] - self.offset)
+        self.offset = float(np.clip(self.offset, 0.0, self.cell))
         self.offset_variance *= 1 - gain
         return remaining
 

@@ -81,6 +81,20 @@ def test_place_in_the_cells_of_another_room(seed):
     assert precision.offset == pytest.approx(0.005, abs=0.003)
 
 
+@pytest.mark.parametrize("assumed", [0.005, 0.015, 0.03])
+def test_offset_that_the_scan_was_matched_with(assumed):
+    """The place in the cells is learned from scans that were predicted with any other offset than the one learned."""
+    rng, precision = np.random.default_rng(0), Precision.before_first_scan(0.05)
+    for pose in ROOM.sample_poses(20, rng, 0.3):
+        seen = RayCaster(ROOM).expect(se2.compose(pose, MOUNT)[None], ANGLES)
+        ranges = seen.ranges[0] + 0.015 * seen.slope[0] + 0.02 * rng.standard_normal(len(ANGLES))
+        view = View(
+            RayCaster(ROOM), Likelihood(sigma=0.02), MOUNT, ANGLES, ranges, 25.0, map_error=0.01, map_offset=assumed
+        )
+        precision.learn_map_error(view, pose)
+    assert precision.offset == pytest.approx(0.015, abs=0.003)
+
+
 @given(st.lists(st.tuples(st.integers(0, 3), st.floats(-1, 1), st.floats(0.01, 1)), min_size=2, max_size=20))
 def test_covariance_of_all_pairs(beams):
     """The fast sum over segments equals that over all pairs of two different beams on the same segment."""

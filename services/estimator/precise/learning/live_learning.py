@@ -65,8 +65,7 @@ def learn_version(
 ) -> ModelVersion | None:
     """Learns a field from key scans and the ``original`` model, which knows the surroundings of ``places`` (S, 2) m.
 
-    Returns None if the new field predicts held-out key scans no better than the model in use, ``present``, where both
-    of them predict a surface.
+    Returns None if the new field predicts held-out key scans no better than the model in use, ``present``.
     """
     tracked = remove_moving_objects(keys)
     sigma = estimate_noise(tracked.ranges, tracked.angles)
@@ -83,12 +82,15 @@ def learn_version(
     trial = _learn(others, overlapping, recipe, EPOCHS)
     _, unaligned = hold_out(tracked)
     errors, present_errors = (
-        errors_of_beams(model, _match_key_scans(model, unaligned, unaligned.poses, sigma)) for model in (trial, present)
+        errors_of_beams(model, _match_key_scans(model, unaligned, unaligned.poses, sigma))[
+            np.isfinite(unaligned.ranges)
+        ]
+        for model in (trial, present)
     )
-    common = np.isfinite(errors + present_errors)
-    errors, present_errors = errors[common], present_errors[common]
     if mean_error(errors) >= mean_error(present_errors):
         return None
+    common = np.isfinite(errors + present_errors)
+    errors, present_errors = errors[common], present_errors[common]
     scales = learn_scales(trial.field, held_out.poses, held_out.mount, held_out.angles, held_out.ranges, sigma)
     ripple = measure_ripple(trial.field, se2.compose(held_out.poses, held_out.mount), held_out.angles)
     final = _learn(aligned, overlapping.joined(elsewhere), recipe, EPOCHS)
@@ -121,8 +123,11 @@ def remove_moving_objects(keys: ReferenceDrive) -> ReferenceDrive:
 
 
 def mean_error(errors: Array) -> float:
-    """Mean of errors (K,) in m, each clipped at `MAX_ERROR_M`, because larger ones are due to changed surroundings."""
-    return float(np.minimum(errors, MAX_ERROR_M).mean()) if len(errors) else MAX_ERROR_M
+    """Mean of errors (K,) in m, each clipped at `MAX_ERROR_M`, because larger ones are due to changed surroundings.
+
+    A surface that was measured, but not predicted (NaN), counts as much.
+    """
+    return float(np.fmin(errors, MAX_ERROR_M).mean()) if len(errors) else MAX_ERROR_M
 
 
 def _estimate_map_error(model: GenerativeModel, keys: ReferenceDrive, sigma: float) -> float:

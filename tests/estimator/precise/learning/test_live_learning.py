@@ -132,6 +132,21 @@ def test_unchanged_surroundings(original):
     assert learn_version(exact, places, exact, drive(BEFORE, *WEST, 60), RECIPE) is None
 
 
+def test_room_that_the_model_lacks(original):
+    """It is learned, even if nothing else is to be improved."""
+
+    class WestRoom(RayCaster):
+        def expect(self, lasers, angles):
+            expected = super().expect(lasers, angles)
+            ends = lasers[:, :1] + expected.ranges * np.cos(lasers[:, 2:] + angles)
+            return replace(expected, scale=np.where(ends > 4.15, np.inf, expected.scale))
+
+    _, places = original
+    west = WestRoom(BEFORE)
+    version = learn_version(west, places[places[:, 0] < 4], west, drive(BEFORE, (0.3, 0.3), (7.7, 3.7), 120), RECIPE)
+    assert error(version.model, BEFORE, *EAST) < 0.005
+
+
 def test_people_leave_no_trace(original, version):
     model, places = original
     # Every 8 s a person walks through the room, 0.8 m between two scans.
