@@ -22,7 +22,7 @@ HEADS = ("`tracking` %", "wrong of these %; longest", "correct %", "error (mm)",
 LEGEND = """*Tracking*: share of the scans that are reported as `tracking`. *Wrong*: share of these with an error above
 0.2 m or 5°, with Wilson's 95 % interval (too narrow, because scans of one trial depend on each other), or its upper
 bound if none was wrong. *Longest*: wrong stretch. *Correct*: scans within 0.2 m and 5°, in any state. *Error*:
-median/RMS of correct scans. *NEES*: mean of x and y where `tracking`; 2 is ideal. The JSON has more."""
+median/RMS of correct scans. *NEES*: mean of x, y and heading where `tracking`; 3 is ideal. The JSON has more."""
 
 
 def bench_integrity(plan: IntegrityPlan, out: Path, workers: int, console: Console) -> int:
@@ -71,7 +71,7 @@ def _cells(row: dict[str, Any] | None) -> list[str]:
         "–"
         if row["error_rms_m"] is None
         else "/".join(millimetres(row[f"error_{name}_m"]) for name in ("median", "rms")),
-        _short(row["nees_xy"]),
+        _short(row["nees"]),
     ]
 
 

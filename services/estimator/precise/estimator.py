@@ -65,7 +65,7 @@ WRONG_MATCH = 1e-6
 # guess). Then a wider area is searched.
 MAX_FIT_DROP = 20.0
 # Smaller errors of the map, divided by the scanner's noise, cannot be told from the noise of one scan (a guess).
-SIGNIFICANT_MAP_ERROR = 0.25
+SIGNIFICANT_MAP_ERROR = 0.2
 # Of the beams at surfaces that the map lacks, at most this fraction ends at one of its surfaces by chance. The map
 # explained less than 5 to 9 % of the scan at nine of ten wrong poses in the buildings used for development.
 EXPLAINED_BY_CHANCE = 0.1
@@ -220,6 +220,7 @@ class PreciseEstimator:
             self._precision.map_error,
             self._precision.correlated_fraction,
             self._precision.changed_fraction,
+            self._precision.cell,
             self._precision.offset,
         )
         return self._correct_motion(

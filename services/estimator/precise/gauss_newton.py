@@ -16,7 +16,7 @@ import numpy.typing as npt
 from common.geometry import se2
 from common.robot.ranges import is_surface
 from services.estimator.precise.likelihood import Evidence
-from services.estimator.precise.scan_surfaces import ScanSurfaces
+from services.estimator.precise.scan_surfaces import EDGE_M, ScanSurfaces
 from services.estimator.precise.surface_evidence import SurfaceEvidence, find_borders
 
 if TYPE_CHECKING:
@@ -102,6 +102,7 @@ class View:
     map_error: float = 0.0  # m, standard deviation of the map's error beyond what the model states
     correlated_fraction: float = 0.0  # of the variance of the map's error: alike for beams on the same segment
     changed_fraction: float = 0.25  # fraction of the beams that hit no surface of the map
+    map_cell: float = 0.0  # m, edge of the cells if the map is a grid
     map_offset: float = 0.0  # m, mean distance of the real surfaces behind those that the model predicts
     _last: list[_PredictedScans] = field(default_factory=list, init=False, repr=False)
 
@@ -153,7 +154,7 @@ class View:
     @cached_property
     def surfaces(self) -> ScanSurfaces:
         """The surfaces that the scan shows."""
-        return ScanSurfaces.from_scan(self.ranges, self.angles, self.likelihood)
+        return ScanSurfaces.from_scan(self.ranges, self.angles, self.likelihood, max(EDGE_M, self.map_cell))
 
     def expect(self, lasers: Array) -> Expected:
         """The scans that the model predicts at laser poses (N, 3), with its surfaces moved back by the map's offset."""

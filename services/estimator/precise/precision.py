@@ -12,16 +12,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from services.estimator.precise.gauss_newton import CORRELATION_LENGTH_M
-from services.estimator.precise.noise import NORMAL_MAD, estimate_noise
+from services.estimator.precise.noise import estimate_noise
+from services.estimator.precise.residuals import (
+    LeastSquares,
+    error_covariance,
+    robust_covariance,
+    segment_ids,
+    sum_over_pairs,
+    variance_by_noise,
+)
 
 if TYPE_CHECKING:
-    import numpy.typing as npt
-
     from common.geometry.se2 import Array
     from services.estimator.precise.gauss_newton import View
     from services.estimator.precise.likelihood import Likelihood
 
-MIN_UPDATE_WEIGHT = 0.1  # of the newest scan, or key scan, in an average
+MIN_UPDATE_WEIGHT = 0.1  # of the newest scan, or key scan, in an average; the older ones fade accordingly
 MIN_CHANGED_FRACTION, MAX_CHANGED_FRACTION = 0.02, 0.5  # guesses
 # If the measured noise differs from the configured one by more than this factor (a guess), the scan shows no smooth
 # walls, from which noise could be measured.
@@ -33,8 +39,8 @@ SEGMENT_LENGTH_M = 0.5
 # Larger errors, with three standard deviations of the noise added in quadrature, are not the map's, but changes of the
 # surroundings.
 MAX_MAP_ERROR_M = 0.1
+SIGNIFICANT_DEVIATIONS = 2.0  # by which a covariance may be too large by chance
 MIN_LEARNING_BEAMS, MIN_LEARNING_FRACTION = 30, 0.3  # of a scan's beams; nothing is learned from fewer
-DAMPING = 1e-9  # in m; keeps the inverse finite where a direction is not observed
 ROOM_KEY_SCANS = 20  # in a room (a guess); in the next room, surfaces may have another mean place in their cells
 
 
@@ -47,7 +53,11 @@ class Precision:
     cell: float = 0.0  # m, edge of the cells if the map is a grid
     offset: float = 0.0  # m, mean distance of the real surfaces behind the front of the cells, where the robot is
     offset_variance: float = 0.0  # m²
-    covariance: float = 0.0  # m², of the map's errors at two beams on the same segment of a surface
+    # Sums over key scans, of which the older ones fade. The pose was fitted to the scan, so part of the map's errors
+    # does not show in what remains.
+    covariance: float = 0.0  # m², of the remaining errors at two beams on the same segment of a surface
+    covariance_variance: float = 0.0  # m⁴, of the covariance, due to the scanner's noise
+    remaining: float = 0.0  # fraction of the map's errors that remains
     model_variance: float = 0.0  # m², mean variance of the map's errors as the model states it
     scans: int = 0  # key scans from which the map's errors were learned
     noise_scans: int = 0  # scans from which the noise was learned
@@ -60,12 +70,22 @@ class Precision:
         Together, the standard deviation is 0.41 cells. In some maps all surfaces have the same place in their cells,
         so the offset common to all surfaces is uncertain, too.
         """
-        return cls(cell=cell, offset=cell / 2, offset_variance=cell**2 / 12, covariance=cell**2 / 6)
+        return cls(cell=cell, offset=cell / 2, offset_variance=cell**2 / 12)
+
+    @property
+    def _error_variance(self) -> float:
+        """Variance in m² of the map's errors; the prior counts as one key scan, which does not fade.
+
+        Where a map is exact, the covariance is as often positive as negative, so what may be due to chance is left out.
+        Until a second key scan, an error is assumed nevertheless.
+        """
+        by_chance = SIGNIFICANT_DEVIATIONS * float(np.sqrt(self.covariance_variance)) if self.scans > 1 else 0.0
+        return max(0.0, self.cell**2 / 6 + self.covariance - by_chance) / (1 + self.remaining)
 
     @property
     def map_error(self) -> float:
         """Standard deviation in m of the map's error beyond what the model states."""
-        return float(np.sqrt(max(0.0, self.covariance - self.model_variance)))
+        return float(np.sqrt(max(0.0, self._error_variance - self.model_variance)))
 
     @property
     def map_error_elsewhere(self) -> float:
@@ -75,8 +95,8 @@ class Precision:
     @property
     def correlated_fraction(self) -> float:
         """Fraction of the variance of the map's error that is alike for beams on the same segment."""
-        total = max(self.covariance, self.model_variance)
-        return max(0.0, self.covariance) / total if total > 0 else 0.0
+        total = max(self._error_variance, self.model_variance)
+        return self._error_variance / total if total > 0 else 0.0
 
     def update_noise(self, configured: Likelihood, ranges: Array, angles: Array) -> Likelihood:
         """Updates the noise by one more scan, (B,) m along (B,) rad.
@@ -116,80 +136,44 @@ class Precision:
             return
         errors, noise, surface, slope = errors[used], noise[used], surface[used], slope[used]
         model_variance, spacing = (scale[used] / slope) ** 2, surface * view.spacing
-        segments = _segment_ids(np.cumsum(view.surfaces.starts)[used], spacing)
-        robust = _robust_covariance(errors, segments) - float(np.median(model_variance))
+        surfaces = np.cumsum(view.surfaces.starts)[used]
+        segments = segment_ids(surfaces, spacing, SEGMENT_LENGTH_M)
+        robust = robust_covariance(errors, segments) - float(np.median(model_variance))
         if robust > view.map_error**2:  # with too small an error, no surface would be explained
             view = replace(view, map_error=float(np.sqrt(robust)))
         # Weighted by length of surface instead of by beam, because near surfaces have more beams.
         lengths = view.surface_evidence(pose[None]).weights[0, used] * spacing
-        if not lengths.any():
+        if sum_over_pairs(segments, lengths) <= 0:
             return
-        if self.cell:
-            jacobian = expected.jacobian[0, used] / slope[:, None]
-            errors = self._learn_offset(view.map_offset, errors, model_variance + noise**2, jacobian, lengths)
+        design = np.column_stack([expected.jacobian[0, used] / slope[:, None], np.ones(len(errors))])
+        fit = LeastSquares.of(design if self.cell else design[:, :3], lengths)  # the pose, and in a grid the offset
+        patches = segment_ids(surfaces, spacing, CORRELATION_LENGTH_M)
+        remaining, by_noise = fit.expected_covariance(segments, patches, noise**2)
+        fading = 1 - MIN_UPDATE_WEIGHT
         self.scans += 1
+        self.covariance *= fading
+        self.covariance += error_covariance(fit.residuals(errors), segments, lengths) - by_noise
+        self.covariance_variance *= fading**2
+        self.covariance_variance += variance_by_noise(segments, lengths, noise**2)
+        self.remaining = fading * self.remaining + remaining
         weight = _update_weight(self.scans)
-        self.covariance += weight * (error_covariance(errors, segments, lengths) - self.covariance)
         self.model_variance += weight * (float(np.average(model_variance, weights=lengths)) - self.model_variance)
+        if self.cell:
+            # Both in m³: a variance times the length of surface over which errors are alike, which for independent ones
+            # is the length that one beam covers.
+            correlated_part = self._error_variance * CORRELATION_LENGTH_M
+            independent_part = float(np.average(model_variance + noise**2, weights=lengths) * lengths.mean())
+            variance = (correlated_part + independent_part) * float(fit.inverse[3, 3])
+            self._learn_offset(view.map_offset + float(fit.gain[3] @ errors), variance)
 
-    def _learn_offset(
-        self, assumed: float, errors: Array, expected_variance: Array, jacobian: Array, lengths: Array
-    ) -> Array:
-        """Learns the offset from the errors (K,) in m across surfaces that were predicted with an ``assumed`` offset.
-
-        ``expected_variance`` (K,) m² is that of the scanner's noise plus the map error that the model states. The pose
-        was fitted to the same beams with the assumed offset, so both are estimated together: with ``jacobian`` (K, 3),
-        the derivative of the errors by the pose. Beams are weighted by their ``lengths`` (K,) of surface in m. Returns
-        the errors that remain.
-        """
-        design = np.column_stack([jacobian, np.ones(len(errors))])
-        inverse = np.linalg.inv(design.T @ (lengths[:, None] * design) + DAMPING * np.eye(4))
-        fitted = inverse @ (design.T @ (lengths * errors))
-        remaining = np.asarray(errors - design @ fitted)
-        excess = max(0.0, float(np.average(remaining**2 - expected_variance, weights=lengths)))
-        # Both in m³: a variance times the length of surface over which errors are alike, which for independent ones is
-        # the length that one beam covers.
-        correlated_part = excess * CORRELATION_LENGTH_M
-        independent_part = float(np.average(expected_variance, weights=lengths) * lengths.mean())
-        variance = (correlated_part + independent_part) * float(inverse[3, 3])
+    def _learn_offset(self, measured: float, variance: float) -> None:
+        """Learns the offset from a key scan, where it was ``measured`` in m with the ``variance`` in m²."""
         self.offset_variance += (self.cell**2 / 12 - self.offset_variance) / ROOM_KEY_SCANS
         gain = self.offset_variance / (self.offset_variance + variance)
-        self.offset += gain * (assumed + fitted[3] - self.offset)
-        self.offset = float(np.clip(self.offset, 0.0, self.cell))
+        self.offset = float(np.clip(self.offset + gain * (measured - self.offset), 0.0, self.cell))
         self.offset_variance *= 1 - gain
-        return remaining
 
 
 def _update_weight(scans: int) -> float:
     """Weight of the newest of ``scans`` scans in an average, in which the initial value counts as one more scan."""
     return max(MIN_UPDATE_WEIGHT, 1 / (scans + 1))
-
-
-def _segment_ids(surface_ids: npt.NDArray[np.intp], lengths: Array) -> npt.NDArray[np.intp]:
-    """Cuts surfaces into segments of `SEGMENT_LENGTH_M`.
-
-    Returns the segment (K,) on which each beam ends, from its surface (K,) and the ``lengths`` (K,) in m that beams
-    cover, in the order of the scan.
-    """
-    along = np.floor(np.cumsum(lengths) / SEGMENT_LENGTH_M)
-    return np.cumsum((np.diff(surface_ids, prepend=surface_ids[:1]) != 0) | (np.diff(along, prepend=along[:1]) != 0))
-
-
-def error_covariance(errors: Array, segments: npt.NDArray[np.intp], weights: Array) -> float:
-    """Weighted covariance in m² of the errors (K,) of two different beams on the same segment; 0 if there are none."""
-    sums = np.bincount(segments, weights * errors) ** 2 - np.bincount(segments, (weights * errors) ** 2)
-    pairs = np.bincount(segments, weights) ** 2 - np.bincount(segments, weights**2)
-    return float(sums.sum() / pairs.sum()) if pairs.sum() > 0 else 0.0
-
-
-def _robust_covariance(errors: Array, segments: npt.NDArray[np.intp]) -> float:
-    """Robust covariance in m² of the errors (K,) of consecutive beams on the same segment; outliers hardly matter.
-
-    Gnanadesikan and Kettenring 1972. Returns 0 if there are no such beams.
-    """
-    first = np.flatnonzero(np.diff(segments) == 0)
-    if not len(first):
-        return 0.0
-    a, b = errors[first], errors[first + 1]
-    deviation_of_sum, deviation_of_difference = (NORMAL_MAD * float(np.median(np.abs(each))) for each in (a + b, a - b))
-    return (deviation_of_sum**2 - deviation_of_difference**2) / 4

@@ -31,7 +31,7 @@ NO_RETURN = 0.05  # probability that a surface that starts returns no beams
 SWITCHES_PER_RAD = 1.0  # along a scan, from one object to another, although both look like one surface
 MIN_BEAMS = 3  # on a surface; fewer are often dust, or mixed pixels
 OUTLIER = 0.01  # probability that a single beam has an arbitrary range
-EDGE_M = 0.02  # an edge of the map may be misplaced by this, and by one beam more
+EDGE_M = 0.02  # an edge of a map that is no grid may be misplaced by this
 
 jit = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -48,8 +48,13 @@ class ScanSurfaces:
     switch_probability: float  # that the next beam on the same surface meets another object
 
     @classmethod
-    def from_scan(cls, ranges: Array, angles: Array, likelihood: Likelihood) -> ScanSurfaces:
-        """Splits a scan (B,) m along ``angles`` (B,) rad."""
+    def from_scan(
+        cls, ranges: Array, angles: Array, likelihood: Likelihood, edge_error: float = EDGE_M
+    ) -> ScanSurfaces:
+        """Splits a scan (B,) m along ``angles`` (B,) rad.
+
+        An edge of the map may be misplaced by ``edge_error`` m, and by one beam more.
+        """
         count = len(ranges)
         log_density, starts, known_log_density = np.zeros(count), np.zeros(count, np.bool_), np.zeros(count)
         _split(ranges, angles, likelihood.sigma, likelihood.relative, log_density, starts, known_log_density)
@@ -57,14 +62,18 @@ class ScanSurfaces:
         surface = np.cumsum(starts)
         small = np.bincount(surface)[surface] < MIN_BEAMS if count else starts
         edge_tolerance = np.zeros(count, np.int64)
-        _mark_edges(ranges, starts, increment, edge_tolerance)
+        _mark_edges(ranges, starts, increment, edge_error, edge_tolerance)
         switch_probability = min(0.5, SWITCHES_PER_RAD * increment)
         return cls(log_density, starts, known_log_density, small, edge_tolerance, switch_probability)
 
 
 @jit
 def _mark_edges(
-    ranges: Array, starts: npt.NDArray[np.bool_], increment: float, edge_tolerance: npt.NDArray[np.int64]
+    ranges: Array,
+    starts: npt.NDArray[np.bool_],
+    increment: float,
+    edge_error: float,
+    edge_tolerance: npt.NDArray[np.int64],
 ) -> None:
     """Fills ``edge_tolerance`` of `ScanSurfaces`."""
     last = -1
@@ -73,7 +82,7 @@ def _mark_edges(
             continue
         if starts[b] and last >= 0:
             near = min(ranges[b], ranges[last])  # the edge belongs to the nearer of the two surfaces
-            reach = 1 + int(EDGE_M / (near * increment))
+            reach = 1 + int(edge_error / (near * increment))
             for at in range(max(0, last + 1 - reach), min(ranges.shape[0], b + reach)):
                 edge_tolerance[at] = max(edge_tolerance[at], reach)
         last = b

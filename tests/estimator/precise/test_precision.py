@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from common.geometry import se2
 from services.estimator.precise.gauss_newton import View
 from services.estimator.precise.likelihood import Likelihood
-from services.estimator.precise.precision import Precision, error_covariance
+from services.estimator.precise.precision import Precision
+from services.estimator.precise.residuals import LeastSquares, error_covariance
 from services.estimator.shared.generative_models import Expected, RayCaster
 from tests.estimator.models import ROOM
 
@@ -20,14 +21,23 @@ CONFIGURED_SIGMA_M = 0.02
 
 
 class WrongMap(RayCaster):
-    """A map whose surfaces are 1 cm too far away on the left of the robot, and as much too near on the right."""
+    """A map whose surfaces are 1 cm too far away in some squares of 2 m, and as much too near in others."""
 
     ERROR = 0.01  # m
 
+    def __init__(self, world, seed):
+        super().__init__(world)
+        self.signs = np.random.default_rng(seed).choice([-1, 1], (20, 20))
+
     def expect(self, lasers, angles):
         expected = super().expect(lasers, angles)
-        error = np.where(angles > 0, self.ERROR, -self.ERROR)
-        return Expected(expected.ranges + error * expected.slope, expected.scale, expected.jacobian)
+        directions = lasers[:, 2:] + angles
+        x, y = (
+            lasers[:, :1] + expected.ranges * np.cos(directions),
+            lasers[:, 1:2] + expected.ranges * np.sin(directions),
+        )
+        sign = self.signs[(x // 2).astype(int), (y // 2).astype(int)]
+        return Expected(expected.ranges + self.ERROR * sign * expected.slope, expected.scale, expected.jacobian)
 
 
 def learned(model, noise, seed):
@@ -53,9 +63,34 @@ def test_noise_is_no_error_of_the_map(noise, seed):
 
 @pytest.mark.parametrize("noise", [0.01, 0.02, 0.04])
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=5)
+@settings(max_examples=3)
 def test_error_of_the_map(noise, seed):
-    assert learned(WrongMap(ROOM), noise, seed) == pytest.approx(WrongMap.ERROR, rel=0.2)
+    """On average over maps, it is underestimated by at most 40 %, even if the noise is four times as large.
+
+    Part of it may be due to chance and is left out, the prior that there is no error counts as one key scan, and some
+    segments on which errors count as equal lie in two squares.
+    """
+    variances = [learned(WrongMap(ROOM, [seed, k]), noise, seed) ** 2 for k in range(20)]
+    assert 0.6 < np.sqrt(np.mean(variances)) / WrongMap.ERROR < 1
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_what_remains_after_a_fit(seed):
+    """The fast sums equal those over all pairs of beams, for any errors of this covariance."""
+    rng, beams = np.random.default_rng(seed), 15
+    segments, patches = np.sort(rng.integers(0, 4, beams)), np.sort(rng.integers(0, 3, beams))
+    segments, patches = (np.unique(ids, return_inverse=True)[1] for ids in (segments, patches))
+    weights, noise_variance = rng.uniform(0.1, 1, beams), rng.uniform(0.1, 1, beams)
+    fit = LeastSquares.of(rng.standard_normal((beams, 3)), weights)
+    pairs = np.where(np.equal.outer(segments, segments), np.outer(weights, weights), 0.0)
+    np.fill_diagonal(pairs, 0.0)
+    remains = np.eye(beams) - fit.design @ fit.gain
+    of_map, of_noise = (
+        np.sum(pairs * (remains @ covariance @ remains.T)) / pairs.sum()
+        for covariance in (np.equal.outer(patches, patches), np.diag(noise_variance))
+    )
+    assert fit.expected_covariance(segments, patches, noise_variance) == pytest.approx((of_map, of_noise), abs=1e-9)
+    assert np.allclose(fit.gain @ fit.residuals(rng.standard_normal(beams)), 0, atol=1e-6)
 
 
 @given(seed=st.integers(0, 2**32 - 1))

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from common.geometry.world import World
 from services.estimator.precise import surface_evidence
+from services.estimator.precise.gauss_newton import View
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.scan_surfaces import ScanSurfaces
 from services.estimator.precise.surface_evidence import CHANGED_STATE_PRIOR, SurfaceEvidence, find_borders
@@ -171,13 +172,29 @@ def test_misplaced_edges(reach):
     assert np.isclose(found, near[beams], rtol=1e-3).tolist() == (20 - beams <= reach).tolist()
 
 
-def test_beams_near_edges():
-    """An edge at 2 m may be misplaced by 2 cm and one beam; each of these 240 beams covers 17 mm there."""
+@pytest.mark.parametrize(("edge_error", "reach"), [(0.02, 2), (0.05, 3)])
+def test_beams_near_edges(edge_error, reach):
+    """An edge at 2 m may be misplaced by this and one beam; each of these 240 beams covers 17 mm there."""
     ranges = np.full(len(ANGLES), 5.0)
     ranges[100:140] = 2.0
-    edges = ScanSurfaces.from_scan(ranges, ANGLES, Likelihood(SIGMA_M)).edge_tolerance
-    assert np.flatnonzero(edges).tolist() == [98, 99, 100, 101, 138, 139, 140, 141]
-    assert set(edges[edges > 0]) == {2}
+    edges = ScanSurfaces.from_scan(ranges, ANGLES, Likelihood(SIGMA_M), edge_error).edge_tolerance
+    beams = [beam for first in (100, 140) for beam in range(first - reach, first + reach)]
+    assert np.flatnonzero(edges).tolist() == beams
+    assert set(edges[edges > 0]) == {reach}
+
+
+def test_edges_of_a_grid():
+    """An obstacle in a grid is wider than in reality by up to a cell, so beams pass beside it."""
+    column = {"box": {"center": (3.8, 3.0), "size": (0.1, 0.22)}}
+    cells = {"box": {"center": (3.8, 3.0), "size": (0.1, 0.3)}}
+    in_map = RayCaster(World(name="square", boundary=SQUARE, obstacles=[cells]))
+    log_likelihood = [
+        View(in_map, Likelihood(SIGMA_M), np.zeros(3), ANGLES, scan(WALL, [column]), 25.0, map_cell=cell)
+        .surface_evidence(WALL[:1])
+        .log_likelihood[0]
+        for cell in (0.0, 0.05)
+    ]
+    assert log_likelihood[1] > log_likelihood[0] + 4
 
 
 def test_corners_of_the_map():
