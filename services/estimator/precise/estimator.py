@@ -65,7 +65,7 @@ WRONG_MATCH = 1e-6
 # guess). Then a wider area is searched.
 MAX_FIT_DROP = 20.0
 # Smaller errors of the map, divided by the scanner's noise, cannot be told from the noise of one scan (a guess).
-SIGNIFICANT_MAP_ERROR = 0.2
+SIGNIFICANT_MAP_ERROR = 0.25
 # Of the beams at surfaces that the map lacks, at most this fraction ends at one of its surfaces by chance. The map
 # explained less than 5 to 9 % of the scan at nine of ten wrong poses in the buildings used for development.
 EXPLAINED_BY_CHANCE = 0.1
@@ -144,7 +144,7 @@ class PreciseEstimator:
     def use_model(self, model: GenerativeModel, seeds: Seeds) -> None:
         """Replaces the model by one learned from real scans in the same frame, between two scans. The belief stays."""
         self.model, self.seeds, self._map_cell = model, seeds, 0.0
-        self._precision.forget_cells()
+        self._precision.forget_map()
 
     def update(self, observation: Observation) -> Posterior:
         """Returns the posterior after one more scan."""

@@ -74,13 +74,14 @@ class Precision:
 
     @property
     def _error_variance(self) -> float:
-        """Variance in m² of the map's errors; the prior counts as one key scan, which does not fade.
+        """Variance in m² of the map's errors; the prior counts as one key scan whose pose is known, and does not fade.
 
         Where a map is exact, the covariance is as often positive as negative, so what may be due to chance is left out.
         Until a second key scan, an error is assumed nevertheless.
         """
         by_chance = SIGNIFICANT_DEVIATIONS * float(np.sqrt(self.covariance_variance)) if self.scans > 1 else 0.0
-        return max(0.0, self.cell**2 / 6 + self.covariance - by_chance) / (1 + self.remaining)
+        significant = self.covariance - min(by_chance, max(0.0, self.covariance))
+        return max(0.0, self.cell**2 / 6 + significant) / (1 + self.remaining)
 
     @property
     def map_error(self) -> float:
@@ -110,9 +111,11 @@ class Precision:
                 self.noise_factor += _update_weight(self.noise_scans) * (factor - self.noise_factor)
         return replace(configured, sigma=self.noise_factor * configured.sigma)
 
-    def forget_cells(self) -> None:
-        """Forgets the grid, when the model is replaced by one that has learned where surfaces are in its cells."""
+    def forget_map(self) -> None:
+        """Forgets the map's errors, when the model is replaced by one that has learned where the surfaces are."""
         self.cell = self.offset = self.offset_variance = 0.0
+        self.covariance = self.covariance_variance = self.remaining = self.model_variance = 0.0
+        self.scans = 0
 
     def learn_changes(self, view: View, pose: Array) -> None:
         """Learns the fraction of beams that hit no surface of the map from a key scan at ``pose`` (3,)."""
@@ -124,8 +127,9 @@ class Precision:
         """Learns the map's errors from those of the prediction of a key scan at ``pose`` (3,).
 
         The map's errors are alike for beams on the same segment of a surface, but the scanner's noise is independent.
-        So the covariance of the errors of two such beams is the variance of the map's errors, however large the noise.
-        Scans at one place show the same errors, so only key scans are used.
+        So the covariance of the errors of two such beams is the variance of the map's errors. What the fit of the pose
+        changes about this is known (`LeastSquares.expected_covariance`). Scans at one place show the same errors, so
+        only key scans are used.
         """
         expected = view.expected(pose)
         surface, scale, slope = expected.ranges[0], expected.scale[0], expected.slope[0]

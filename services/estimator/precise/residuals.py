@@ -85,12 +85,26 @@ class LeastSquares:
         surface, independent otherwise, and that for independent noise with ``noise_variance`` (K,) m². Without a fit
         these would be 1, if each segment lies in a patch, and 0.
         """
-        pairs = sum_over_pairs(segments, self.weights)
-        # With A for the matrix of the weights of all pairs, the covariance is residuals.T @ A @ residuals / pairs.
-        on_segment = np.eye(segments[-1] + 1)[segments] * self.weights[:, None]
-        map_errors = self.residuals(np.eye(patches[-1] + 1)[patches])
-        of_map = ((on_segment.T @ map_errors) ** 2).sum() - ((self.weights[:, None] * map_errors) ** 2).sum()
-        by_design = on_segment @ (on_segment.T @ self.design) - self.weights[:, None] ** 2 * self.design  # A @ design
+        weights, design, pairs = self.weights, self.design, sum_over_pairs(segments, self.weights)
+        on_segment = _sums(weights[:, None] * design, segments)
+        # Rows are the fitted parameters if the map is wrong by 1 at one patch, and right elsewhere.
+        fitted = _sums(self.gain.T, patches)
+        # Sum over all segments and patches of the squared weighted residuals; then what pairs of a beam with itself add
+        joint = np.cumsum((np.diff(segments, prepend=0) != 0) | (np.diff(patches, prepend=0) != 0))
+        first = np.flatnonzero(np.diff(joint, prepend=-1))
+        length = np.bincount(joint, weights)
+        both = (on_segment[segments[first]] * fitted[patches[first]]).sum(axis=1)
+        square = fitted.T @ fitted
+        of_map = float((length**2 - 2 * length * both).sum() + ((on_segment @ square) * on_segment).sum())
+        residual = 1 - 2 * (design * fitted[patches]).sum(axis=1) + ((design @ square) * design).sum(axis=1)
+        of_map -= float((weights**2 * residual).sum())
+        # The product of the matrix of the weights of all pairs with the design
+        by_design = weights[:, None] * (on_segment[segments] - weights[:, None] * design)
         noise = self.gain * noise_variance
-        of_noise = ((self.design.T @ by_design) * (noise @ self.gain.T)).sum() - 2 * (noise * by_design.T).sum()
-        return float(of_map / pairs), float(of_noise / pairs)
+        of_noise = ((design.T @ by_design) * (noise @ self.gain.T)).sum() - 2 * (noise * by_design.T).sum()
+        return of_map / pairs, float(of_noise / pairs)
+
+
+def _sums(values: Array, ids: npt.NDArray[np.intp]) -> Array:
+    """Sums (N, P) of ``values`` (K, P) with the same one of the sorted ``ids`` (K,) from 0 to N - 1."""
+    return np.add.reduceat(values, np.flatnonzero(np.diff(ids, prepend=-1)), axis=0)

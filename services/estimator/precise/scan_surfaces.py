@@ -31,7 +31,7 @@ NO_RETURN = 0.05  # probability that a surface that starts returns no beams
 SWITCHES_PER_RAD = 1.0  # along a scan, from one object to another, although both look like one surface
 MIN_BEAMS = 3  # on a surface; fewer are often dust, or mixed pixels
 OUTLIER = 0.01  # probability that a single beam has an arbitrary range
-EDGE_M = 0.02  # an edge of a map that is no grid may be misplaced by this
+EDGE_M = 0.02  # an edge of the map may be misplaced by this, or by a cell of a grid if that is larger
 
 jit = numba.njit(cache=True, nogil=True, error_model="numpy")
 

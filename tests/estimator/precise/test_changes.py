@@ -196,6 +196,8 @@ def test_map_error_of_the_first_scan():
         off = (found.pose - truth * [1.01, 1.01, 1.0])[:2]
         errors.append(off @ np.linalg.solve(found.covariance[:2, :2], off))
     assert np.mean(np.array(errors) < 25) > 0.8, errors
+    assert np.median(errors) < 12, errors
+    assert np.mean(errors) < 40, errors
 
 
 def test_surfaces_in_the_cells_of_a_grid():

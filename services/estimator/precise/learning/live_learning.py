@@ -43,6 +43,7 @@ RECIPE = Recipe(resolution=0.05, sweeps=6, beams_per_sweep=500_000)
 MAX_REPLAYED_SCANS = 2000  # predicted by the original model; at most one for each place
 PRECISE_M = 1e-3  # error of an original model whose replayed scans count as much as measured ones
 LASTING_S, LASTING_CELL_M = 3.0, 0.1  # a surface is learned if beams end in or beside its cell this long apart
+MAX_WORSENING = 1.1  # factor (a guess) on the mean error where both models predict a surface
 EPOCHS = 4  # parts of the key scans, of which each may contradict those before it
 ALIGNMENTS = 3  # times that the key scans are matched to the field learned from them
 ALIGNMENT_SCHEDULE_M = (0.02, 0.0, 0.0)  # added to the deviation of every beam, step by step
@@ -65,7 +66,8 @@ def learn_version(
 ) -> ModelVersion | None:
     """Learns a field from key scans and the ``original`` model, which knows the surroundings of ``places`` (S, 2) m.
 
-    Returns None if the new field predicts held-out key scans no better than the model in use, ``present``.
+    Returns None if the new field predicts held-out key scans no better than the model in use, ``present``. It may do so
+    by predicting more surfaces, if it is not much worse at those that both predict.
     """
     tracked = remove_moving_objects(keys)
     sigma = estimate_noise(tracked.ranges, tracked.angles)
@@ -91,6 +93,8 @@ def learn_version(
         return None
     common = np.isfinite(errors + present_errors)
     errors, present_errors = errors[common], present_errors[common]
+    if mean_error(errors) > MAX_WORSENING * mean_error(present_errors):
+        return None
     scales = learn_scales(trial.field, held_out.poses, held_out.mount, held_out.angles, held_out.ranges, sigma)
     ripple = measure_ripple(trial.field, se2.compose(held_out.poses, held_out.mount), held_out.angles)
     final = _learn(aligned, overlapping.joined(elsewhere), recipe, EPOCHS)
