@@ -41,6 +41,7 @@ SEGMENT_LENGTH_M = 0.5
 MAX_MAP_ERROR_M = 0.1
 SIGNIFICANT_DEVIATIONS = 2.0  # by which a covariance may be too large by chance
 MIN_LEARNING_BEAMS, MIN_LEARNING_FRACTION = 30, 0.3  # of a scan's beams; nothing is learned from fewer
+MIN_REMAINING = 1e-3  # of the errors after the fit of the pose; limits the division by it
 ROOM_KEY_SCANS = 20  # in a room (a guess); in the next room, surfaces may have another mean place in their cells
 
 
@@ -164,8 +165,9 @@ class Precision:
         self.model_variance += weight * (float(np.average(model_variance, weights=lengths)) - self.model_variance)
         if self.cell:
             # Both in m³: a variance times the length of surface over which errors are alike, which for independent ones
-            # is the length that one beam covers.
-            correlated_part = self._error_variance * CORRELATION_LENGTH_M
+            # is the length that one beam covers. The former is as measured, without the prior, by which the offset of a
+            # grid drawn exactly along its cells would remain uncertain for long.
+            correlated_part = max(0.0, self.covariance) / max(self.remaining, MIN_REMAINING) * CORRELATION_LENGTH_M
             independent_part = float(np.average(model_variance + noise**2, weights=lengths) * lengths.mean())
             variance = (correlated_part + independent_part) * float(fit.inverse[3, 3])
             self._learn_offset(view.map_offset + float(fit.gain[3] @ errors), variance)
