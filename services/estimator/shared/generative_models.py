@@ -10,6 +10,8 @@ import numpy as np
 from common.geometry.ray_casting import cast_rays, cast_rays_with_jacobian
 
 if TYPE_CHECKING:
+    import numpy.typing as npt
+
     from common.geometry.se2 import Array
     from common.geometry.world import World
 
@@ -80,7 +82,7 @@ class RayCaster:
         lasers, angles = np.array(lasers, float).reshape(-1, 3), np.asarray(angles, float)
         ranges, jacobian = cast_rays_with_jacobian(self.world, lasers, angles)
         # A laser cannot be inside an object, so an object of the map around it must have been removed.
-        inside = self.world.surface_distance(lasers[:, :2]) < 0
+        inside = (self.world.surface_distance(lasers[:, :2]) < 0) & ~self._in_circle(lasers)
         if inside.any():
             rays = _advanced(lasers[inside, None], angles, ranges[inside] + PASSED_M)
             further, derivatives = cast_rays_with_jacobian(self.world, rays.reshape(-1, 3), np.zeros(1))
@@ -98,13 +100,17 @@ class RayCaster:
         pose, beam = np.nonzero(np.isfinite(behind))
         lasers, angles, start = lasers[pose], angles[beam], behind[pose, beam] + PASSED_M
         rays = _advanced(lasers, angles, start)
-        # Continue from the far side of the object that was hit. Rays do not hit a circle from inside.
-        in_circle = np.zeros(len(rays), bool)
-        for x, y, radius in self.world.circles:
-            in_circle |= np.hypot(rays[:, 0] - x, rays[:, 1] - y) < radius
-        start += np.where(in_circle, 0.0, cast_rays(self.world, rays, np.zeros(1))[:, 0] + PASSED_M)
+        # Continue from the far side of the object that was hit.
+        start += np.where(self._in_circle(rays), 0.0, cast_rays(self.world, rays, np.zeros(1))[:, 0] + PASSED_M)
         behind[pose, beam] = start + cast_rays(self.world, _advanced(lasers, angles, start), np.zeros(1))[:, 0]
         return behind
+
+    def _in_circle(self, poses: Array) -> npt.NDArray[np.bool_]:
+        """Mask (N,) of the poses (N, 3) in a circle, which rays from inside do not hit."""
+        inside = np.zeros(len(poses), np.bool_)
+        for x, y, radius in self.world.circles:
+            inside |= np.hypot(poses[:, 0] - x, poses[:, 1] - y) < radius
+        return inside
 
 
 def _advanced(lasers: Array, angles: Array, distances: Array) -> Array:

@@ -23,7 +23,12 @@ def analytic(resolution: float = 0.05) -> DistanceField:
     return DistanceField(np.minimum(walls, disc).astype(np.float32), (-0.5, -0.5), resolution)
 
 
-ANALYTIC_WORLD = World(name="disc", boundary=BOX.boundary, obstacles=[{"circle": {"center": (4.5, 3), "radius": 0.4}}])
+def world_with(obstacle):
+    return World(name="obstacle", boundary=BOX.boundary, obstacles=[obstacle])
+
+
+ANALYTIC_WORLD = world_with({"circle": {"center": (4.5, 3), "radius": 0.4}})
+BOX_THERE = {"center": (4.5, 3), "size": (0.8, 0.6)}
 
 
 def poses_in(world: World, count: int, seed: int) -> np.ndarray:
@@ -63,10 +68,18 @@ def test_no_surface():
     assert not found.jacobian.any()
 
 
-def test_inside_a_surface():
-    """A laser cannot be there, so the disc was removed: its beams leave it and meet the walls."""
-    inside = np.array([[4.5, 3.0, 0.0]])
-    assert analytic().trace(inside, ANGLES).ranges == pytest.approx(BOX.ray_distances(inside, ANGLES), abs=2e-3)
+@pytest.mark.parametrize(
+    "model",
+    [FieldModel(analytic(0.02)), RayCaster(ANALYTIC_WORLD), RayCaster(world_with({"box": BOX_THERE}))],
+    ids=["field", "circle", "box"],
+)
+def test_inside_a_surface(model):
+    """A laser cannot be there, so the object was removed: its beams leave it and meet the walls."""
+    inside, expected = np.array([[4.4, 2.9, 0.3]]), RayCaster(BOX)
+    found = model.expect(inside, ANGLES)
+    assert found.ranges == pytest.approx(expected.expect(inside, ANGLES).ranges, abs=2e-3)
+    assert np.quantile(np.abs(found.jacobian - expected.expect(inside, ANGLES).jacobian), 0.98) < 0.02
+    assert np.isinf(model.expect_behind(inside, ANGLES, found.ranges)).all()
 
 
 @pytest.mark.parametrize("model", [FieldModel(analytic(0.02)), RayCaster(ANALYTIC_WORLD)], ids=["field", "exact"])
