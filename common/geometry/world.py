@@ -265,6 +265,19 @@ class World(WorldPart):
             found.append(points[shapely.contains(room, shapely.points(points)) & (self.clearance(points) >= clearance)])
         return np.concatenate(found)[:count]
 
+    def sample_within_walls(self, count: int, rng: np.random.Generator) -> Array:
+        """(count, 2) points distributed uniformly within the walls, also under obstacles.
+
+        In a world with a grid, the free cells count as within the walls.
+        """
+        x0, y0, x1, y1 = self.bounds
+        shapely.prepare(self._inside)
+        found: list[Array] = []
+        while sum(map(len, found)) < count:
+            points = rng.uniform([x0, y0], [x1, y1], (max(count, 256), 2))
+            found.append(points[shapely.contains(self._inside, shapely.points(points))])
+        return np.concatenate(found)[:count]
+
     def sample_poses(self, count: int, rng: np.random.Generator, clearance: float) -> Array:
         """Random poses (count, 3) at places from `sample_free`, with uniform headings."""
         places = self.sample_free(count, rng, clearance)

@@ -50,6 +50,18 @@ def test_samples(seed, clearance):
     assert np.array_equal(points, ROOM.sample_free(20, np.random.default_rng(seed), clearance))
 
 
+@given(st.integers(0, 2**32 - 1))
+def test_samples_within_walls(seed):
+    """Their density is the same in free space and in obstacles."""
+    column = {"circle": {"center": (1.0, 1.0), "radius": 0.5}}
+    world = World(name="w", boundary=[(0, 0), (2, 0), (2, 2), (0, 2)], obstacles=[column])
+    points = world.sample_within_walls(2000, np.random.default_rng(seed))
+    assert points.shape == (2000, 2)
+    assert ((points > 0) & (points < 2)).all()
+    share = np.pi * 0.5**2 / 4
+    assert (world.clearance(points) < 0).mean() == pytest.approx(share, abs=5 * np.sqrt(share / 2000))
+
+
 def test_no_room_for_samples():
     with pytest.raises(UserError, match="no place 4 m clear"):
         ROOM.sample_free(1, np.random.default_rng(0), 4)

@@ -173,6 +173,22 @@ def test_probability_of_being_near(seed):
             assert found == pytest.approx(near.mean(), abs=0.02)
 
 
+@pytest.mark.parametrize(
+    "cupboard",
+    [{"box": {"center": (6.0, 2.5), "size": (2.0, 1.6)}}, {"circle": {"center": (6.0, 2.5), "radius": 0.9}}],
+    ids=["box", "round"],
+)
+def test_unknown_start_where_a_cupboard_was_removed(cupboard):
+    mapped = World(name="hall", boundary=HALL.boundary, obstacles=[*HALL.obstacles, cupboard])
+    scene = Scene.of(HALL, BEAMS, 3)
+    made = prepare_factory(EstimatorOptions(mapped, "precise", "exact"))(ScannerGeometry.of(scene.scanner))
+    for truth in np.array([[6.0, 2.5, 0.3], [6.1, 2.4, -2.0]]):
+        made.restart()
+        found = drive(made, scene, truth[None])[0]
+        assert tasks.is_at(found.pose, truth)
+        assert found.state == "tracking"
+
+
 @pytest.mark.parametrize("there", [(5.05, 4.47, 0.48), (4.77, 3.81, 0.57)])
 def test_carried_nearby(there):
     """A robot that was carried so little that the scan matches at once is tracked at once, too."""
