@@ -125,9 +125,9 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity --worlds 3 --seed 3458 --model exact --seconds 10
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-long-corridor --worlds 20 --seed 3462 --model exact --seconds 10 --cases long-corridor --estimators precise
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-noisy-map --worlds 20 --seed 3457 --model exact --seconds 40 --cases noisy-map
-	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-50 --worlds 20 --seed 3459 --model exact --cases moved-50
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-50 --worlds 20 --seed 3463 --model exact --cases moved-50
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-100 --worlds 20 --seed 3460 --model exact --seconds 10 --cases moved-100 --estimators precise
-	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-single-scan --worlds 20 --seed 3461 --model exact --cases single-scan-moved-50 --estimators precise
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-single-scan --worlds 20 --seed 3464 --model exact --cases single-scan-moved-50 --estimators precise
 	for folder in $(RESULTS)/integrity*/; do cp $$folder/integrity.json docs/experiments/$$(basename $$folder).json || exit 1; done
 	cp $(RESULTS)/integrity/integrity.png $(RESULTS)/*.json $(RESULTS)/*.csv $(RESULTS)/*.png $(RESULTS)/*.pdf docs/experiments/
 	mv docs/experiments/accuracy.png docs/accuracy.png
