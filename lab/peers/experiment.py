@@ -35,7 +35,7 @@ STANDING, ODOMETRY, LASER = "standing", "odometry", "laser"
 TASKS = {
     STANDING: "a: standing at unknown places",
     ODOMETRY: "b: tracking with odometry",
-    LASER: "c: tracking without",
+    LASER: "c: tracking without odometry",
 }
 # The maps: given as polygons or as an occupancy grid, or a field learned from that grid or from scans with known poses.
 POLYGONS, CELLS, FIELD, POSED = "polygons", "5 cm map", "learned from 5 cm map", "learned from posed scans"

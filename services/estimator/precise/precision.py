@@ -41,7 +41,7 @@ SEGMENT_LENGTH_M = 0.5
 MAX_MAP_ERROR_M = 0.1
 SIGNIFICANT_DEVIATIONS = 2.0  # by which a covariance may be too large by chance
 MIN_LEARNING_BEAMS, MIN_LEARNING_FRACTION = 30, 0.3  # of a scan's beams; nothing is learned from fewer
-MIN_REMAINING = 1e-3  # of the errors after the fit of the pose; limits the division by it
+MIN_EXPECTED_SUM = 1e-3  # limits the division by it
 ROOM_KEY_SCANS = 20  # in a room (a guess); in the next room, surfaces may have another mean place in their cells
 
 
@@ -54,11 +54,11 @@ class Precision:
     cell: float = 0.0  # m, edge of the cells if the map is a grid
     offset: float = 0.0  # m, mean distance of the real surfaces behind the front of the cells, where the robot is
     offset_variance: float = 0.0  # m²
-    # Sums over key scans, of which the older ones fade. The pose was fitted to the scan, so part of the map's errors
-    # does not show in what remains.
-    covariance: float = 0.0  # m², of the remaining errors at two beams on the same segment of a surface
-    covariance_variance: float = 0.0  # m⁴, of the covariance, due to the scanner's noise
-    remaining: float = 0.0  # fraction of the map's errors that remains
+    # Sums over key scans, of which the older ones fade. The pose was fitted to each scan, so part of the map's errors
+    # does not show in the residuals.
+    covariance_sum: float = 0.0  # m², covariances of the residuals at two beams on the same segment of a surface
+    covariance_sum_variance: float = 0.0  # m⁴, its variance due to the scanner's noise
+    expected_sum: float = 0.0  # the covariances that are expected for errors of the map with variance 1
     model_variance: float = 0.0  # m², mean variance of the map's errors as the model states it
     scans: int = 0  # key scans from which the map's errors were learned
     noise_scans: int = 0  # scans from which the noise was learned
@@ -80,9 +80,9 @@ class Precision:
         Where a map is exact, the covariance is as often positive as negative, so what may be due to chance is left out.
         Until a second key scan, an error is assumed nevertheless.
         """
-        by_chance = SIGNIFICANT_DEVIATIONS * float(np.sqrt(self.covariance_variance)) if self.scans > 1 else 0.0
-        significant = self.covariance - min(by_chance, max(0.0, self.covariance))
-        return max(0.0, self.cell**2 / 6 + significant) / (1 + self.remaining)
+        by_chance = SIGNIFICANT_DEVIATIONS * float(np.sqrt(self.covariance_sum_variance)) if self.scans > 1 else 0.0
+        significant = self.covariance_sum - min(by_chance, max(0.0, self.covariance_sum))
+        return max(0.0, self.cell**2 / 6 + significant) / (1 + self.expected_sum)
 
     @property
     def map_error(self) -> float:
@@ -96,7 +96,7 @@ class Precision:
 
     @property
     def correlated_fraction(self) -> float:
-        """Fraction of the variance of the map's error that is alike for beams on the same segment."""
+        """Fraction of the variance of the map's error that is alike along a surface, for `CORRELATION_LENGTH_M`."""
         total = max(self._error_variance, self.model_variance)
         return self._error_variance / total if total > 0 else 0.0
 
@@ -115,7 +115,7 @@ class Precision:
     def forget_map(self) -> None:
         """Forgets the map's errors, when the model is replaced by one that has learned where the surfaces are."""
         self.cell = self.offset = self.offset_variance = 0.0
-        self.covariance = self.covariance_variance = self.remaining = self.model_variance = 0.0
+        self.covariance_sum = self.covariance_sum_variance = self.expected_sum = self.model_variance = 0.0
         self.scans = 0
 
     def learn_changes(self, view: View, pose: Array) -> None:
@@ -144,7 +144,7 @@ class Precision:
         surfaces = np.cumsum(view.surfaces.starts)[used]
         segments = segment_ids(surfaces, spacing, SEGMENT_LENGTH_M)
         robust = robust_covariance(errors, segments) - float(np.median(model_variance))
-        if robust > view.map_error**2:  # with too small an error, no surface would be explained
+        if robust > view.map_error**2:  # with too small an assumed error, all surfaces would look changed
             view = replace(view, map_error=float(np.sqrt(robust)))
         # Weighted by length of surface instead of by beam, because near surfaces have more beams.
         lengths = view.surface_evidence(pose[None]).weights[0, used] * spacing
@@ -152,22 +152,24 @@ class Precision:
             return
         design = np.column_stack([expected.jacobian[0, used] / slope[:, None], np.ones(len(errors))])
         fit = LeastSquares.of(design if self.cell else design[:, :3], lengths)  # the pose, and in a grid the offset
-        patches = segment_ids(surfaces, spacing, CORRELATION_LENGTH_M)
-        remaining, by_noise = fit.expected_covariance(segments, patches, noise**2)
+        long_segments = segment_ids(surfaces, spacing, CORRELATION_LENGTH_M)
+        of_map_errors, by_noise = fit.expected_covariance(segments, long_segments, noise**2)
         fading = 1 - MIN_UPDATE_WEIGHT
         self.scans += 1
-        self.covariance *= fading
-        self.covariance += error_covariance(fit.residuals(errors), segments, lengths) - by_noise
-        self.covariance_variance *= fading**2
-        self.covariance_variance += variance_by_noise(segments, lengths, noise**2)
-        self.remaining = fading * self.remaining + remaining
+        self.covariance_sum *= fading
+        self.covariance_sum += error_covariance(fit.residuals(errors), segments, lengths) - by_noise
+        self.covariance_sum_variance *= fading**2
+        self.covariance_sum_variance += variance_by_noise(segments, lengths, noise**2)
+        self.expected_sum = fading * self.expected_sum + of_map_errors
         weight = _update_weight(self.scans)
         self.model_variance += weight * (float(np.average(model_variance, weights=lengths)) - self.model_variance)
         if self.cell:
             # Both in m³: a variance times the length of surface over which errors are alike, which for independent ones
             # is the length that one beam covers. The former is as measured, without the prior, by which the offset of a
             # grid drawn exactly along its cells would remain uncertain for long.
-            correlated_part = max(0.0, self.covariance) / max(self.remaining, MIN_REMAINING) * CORRELATION_LENGTH_M
+            correlated_part = (
+                max(0.0, self.covariance_sum) / max(self.expected_sum, MIN_EXPECTED_SUM) * CORRELATION_LENGTH_M
+            )
             independent_part = float(np.average(model_variance + noise**2, weights=lengths) * lengths.mean())
             variance = (correlated_part + independent_part) * float(fit.inverse[3, 3])
             self._learn_offset(view.map_offset + float(fit.gain[3] @ errors), variance)

@@ -77,31 +77,33 @@ class LeastSquares:
         return np.asarray(errors - self.design @ (self.gain @ errors))
 
     def expected_covariance(
-        self, segments: npt.NDArray[np.intp], patches: npt.NDArray[np.intp], noise_variance: Array
+        self, segments: npt.NDArray[np.intp], long_segments: npt.NDArray[np.intp], noise_variance: Array
     ) -> tuple[float, float]:
         """The values of `error_covariance` that are expected for the residuals.
 
-        Returns that for errors of the map with variance 1, equal at beams on the same of the ``patches`` (K,) of
-        surface, independent otherwise, and that for independent noise with ``noise_variance`` (K,) m². Without a fit
-        these would be 1, if each segment lies in a patch, and 0.
+        The first is for errors of the map with variance 1 that are equal on each of the ``long_segments`` (K,) and
+        independent between them, the second for independent noise with ``noise_variance`` (K,) m². Without a fit, they
+        would be 1 (if each segment lies in a long one) and 0.
+
+        For errors with covariance C, the value is tr(W R C R') / sum(W). W has the products of the weights of all pairs
+        of beams on the same segment, and the residuals are R = I - design gain times the errors.
         """
         weights, design, pairs = self.weights, self.design, sum_over_pairs(segments, self.weights)
         on_segment = _sums(weights[:, None] * design, segments)
-        # Rows are the fitted parameters if the map is wrong by 1 at one patch, and right elsewhere.
-        fitted = _sums(self.gain.T, patches)
-        # Sum over all segments and patches of the squared weighted residuals; then what pairs of a beam with itself add
-        joint = np.cumsum((np.diff(segments, prepend=0) != 0) | (np.diff(patches, prepend=0) != 0))
-        first = np.flatnonzero(np.diff(joint, prepend=-1))
-        length = np.bincount(joint, weights)
-        both = (on_segment[segments[first]] * fitted[patches[first]]).sum(axis=1)
-        square = fitted.T @ fitted
-        of_map = float((length**2 - 2 * length * both).sum() + ((on_segment @ square) * on_segment).sum())
-        residual = 1 - 2 * (design * fitted[patches]).sum(axis=1) + ((design @ square) * design).sum(axis=1)
-        of_map -= float((weights**2 * residual).sum())
-        # The product of the matrix of the weights of all pairs with the design
-        by_design = weights[:, None] * (on_segment[segments] - weights[:, None] * design)
+        shift = _sums(self.gain.T, long_segments)  # of the fitted parameters by an error of 1 m on each long segment
+        gram = shift.T @ shift
+        # Beams that share both a segment and a long one
+        shared = np.cumsum((np.diff(segments, prepend=0) != 0) | (np.diff(long_segments, prepend=0) != 0))
+        first = np.flatnonzero(np.diff(shared, prepend=-1))
+        weight = np.bincount(shared, weights)
+        cross = (on_segment[segments[first]] * shift[long_segments[first]]).sum(axis=1)
+        of_map = float((weight**2 - 2 * weight * cross).sum() + ((on_segment @ gram) * on_segment).sum())
+        # Less the products of each beam with itself
+        variance = 1 - 2 * (design * shift[long_segments]).sum(axis=1) + ((design @ gram) * design).sum(axis=1)
+        of_map -= float((weights**2 * variance).sum())
+        w_design = weights[:, None] * (on_segment[segments] - weights[:, None] * design)  # W times the design
         noise = self.gain * noise_variance
-        of_noise = ((design.T @ by_design) * (noise @ self.gain.T)).sum() - 2 * (noise * by_design.T).sum()
+        of_noise = ((design.T @ w_design) * (noise @ self.gain.T)).sum() - 2 * (noise * w_design.T).sum()
         return of_map / pairs, float(of_noise / pairs)
 
 

@@ -119,8 +119,8 @@ def test_noise_hides_the_error_of_a_grid():
 def test_what_remains_after_a_fit(seed):
     """The fast sums equal those over all pairs of beams, for any errors of this covariance."""
     rng, beams = np.random.default_rng(seed), 15
-    segments, patches = np.sort(rng.integers(0, 4, beams)), np.sort(rng.integers(0, 3, beams))
-    segments, patches = (np.unique(ids, return_inverse=True)[1] for ids in (segments, patches))
+    segments, long_segments = np.sort(rng.integers(0, 4, beams)), np.sort(rng.integers(0, 3, beams))
+    segments, long_segments = (np.unique(ids, return_inverse=True)[1] for ids in (segments, long_segments))
     weights, noise_variance = rng.uniform(0.1, 1, beams), rng.uniform(0.1, 1, beams)
     fit = LeastSquares.of(rng.standard_normal((beams, 3)), weights)
     pairs = np.where(np.equal.outer(segments, segments), np.outer(weights, weights), 0.0)
@@ -128,9 +128,11 @@ def test_what_remains_after_a_fit(seed):
     remains = np.eye(beams) - fit.design @ fit.gain
     of_map, of_noise = (
         np.sum(pairs * (remains @ covariance @ remains.T)) / pairs.sum()
-        for covariance in (np.equal.outer(patches, patches), np.diag(noise_variance))
+        for covariance in (np.equal.outer(long_segments, long_segments), np.diag(noise_variance))
     )
-    assert fit.expected_covariance(segments, patches, noise_variance) == pytest.approx((of_map, of_noise), abs=1e-9)
+    assert fit.expected_covariance(segments, long_segments, noise_variance) == pytest.approx(
+        (of_map, of_noise), abs=1e-9
+    )
     assert np.allclose(fit.gain @ fit.residuals(rng.standard_normal(beams)), 0, atol=1e-6)
 
 
@@ -159,7 +161,7 @@ def test_place_in_the_cells_of_another_room(seed):
 
 @pytest.mark.parametrize("assumed", [0.005, 0.015, 0.03])
 def test_offset_that_the_scan_was_matched_with(assumed):
-    """The place in the cells is learned from scans that were predicted with any other offset than the one learned."""
+    """The learned place in the cells does not depend on the offset that the prediction assumed."""
     rng, precision = np.random.default_rng(0), Precision.before_first_scan(0.05)
     for pose in ROOM.sample_poses(20, rng, 0.3):
         seen = RayCaster(ROOM).expect(se2.compose(pose, MOUNT)[None], ANGLES)

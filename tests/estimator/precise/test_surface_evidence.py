@@ -184,7 +184,7 @@ def test_beams_near_edges(edge_error, reach):
 
 
 def test_edges_of_a_grid():
-    """An obstacle in a grid is wider than in reality by up to a cell, so beams pass beside it."""
+    """An obstacle in a grid is up to a cell too wide, so beams pass where the map shows it."""
     column = {"box": {"center": (3.8, 3.0), "size": (0.1, 0.22)}}
     cells = {"box": {"center": (3.8, 3.0), "size": (0.1, 0.3)}}
     in_map = RayCaster(World(name="square", boundary=SQUARE, obstacles=[cells]))
