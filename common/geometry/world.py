@@ -256,26 +256,23 @@ class World(WorldPart):
         """
         if self.grid is not None:
             return self._sample_cells(count, rng, clearance)
-        x0, y0, x1, y1 = self.bounds
-        room = self._room(clearance)
-        shapely.prepare(room)
-        found: list[Array] = []
-        while sum(map(len, found)) < count:
-            points = rng.uniform([x0, y0], [x1, y1], (max(count, 256), 2))
-            found.append(points[shapely.contains(room, shapely.points(points)) & (self.clearance(points) >= clearance)])
-        return np.concatenate(found)[:count]
+        return self._sample(self._room(clearance), count, rng, clearance)
 
     def sample_within_walls(self, count: int, rng: np.random.Generator) -> Array:
-        """(count, 2) points distributed uniformly within the walls, also under obstacles.
+        """(count, 2) points distributed uniformly within the walls, also under obstacles; free cells in a grid."""
+        return self._sample(self._inside, count, rng)
 
-        In a world with a grid, the free cells count as within the walls.
-        """
+    def _sample(
+        self, area: shapely.Geometry, count: int, rng: np.random.Generator, clearance: float | None = None
+    ) -> Array:
+        """(count, 2) points distributed uniformly over the area, of those with at least the ``clearance`` if given."""
         x0, y0, x1, y1 = self.bounds
-        shapely.prepare(self._inside)
+        shapely.prepare(area)
         found: list[Array] = []
         while sum(map(len, found)) < count:
             points = rng.uniform([x0, y0], [x1, y1], (max(count, 256), 2))
-            found.append(points[shapely.contains(self._inside, shapely.points(points))])
+            points = points[shapely.contains(area, shapely.points(points))]
+            found.append(points if clearance is None else points[self.clearance(points) >= clearance])
         return np.concatenate(found)[:count]
 
     def sample_poses(self, count: int, rng: np.random.Generator, clearance: float) -> Array:

@@ -82,7 +82,8 @@ class RayCaster:
         lasers, angles = np.array(lasers, float).reshape(-1, 3), np.asarray(angles, float)
         ranges, jacobian = cast_rays_with_jacobian(self.world, lasers, angles)
         # A laser cannot be inside an object, so an object of the map around it must have been removed.
-        inside = (self.world.surface_distance(lasers[:, :2]) < 0) & ~self._in_circle(lasers)
+        inside = self.world.surface_distance(lasers[:, :2]) < 0
+        inside[inside] = ~self._in_circle(lasers[inside])
         if inside.any():
             rays = _advanced(lasers[inside, None], angles, ranges[inside] + PASSED_M)
             further, derivatives = cast_rays_with_jacobian(self.world, rays.reshape(-1, 3), np.zeros(1))

@@ -136,40 +136,37 @@ def test_what_remains_after_a_fit(seed):
     assert np.allclose(fit.gain @ fit.residuals(rng.standard_normal(beams)), 0, atol=1e-6)
 
 
+def learn_in_cells(precision, offset, count, rng, assumed=None):
+    """Learns from key scans of surfaces that are ``offset`` m behind the front of their cells.
+
+    They are predicted with an ``assumed`` offset, by default the one learned so far.
+    """
+    for pose in ROOM.sample_poses(count, rng, 0.3):
+        seen = RayCaster(ROOM).expect(se2.compose(pose, MOUNT)[None], ANGLES)
+        ranges = seen.ranges[0] + offset * seen.slope[0] + 0.02 * rng.standard_normal(len(ANGLES))
+        view = View(
+            RayCaster(ROOM), Likelihood(sigma=0.02), MOUNT, ANGLES, ranges, 25.0, map_error=precision.map_error,
+            map_offset=precision.offset if assumed is None else assumed,
+        )  # fmt: skip
+        precision.learn_map_error(view, pose)
+
+
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=5)
 def test_place_in_the_cells_of_another_room(seed):
     """After a long drive where surfaces are 15 mm behind the front of their cells, they are 5 mm behind it."""
-    cell = 0.05
-    rng, precision = np.random.default_rng(seed), Precision.before_first_scan(cell)
-
-    def drive(offset, count):
-        for pose in ROOM.sample_poses(count, rng, 0.3):
-            seen = RayCaster(ROOM).expect(se2.compose(pose, MOUNT)[None], ANGLES)
-            ranges = seen.ranges[0] + offset * seen.slope[0] + 0.02 * rng.standard_normal(len(ANGLES))
-            view = View(
-                RayCaster(ROOM), Likelihood(sigma=0.02), MOUNT, ANGLES, ranges, 25.0,
-                map_error=precision.map_error, map_offset=precision.offset,
-            )  # fmt: skip
-            precision.learn_map_error(view, pose)
-
-    drive(0.015, 30)
+    rng, precision = np.random.default_rng(seed), Precision.before_first_scan(0.05)
+    learn_in_cells(precision, 0.015, 30, rng)
     assert precision.offset == pytest.approx(0.015, abs=0.003)
-    drive(0.005, 10)
+    learn_in_cells(precision, 0.005, 10, rng)
     assert precision.offset == pytest.approx(0.005, abs=0.003)
 
 
 @pytest.mark.parametrize("assumed", [0.005, 0.015, 0.03])
 def test_offset_that_the_scan_was_matched_with(assumed):
     """The learned place in the cells does not depend on the offset that the prediction assumed."""
-    rng, precision = np.random.default_rng(0), Precision.before_first_scan(0.05)
-    for pose in ROOM.sample_poses(20, rng, 0.3):
-        seen = RayCaster(ROOM).expect(se2.compose(pose, MOUNT)[None], ANGLES)
-        ranges = seen.ranges[0] + 0.015 * seen.slope[0] + 0.02 * rng.standard_normal(len(ANGLES))
-        view = View(
-            RayCaster(ROOM), Likelihood(sigma=0.02), MOUNT, ANGLES, ranges, 25.0, map_error=0.01, map_offset=assumed
-        )
-        precision.learn_map_error(view, pose)
+    precision = Precision.before_first_scan(0.05)
+    learn_in_cells(precision, 0.015, 20, np.random.default_rng(0), assumed)
     assert precision.offset == pytest.approx(0.015, abs=0.003)
 
 
