@@ -203,7 +203,7 @@ def load_model(options: EstimatorOptions, world: World) -> tuple[GenerativeModel
     """Returns the model, the seeds of a search, and the card of a learned model, else None."""
     if options.generative_model is None and options.model != "exact":
         return weights.load(field_path(options, world))
-    # The robot may be where an obstacle of the map was removed. A grid does not tell what are walls.
+    # The robot may be where an obstacle of the map was removed. A grid does not tell walls from furniture.
     count, rng = max(4000, int(60 * world.free_area)), np.random.default_rng(0)
     places = world.sample_within_walls(count, rng) if world.grid is None else world.sample_free(count, rng, 0.05)
     model = options.generative_model or RayCaster(world)
