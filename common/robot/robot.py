@@ -24,7 +24,7 @@ class Robot(BaseModel):
     dead_band: NotNegative = 0.0  # m/s, slower commands do not move the base
     turn_dead_band: NotNegative = 0.0  # rad/s, slower commands do not turn it
     latency: NotNegative = 0.0  # s, from a command to its effect
-    margin: Positive = 0.05  # m, gap that the obstacle stop keeps
+    margin: Positive = 0.02  # m, gap that the obstacle stop keeps
     command_timeout: Positive = 0.2  # s without a new command until the robot brakes hard
     command_age: Positive = 0.5  # s, commands for older scans are ignored
     braking: Positive = 5.0  # m/s², of hard braking

@@ -11,18 +11,40 @@ from common.robot.ranges import is_surface
 from common.robot.robot import Robot
 
 REACTION_TIME_S = 2 / 15  # the scan is up to one 15 Hz period old, and the command holds for another
-FOOTPRINT_MARGIN_M = 0.01  # distance around the footprint that must be free
 PATH_STEP_S = 1 / 60  # between the points of a stopping path: 17 mm at 1 m/s, which is exact to 0.1 mm
+# A surface is averaged over this distance to either side of a beam, and over ranges that differ by at most this much: a
+# few times the noise of usual scanners. Anything in front of a wall by more than that keeps its distance.
+AVERAGE_WITHIN_M, MAX_RANGE_DIFFERENCE_M = 0.015, 0.06
+MAX_AVERAGED_BEAMS = 8  # to either side
 
 
 def scan_points(scan: Scan) -> Array:
-    """(K, 2) end points in m in base_link of the beams that hit something; too close (-inf) counts as at range_min."""
+    """(K, 2) points in m in base_link on the surfaces that the beams hit; too close (-inf) counts as at range_min.
+
+    Each is the mean of the end points of neighbouring beams that end within centimetres. Otherwise the robot would stop
+    before the largest of hundreds of errors: several centimetres too early. The mean of points of a straight wall lies
+    on the wall; that of a corner or a round post lies behind its surface by at most a few millimetres.
+    """
     close = np.isneginf(scan.ranges)
     hit = is_surface(scan.ranges) | close
     ranges = np.where(close, scan.range_min, scan.ranges.astype(np.float64))
-    angles, ranges = scan.angles()[hit], ranges[hit]
-    in_laser = np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=-1)
-    return se2.transform(scan.mount.array(), in_laser)
+    ranges[~hit] = np.inf
+    angles = scan.angles()
+    with np.errstate(invalid="ignore"):  # inf times cos(90°)
+        ends = np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=-1)
+    spacing = abs(scan.angle_increment) * ranges  # m between neighbouring end points across the beam
+    total, count = ends.copy(), np.ones(len(ranges))
+    for offset in range(1, min(MAX_AVERAGED_BEAMS, len(ranges) - 1) + 1):
+        first, second = slice(None, -offset), slice(offset, None)
+        with np.errstate(invalid="ignore"):  # inf - inf
+            same = np.abs(ranges[first] - ranges[second]) <= MAX_RANGE_DIFFERENCE_M
+        same &= offset * np.minimum(spacing[first], spacing[second]) <= AVERAGE_WITHIN_M
+        if not same.any():
+            break
+        for here, other in ((first, second), (second, first)):
+            total[here][same] += ends[other][same]
+            count[here] += same
+    return se2.transform(scan.mount.array(), total[hit] / count[hit, None])
 
 
 def clip_twist(twist: Array, robot: Robot) -> Array:
@@ -93,11 +115,11 @@ def _straight_scale(twist: Array, points: Array, robot: Robot) -> float:
         return 1.0
     ahead = twist[:2] / speed
     along, aside = points @ ahead, np.abs(points @ np.array([-ahead[1], ahead[0]]))
-    in_way = (along > 0) & (aside < robot.radius + FOOTPRINT_MARGIN_M)
+    in_way = (along > 0) & (aside < robot.radius + robot.margin)
     if not in_way.any():
         return 1.0
-    reach = np.sqrt(np.maximum((robot.radius + FOOTPRINT_MARGIN_M) ** 2 - aside[in_way] ** 2, 0.0))
-    gap = max(0.0, float(np.min(along[in_way] - reach)) - robot.margin)
+    reach = np.sqrt(np.maximum((robot.radius + robot.margin) ** 2 - aside[in_way] ** 2, 0.0))
+    gap = max(0.0, float(np.min(along[in_way] - reach)))
     # Solve v REACTION_TIME_S + v² / 2a = gap for v.
     allowed = robot.acceleration * (np.sqrt(REACTION_TIME_S**2 + 2 * gap / robot.acceleration) - REACTION_TIME_S)
     return min(1.0, float(allowed) / speed)
@@ -133,7 +155,7 @@ def _ramp_velocities(current: Array, target: Array, robot: Robot, times: Array) 
 
 def _is_path_clear(current: Array, target: Array, points: Array, robot: Robot, hold: float) -> bool:
     """Whether the footprint touches no point that it approaches on the stopping path."""
-    path, contact = stopping_path(current, target, robot, hold), robot.radius + FOOTPRINT_MARGIN_M
+    path, contact = stopping_path(current, target, robot, hold), robot.radius + robot.margin
     travelled = float(np.hypot(*np.diff(path, axis=0).T).sum())
     points = points[np.hypot(points[:, 0], points[:, 1]) < contact + travelled]
     distance = np.hypot(path[:, None, 0] - points[:, 0], path[:, None, 1] - points[:, 1])

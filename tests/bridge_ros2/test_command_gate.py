@@ -113,11 +113,11 @@ def test_limits_and_obstacle_stop():
     gate.add_scan(scan(1000), 0.0)
     np.testing.assert_allclose(gate.command(command(1000, vx=5.0, wz=9.0), 0.0), [0.3, 0, 2.0])
     near = CommandGate(Robot())
-    near.add_scan(scan(1000, ahead=0.33), 0.0)
+    near.add_scan(scan(1000, ahead=0.28), 0.0)
     assert near.command(command(1000, vx=1.0), 0.0) is None  # no stop is sent to a standing robot
     assert near.stopped
     blind = CommandGate(Robot(), obstacle_stop=False)
-    blind.add_scan(scan(1000, ahead=0.33), 0.0)
+    blind.add_scan(scan(1000, ahead=0.28), 0.0)
     assert blind.command(command(1000, vx=1.0), 0.0)[0] == 1.0
 
 

@@ -25,10 +25,9 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from services.controller.policies.free_space import FreeSpace
 
-WALL_GAP_M = 0.03  # minimum distance between footprint and wall; beside it, the obstacle stop needs 0.01 m
+WALL_GAP_M = 0.03  # minimum distance between footprint and wall; the obstacle stop needs 0.02 m, and noise 0.01 m
 WALL_COST_RANGE_M = 0.35  # range of clearances beyond the minimum within which a metre costs more
-STOP_RANGE_M = 0.05  # within this range it costs even more: there, noise in the scan makes the obstacle stop brake
-MAX_WALL_COST = 1.0  # additional cost of a metre at the minimum clearance, for each of the two ranges
+MAX_WALL_COST = 1.0  # additional cost of a metre at the minimum clearance
 UNKNOWN_COST = 30.0  # additional cost of a metre where nothing is known: a path through it is the last resort
 ATTRACTOR_RANGE_M = 3.0  # length of the path within which the attractor is chosen
 MAX_ATTRACTOR_CANDIDATES = 12  # points of the path that are tried, evenly spaced
@@ -200,9 +199,8 @@ class CostField:
 
 def cost_near_walls(clearance: Array, min_clearance: float) -> Array:
     """Cost of a metre at a clearance (N,) m: 1 far from walls, and most at ``min_clearance``."""
-    gap = clearance - min_clearance
-    closeness, tightness = (np.clip(1 - gap / range_m, 0, 1) for range_m in (WALL_COST_RANGE_M, STOP_RANGE_M))
-    return np.asarray(1 + MAX_WALL_COST * (closeness**2 + tightness**2))
+    closeness = np.clip(1 - (clearance - min_clearance) / WALL_COST_RANGE_M, 0, 1)
+    return np.asarray(1 + MAX_WALL_COST * closeness**2)
 
 
 def _dilate(cells: npt.NDArray[np.bool_], by: int) -> npt.NDArray[np.bool_]:

@@ -19,7 +19,13 @@ from services.controller.policies.decision import Decision, DecisionState
 from services.controller.policies.free_space import NO_MAP, FreeSpace
 from services.controller.policies.geodesic_field import WALL_COST_RANGE_M, CostField, FreeSpaceGraph
 from services.controller.policies.goal_check import near_wall, refusal_text, wall_refusal
-from services.controller.policies.motion_model import STEP_S, delay_until_effect, is_moving, turn_to_attractor
+from services.controller.policies.motion_model import (
+    STEP_S,
+    delay_until_effect,
+    is_moving,
+    turn_rate,
+    turn_to_attractor,
+)
 from services.controller.policies.motion_selection import PoseBelief, Surroundings, least_distance, select_motion
 from services.controller.policies.obstacles import TemporaryObstacles
 from services.controller.policies.recovery import BACKING_OFF, STUCK_AFTER_NS, Recovery, back_off
@@ -328,13 +334,23 @@ class GeodesicPolicy:
         if min(of_robot, of_goal) < 2 * self.robot.radius:
             self._obstacle_near_ns = stamp_ns
             reason = f"{distance:.2f} m from the goal, {self._hindrance_text(pose, surroundings, standing=True)}"
-            return Decision(reason=reason, state="blocked", path=path) if arrived or stuck else None
+            if not (arrived or stuck):
+                return None
+            # The robot must see the goal to notice that the obstacle has gone.
+            return Decision(self._turn_to_see(se2.rotate(-pose[2], to_goal), surroundings), reason, "blocked", path)
         # After an obstacle has gone, the field may still lead around it for a while.
         if not stuck or distance > self.robot.radius or 0 <= stamp_ns - self._obstacle_near_ns < STUCK_AFTER_NS:
             return None
         stopped = f"stopped {distance:.2f} m from the goal, probably because a wall is too close"
         problem = f"cannot be reached exactly: {stopped}"
         return Decision(reason=self._refusal_text(self._goal, problem), state="blocked", path=path, refused=True)
+
+    def _turn_to_see(self, place: Array, surroundings: Surroundings) -> Array:
+        """Action (3,) that turns the robot on the spot until its scanner sees a ``place`` (2,) m in base_link."""
+        bearing = float(np.arctan2(place[1], place[0]))
+        if not surroundings.may_turn or surroundings.sees(bearing):
+            return np.zeros(3)
+        return np.array([0.0, 0.0, turn_rate(float(se2.wrap(bearing - surroundings.forward)), self.robot)])
 
     def _reason(self, pose: Array, surroundings: Surroundings, *, hindered: bool, standing: bool) -> str:
         """Status text: why the robot does not drive freely, or nothing."""

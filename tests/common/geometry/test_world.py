@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from common.errors import UserError
 from common.geometry.world import World, known_worlds, load_world, save_world
 from common.robot.robot import Robot
+from services.controller.policies.geodesic_field import WALL_GAP_M
 from tests.common.geometry.maps import ROOM
 
 
@@ -76,7 +77,7 @@ def test_default_start_pose():
 @pytest.mark.parametrize("name", known_worlds())
 def test_shipped_worlds_are_connected(name):
     world = load_world(name)
-    room = shapely.buffer(world.free_space, -(Robot().radius + Robot().margin))
+    room = shapely.buffer(world.free_space, -(Robot().radius + WALL_GAP_M))
     assert room.geom_type == "Polygon"
     assert room.contains(shapely.Point(world.start_pose(0)[:2]))
     assert world.name == name

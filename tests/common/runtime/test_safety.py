@@ -87,3 +87,65 @@ def test_unmeasured_beams_are_no_obstacles():
         stamp_ns=0, angle_min=0.0, angle_increment=0.1, range_min=0.1, range_max=9.0, ranges=[0.0, np.inf, 2.0, 0.0]
     )
     assert safety.scan_points(scan) == pytest.approx(2 * np.array([[np.cos(0.2), np.sin(0.2)]]))
+
+
+def scan_of(ranges: np.ndarray) -> Scan:
+    """A scan like that of the shipped scanner, 270° with 622 beams."""
+    return Scan(
+        stamp_ns=0, angle_min=-0.75 * np.pi, angle_increment=1.5 * np.pi / 621, range_min=0.05, range_max=8.3,
+        ranges=ranges,
+    )  # fmt: skip
+
+
+BEAMS = scan_of(np.zeros(622)).angles()
+
+
+def ranges_to_wall(distance: float, bearing: float = 0.0) -> np.ndarray:
+    """Ranges (622,) m to a straight wall ``distance`` m away, perpendicular to ``bearing`` rad."""
+    towards = np.cos(BEAMS - bearing)
+    return np.where(towards > 0.1, distance / np.maximum(towards, 0.1), np.inf)
+
+
+@given(st.floats(0.2, 3), st.floats(-3, 3))
+def test_points_of_a_straight_wall_lie_on_it(distance, bearing):
+    points = safety.scan_points(scan_of(ranges_to_wall(distance, bearing)))
+    assert points @ [np.cos(bearing), np.sin(bearing)] == pytest.approx(distance, abs=1e-5)
+
+
+def test_noise_hardly_moves_the_stop():
+    """A robot that drives at a wall stops near its margin, not before the nearest of hundreds of noisy end points."""
+    gaps = np.arange(0, 0.15, 0.002)  # m between robot and wall
+
+    def first_free(points: list[np.ndarray]) -> float:
+        creeping = np.array([0.02, 0, 0])
+        return gaps[np.argmax([safety.limit_velocity(creeping, cloud, ROBOT)[0][0] > 0.01 for cloud in points])]
+
+    stops, raw_stops = [], []
+    for seed in range(20):
+        noise = np.random.default_rng(seed).normal(0, 0.02, 622)
+        ranges = [ranges_to_wall(ROBOT.radius + gap) + noise for gap in gaps]
+        stops.append(first_free([safety.scan_points(scan_of(each)) for each in ranges]))
+        ends = [np.stack([each * np.cos(BEAMS), each * np.sin(BEAMS)], axis=-1) for each in ranges]
+        raw_stops.append(first_free([each[np.isfinite(each).all(axis=1)] for each in ends]))
+    assert min(stops) > ROBOT.margin - 0.01
+    assert np.median(stops) - ROBOT.margin < (np.median(raw_stops) - ROBOT.margin) / 2
+
+
+@pytest.mark.parametrize("beams", [1, 2, 5])
+def test_thin_post_before_a_wall(beams):
+    ranges = ranges_to_wall(0.5)
+    post = slice(311, 311 + beams)
+    ranges[post] = 0.4
+    points = safety.scan_points(scan_of(ranges))
+    assert np.hypot(*points.T).min() == pytest.approx(0.4, abs=1e-3)
+
+
+@pytest.mark.parametrize(("radius", "distance"), [(0.01, 0.35), (0.03, 0.4), (0.2, 0.6)])
+def test_round_post_keeps_its_place(radius, distance):
+    """The mean of points of a curved surface lies behind it by millimetres at most."""
+    across = distance * np.sin(BEAMS)
+    hit = (np.abs(across) < radius) & (np.cos(BEAMS) > 0)
+    depth = distance * np.cos(BEAMS) - np.sqrt(np.maximum(radius**2 - across**2, 0))
+    points = safety.scan_points(scan_of(np.where(hit, depth, np.inf)))
+    assert points[:, 0].min() < distance - radius + 0.004
+    assert (np.hypot(points[:, 0] - distance, points[:, 1]) > radius - 0.008).all()
