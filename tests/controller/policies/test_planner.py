@@ -69,18 +69,17 @@ def test_stops_short_of_the_goal(kind, goal_y, changed, reason):
     assert np.ptp(poses[-60:, :2], axis=0).max() < 0.01
 
 
+@pytest.mark.parametrize("start", [(5.5, 2.5, 0.0), (9.0, 4.0, 2.0), (7.5, 1.0, 1.5)])
 @pytest.mark.parametrize("kind", KINDS)
-def test_goal_that_was_occupied_for_a_while(kind):
-    """The robot waits beside the goal until the box is taken away, instead of refusing the goal."""
+def test_goal_that_was_occupied_for_a_while(kind, start):
+    """The robot waits beside the goal until the box is taken away, instead of refusing the goal, and sees it go."""
 
     def change(simulation):
         if simulation.steps == 300:
             simulation.change_obstacle("remove", "box", None)
 
     changed = room(10, 5, box(7.5, 2.5, 0.3, 0.3))
-    _, statuses, contacts = drive(
-        changed, Robot(drive=kind), (5.5, 2.5, 0.0), goal(7.5, 2.5), 450, known=HALL, change=change
-    )
+    _, statuses, contacts = drive(changed, Robot(drive=kind), start, goal(7.5, 2.5), 375, known=HALL, change=change)
     assert statuses[299].state == "blocked"
     assert not any(status.refused for status in statuses)
     assert (statuses[-1].state, contacts) == ("reached", 0)
