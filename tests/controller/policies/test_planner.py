@@ -69,6 +69,15 @@ def test_stops_short_of_the_goal(kind, goal_y, changed, reason):
     assert np.ptp(poses[-60:, :2], axis=0).max() < 0.01
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_goal_beside_a_wall(kind):
+    """The scanner's noise does not stop the robot before a goal 4 cm farther from a wall than its radius."""
+    to = goal(7.5, Robot().radius + 0.04)
+    poses, statuses, contacts = drive(HALL, Robot(drive=kind), (6.0, 1.5, -1.0), to, 240)
+    assert (statuses[-1].state, contacts) == ("reached", 0)
+    assert np.hypot(*(poses[-1][:2] - [7.5, 0.31])) < 0.02
+
+
 @pytest.mark.parametrize("start", [(5.5, 2.5, 0.0), (9.0, 4.0, 2.0), (7.5, 1.0, 1.5)])
 @pytest.mark.parametrize("kind", KINDS)
 def test_goal_that_was_occupied_for_a_while(kind, start):
