@@ -105,8 +105,8 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	$(BIN)/presage experiment --out $(RESULTS) navigation --start unknown
 	$(BIN)/presage experiment --seed 3421 --out $(RESULTS) navigation --worlds office --people 10 --trials 50
 	$(BIN)/presage experiment --seed 3465 --out $(RESULTS)/within_2cm navigation --trials 30
-	$(BIN)/presage experiment --seed 3422 --out $(RESULTS) navigation --worlds hall --drives holonomic --max-range 4 --beams 271 --prior odometry --slip 0.05 --limit 60 --trials 50
-	$(BIN)/presage experiment --seed 3422 --out $(RESULTS) navigation --worlds hall --drives holonomic --max-range 4 --beams 271 --prior odometry --slip 0.05 --limit 60 --trials 50 --no-epistemic
+	$(BIN)/presage experiment --seed 3467 --out $(RESULTS) navigation --worlds hall --drives holonomic --max-range 4 --beams 271 --prior odometry --slip 0.05 --limit 60 --trials 50
+	$(BIN)/presage experiment --seed 3467 --out $(RESULTS) navigation --worlds hall --drives holonomic --max-range 4 --beams 271 --prior odometry --slip 0.05 --limit 60 --trials 50 --no-epistemic
 	$(BIN)/presage experiment --seed 3466 --out $(RESULTS) navigation --worlds twins --start unknown --trials 50
 	$(BIN)/presage experiment --seed 4300 --out $(RESULTS) navigation --worlds twins --start unknown --trials 50 --drives holonomic --no-epistemic
 	$(BIN)/presage experiment --seed 3424 --out $(RESULTS) docking --trials 64
