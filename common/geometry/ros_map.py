@@ -39,9 +39,9 @@ class MapFile(BaseModel):
     image: Annotated[str, Field(min_length=1)]  # path, relative to the folder of map.yaml
     resolution: Annotated[float, Field(gt=0, le=1e3)]  # m, edge length of a pixel
     origin: tuple[Coordinate, Coordinate, Angle]  # x m, y m, yaw rad of the lower left pixel's lower left corner
-    negate: bool = False  # white is occupied
-    occupied_thresh: Fraction = 0.65  # darker pixels are occupied
-    free_thresh: Fraction = 0.25  # lighter pixels are free
+    negate: bool = False  # lighter pixels are more likely to be occupied
+    occupied_thresh: Fraction = 0.65  # above this occupancy, from 0 (white) to 1 (black), a pixel is occupied
+    free_thresh: Fraction = 0.25  # below this occupancy, it is free
     mode: Literal["trinary", "scale", "raw"] = "trinary"
 
     @field_validator("mode", mode="before")
@@ -151,7 +151,7 @@ def _too_large(path: Path) -> UserError:
 
 def _normalised(image: Image) -> tuple[Array, Array | None]:
     """Colours and alpha of an image of any pixel type, as `_pixels` returns them."""
-    if image.mode.startswith(("I", "F")):  # 16 bits per pixel
+    if image.mode.startswith("I"):  # 16 bits per pixel, which Pillow may hold in 32
         return np.asarray(image, float)[..., None] / 65535, None
     mode = "RGBA" if image.has_transparency_data else "RGB"
     values = np.asarray(image if image.mode in {"L", mode} else image.convert(mode), np.uint8)

@@ -13,6 +13,7 @@ from rich.progress import track
 from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.world import World, load_world
+from common.robot.robot import Robot
 from common.robot.scanner import Scanner
 from lab.accuracy import tasks
 from lab.accuracy.compared_estimators import COMPARED_ESTIMATORS, EstimatorSetup
@@ -43,15 +44,15 @@ class AccuracyJob:
 
 
 def run_all(jobs: list[AccuracyJob], workers: int, console: Console) -> list[dict[str, Any]]:
-    """Rows of all jobs, in their order; jobs that differ only in the seed share their rows. Shows a progress bar."""
+    """Rows of all jobs, in their order; jobs that differ only in the seed are one row. Shows a progress bar."""
     if workers == 1:
-        found = [run(job) for job in track(jobs, "measuring", console=console, transient=True)]
+        measured = [run(job) for job in track(jobs, "measuring", console=console, transient=True)]
     else:
         with pool(workers) as executor:
             done = track(executor.map(run, jobs), "measuring", total=len(jobs), console=console, transient=True)
-            found = list(done)
+            measured = list(done)
     shared: dict[tuple[AccuracyJob, str, str], list[tasks.TaskOutcome]] = {}
-    for job, outcomes in zip(jobs, found, strict=True):
+    for job, outcomes in zip(jobs, measured, strict=True):
         for (world, task), outcome in outcomes.items():
             shared.setdefault((replace(job, seed=0), world, task), []).append(outcome)
     return [_row(job, world, task, tasks.TaskOutcome.joined(parts)) for (job, world, task), parts in shared.items()]
@@ -69,12 +70,12 @@ def run(job: AccuracyJob) -> dict[tuple[str, str], tasks.TaskOutcome]:
         if name in job.tasks:
             scene = _scene(job, world, 10 + number)
             outcomes |= tasks.tracking(estimator, scene, job.seconds, _no_progress, odometry=name == "odometry")
-    found = {(job.world, task): outcome for task, outcome in outcomes.items()}
+    by_world = {(job.world, task): outcome for task, outcome in outcomes.items()}
     if "twins" in job.tasks:
         scene = _scene(job, TWINS, 20)
         outcomes = tasks.twins(_estimator(job, TWINS), scene, job.trials, _no_progress)
-        found |= {(TWINS.name, task): outcome for task, outcome in outcomes.items()}
-    return found
+        by_world |= {(TWINS.name, task): outcome for task, outcome in outcomes.items()}
+    return by_world
 
 
 def _estimator(job: AccuracyJob, world: World) -> PoseEstimator:
@@ -101,7 +102,7 @@ def quick_field(
 
     With ``limited``, ranges beyond the scanner's maximum count as no return.
     """
-    poses = world.sample_poses(samples, rng, 0.27)
+    poses = world.sample_poses(samples, rng, Robot().radius)
     clean = world.ray_distances(se2.compose(poses, geometry.mount), geometry.angles)
     split = samples // 10
     noisy = clean[split:] + geometry.likelihood().deviation(clean[split:]) * rng.standard_normal(clean[split:].shape)
@@ -120,7 +121,7 @@ def _row(job: AccuracyJob, world: str, task: str, outcome: tasks.TaskOutcome) ->
     count, nees = len(position), np.array(outcome.nees)
     groups = [np.array(group) for group in outcome.by_group(position)]
     rms = root_mean_square(position) if count else None
-    limit = root_mean_square(np.array(outcome.bounds)) if outcome.bounds else None
+    bound = root_mean_square(np.array(outcome.bounds)) if outcome.bounds else None
     half = 1.96 * np.sqrt(2 * DEGREES_OF_FREEDOM / max(len(nees), 1))
     every = np.array(outcome.all_position_errors)
     return {
@@ -143,8 +144,8 @@ def _row(job: AccuracyJob, world: str, task: str, outcome: tasks.TaskOutcome) ->
         "all_trials_position_error_median_m": float(np.median(every)) if len(every) else None,
         "all_trials_position_error_rms_m": root_mean_square(every) if len(every) else None,
         "heading_error_median_deg": float(np.rad2deg(np.median(np.abs(errors[:, 2])))) if count else None,
-        "bound_rms_m": limit,
-        "rms_over_bound": rms / limit if rms is not None and limit else None,
+        "bound_rms_m": bound,
+        "rms_over_bound": rms / bound if rms is not None and bound else None,
         "nees_mean": float(nees.mean()) if len(nees) else None,
         "nees_band": [DEGREES_OF_FREEDOM - half, DEGREES_OF_FREEDOM + half] if len(nees) else None,
         "update_ms_median": float(np.median(outcome.update_ms)) if outcome.update_ms else None,

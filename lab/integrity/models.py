@@ -11,7 +11,13 @@ from rich.progress import Progress
 from common.geometry.world import World
 from common.robot.scanner import Scanner
 from lab.accuracy.scenes import Scene
-from presage.learning.train_precise import TEST_SAMPLES, TrainPreciseOptions, default_samples, learn_and_save
+from presage.learning.train_precise import (
+    CALIBRATION_SAMPLES,
+    TEST_SAMPLES,
+    TrainPreciseOptions,
+    default_samples,
+    learn_and_save,
+)
 from services.estimator.precise.learning import weights
 
 
@@ -27,7 +33,7 @@ def _learn(path: Path, world: World, scanner: Scanner) -> None:
     options = TrainPreciseOptions(world.name, scanner, out=path.parent)
     rng = np.random.default_rng(options.recipe.seed)
     scene = Scene(world, scanner, rng)
-    counts = {"train": default_samples(world), "test": TEST_SAMPLES}
+    counts = {"train": default_samples(world), "test": CALIBRATION_SAMPLES + TEST_SAMPLES}
     poses = {name: scene.poses(count) for name, count in counts.items()}
     clean = {name: scene.clean(places) for name, places in poses.items()}
     scans = {"train": scanner.add_noise(clean["train"], rng), "test": clean["test"]}

@@ -34,9 +34,9 @@ from services.estimator.precise.learning.field_learning import (
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.model_folder import training_folder
 
-TEST_SAMPLES = 500
+CALIBRATION_SAMPLES, TEST_SAMPLES = 250, 250  # scans without noise, from which the model is not learned
 MIN_SAMPLES, SAMPLES_PER_M2 = 5000, 10  # training scans; the error depends on the number of beams that meet a surface
-BEAMS_PER_SAMPLE = 400  # minimum number of beams per training scan that a sweep of learning uses
+MIN_BEAMS_PER_SAMPLE = 400  # of each training scan, in each sweep of learning
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def train_precise(options: TrainPreciseOptions, link: Link, console: Console) ->
     path = weights.path_of(options.out, world.name)
     weights.refuse_to_overwrite(path, world)
     rng = np.random.default_rng(options.recipe.seed)
-    counts = {"train": options.samples or default_samples(world), "test": TEST_SAMPLES}
+    counts = {"train": options.samples or default_samples(world), "test": CALIBRATION_SAMPLES + TEST_SAMPLES}
     poses = {name: world.sample_poses(count, rng, Robot().radius) for name, count in counts.items()}
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console) as bar:
@@ -74,10 +74,12 @@ def train_precise(options: TrainPreciseOptions, link: Link, console: Console) ->
             test = collect(bus, poses["test"], scanner, None, bar, "test scans")
         card = learn_and_save(path, options, world, poses, {"train": train, "test": test}, bar)
     _draw(weights.load(path)[0], card, path.with_suffix(".png"))
+    position_error_m = card.test_position_error_rms_m
+    assert position_error_m is not None  # noqa: S101 - it was just measured
     console.print(
         f"{path}: {path.stat().st_size / 1e6:.2f} MB, trained in {card.learning_s:.0f} s; range error median "
         f"{card.test_range_error_median_m * 1e3:.2f} mm, {card.test_share_above_5_cm:.2%} above 5 cm; "
-        f"position error from scans without noise {(card.test_position_error_rms_m or 0.0) * 1e3:.2f} mm RMS"
+        f"position error from scans without noise {position_error_m * 1e3:.2f} mm RMS"
     )
     return path
 
@@ -114,24 +116,23 @@ def _train(
     def report(title: str, done: float) -> None:
         bar.update(task, description=f"training: {title}", completed=0.9 * done)
 
-    beams_per_sweep = max(options.recipe.beams_per_sweep, BEAMS_PER_SAMPLE * len(scans["train"]))
+    beams_per_sweep = max(options.recipe.beams_per_sweep, MIN_BEAMS_PER_SAMPLE * len(scans["train"]))
     recipe = replace(options.recipe, beams_per_sweep=beams_per_sweep)
-    field = learn_field(
-        Beams.of(poses["train"], mount, angles, scans["train"]), recipe, report, threads=os.cpu_count() or 1
-    )
+    beams = Beams.of(poses["train"], mount, angles, scans["train"])
+    learned = learn_field(beams, recipe, report, threads=os.cpu_count() or 1)
     # The weights are stored in half precision, so that the model is evaluated with the same precision.
-    field = replace(field, phi=field.phi.astype(np.float16).astype(np.float32))
-    report("precision", 1.0)
-    half = TEST_SAMPLES // 2  # of the test scans; the precision is learned from it, the errors come from the rest
-    scales = learn_scales(field, poses["test"][:half], mount, angles, scans["test"][:half], 0.0)
-    ripple = measure_ripple(field, se2.compose(poses["test"][:half], mount), angles)
-    model = FieldModel(field, scales, ripple)
+    learned = replace(learned, phi=learned.phi.astype(np.float16).astype(np.float32))
+    report("standard deviations", 1.0)
+    count = CALIBRATION_SAMPLES
+    scales = learn_scales(learned, poses["test"][:count], mount, angles, scans["test"][:count], 0.0)
+    ripple = measure_ripple(learned, se2.compose(poses["test"][:count], mount), angles)
+    model = FieldModel(learned, scales, ripple)
     errors = evaluate_model(
         model,
-        poses["test"][half:],
+        poses["test"][count:],
         mount,
         angles,
-        scans["test"][half:],
+        scans["test"][count:],
         scanner.range_max,
         max(scanner.sigma, MIN_SIGMA_M),
         scanner.sigma_relative,
@@ -153,7 +154,7 @@ def _card(
         sweeps=options.recipe.sweeps,
         ripple=model.ripple,
         inflation=round(errors.inflation, 3),
-        test_samples=TEST_SAMPLES // 2,
+        test_samples=TEST_SAMPLES,
         test_range_error_median_m=errors.range_error_median,
         test_range_error_mean_m=errors.range_error_mean,
         test_share_above_5_cm=errors.share_above_5_cm,

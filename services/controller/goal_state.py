@@ -7,7 +7,7 @@
 | NAVIGATING, BLOCKED, UNLOCALISED | `lose_pose`, `lose_belief` | UNLOCALISED |
 | UNLOCALISED | `find_pose` | NAVIGATING |
 | NAVIGATING, BLOCKED | `update_progress`: the robot backs off, or has stood before an obstacle for 2 s | BLOCKED |
-| BLOCKED | `update_progress`: the robot moves, or nothing is in the way | NAVIGATING |
+| BLOCKED | `update_progress`: the robot has moved, or nothing is in the way | NAVIGATING |
 | NAVIGATING, BLOCKED | `reach` | REACHED |
 | NAVIGATING, BLOCKED | `refuse` | REFUSED |
 | NAVIGATING, BLOCKED, UNLOCALISED | `suspend` | NAVIGATING |
@@ -19,12 +19,18 @@ from __future__ import annotations
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+
+from common.geometry import se2
 from common.messages.definitions import Goal, Status
 
 if TYPE_CHECKING:
+    from common.geometry.se2 import Array
     from services.controller.policies.decision import Decision
 
 BLOCKED_AFTER_S = 2.0  # time without motion before an obstacle after which the phase becomes BLOCKED
+# Less motion is none. Before an obstacle, a robot still moves by millimetres with the noise of the scan.
+MIN_MOTION_M, MIN_MOTION_RAD = 0.02, 0.05
 
 StatusState = Literal["idle", "navigating", "reached", "blocked", "lost", "exploring"]  # of the message Status
 
@@ -59,8 +65,8 @@ class GoalState:
 
     def _enter(self, phase: Phase, reason: str = "") -> None:
         self.phase, self.reason = phase, reason
-        # Stamp since which the robot has stood before an obstacle; None while it makes progress.
-        self._standing_since_ns: int | None = None
+        # Since when, in ns, and at which pose (3,) the robot has stood before an obstacle; None without one.
+        self._standing_since: tuple[int, Array] | None = None
 
     @property
     def active(self) -> bool:
@@ -110,20 +116,19 @@ class GoalState:
             self.goal = None
             self._enter(Phase.IDLE)
 
-    def update_progress(self, stamp_ns: int, decision: Decision, *, moving: bool, limited_by_scan: bool) -> None:
-        """Processes a decision of the policy; ``limited_by_scan``: obstacles in the scan reduced its velocity."""
+    def update_progress(self, stamp_ns: int, pose: Array, decision: Decision, *, limited_by_scan: bool) -> None:
+        """Processes a decision of the policy at a pose (3,); ``limited_by_scan``: obstacles reduced its velocity."""
         if self.phase not in {Phase.NAVIGATING, Phase.BLOCKED}:
             return
         self.reason = decision.reason or ("slowed by the scan" if limited_by_scan else "")
         if decision.recovering:
             self.phase = Phase.BLOCKED
-        elif moving or not (limited_by_scan or decision.state == "blocked"):
-            self.phase, self._standing_since_ns = Phase.NAVIGATING, None
-        else:
-            if self._standing_since_ns is None:
-                self._standing_since_ns = stamp_ns
-            if (stamp_ns - self._standing_since_ns) * 1e-9 >= BLOCKED_AFTER_S:
-                self.phase, self.reason = Phase.BLOCKED, decision.reason or "the scan shows something in the way"
+        elif not (limited_by_scan or decision.state == "blocked"):
+            self.phase, self._standing_since = Phase.NAVIGATING, None
+        elif self._standing_since is None or _has_moved(self._standing_since[1], pose):
+            self.phase, self._standing_since = Phase.NAVIGATING, (stamp_ns, pose)
+        elif (stamp_ns - self._standing_since[0]) * 1e-9 >= BLOCKED_AFTER_S:
+            self.phase, self.reason = Phase.BLOCKED, decision.reason or "the scan shows something in the way"
 
     def status(self, stamp_ns: int, distance: float | None) -> Status:
         """The status to publish, with the ``distance`` m to the goal if it is known."""
@@ -136,3 +141,8 @@ class GoalState:
             goal_seq=self.goal.seq if self.goal is not None else 0,
             distance=distance,
         )
+
+
+def _has_moved(before: Array, now: Array) -> bool:
+    moved, turned = np.hypot(*(now - before)[:2]), abs(se2.wrap(now[2] - before[2]))
+    return bool(moved > MIN_MOTION_M or turned > MIN_MOTION_RAD)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from services.controller.goal_state import GoalState
@@ -13,9 +14,9 @@ def event(method, *args, **more):
     return lambda state: method(state, *args, **more)
 
 
-def progress(seconds, *, moving=False, limited=False, **decision):
-    now_ns = round(seconds * 1e9)
-    return event(GoalState.update_progress, now_ns, Decision(**decision), moving=moving, limited_by_scan=limited)
+def progress(seconds, *, at=(0, 0, 0), limited=False, **decision):
+    pose, now_ns = np.array(at, dtype=float), round(seconds * 1e9)
+    return event(GoalState.update_progress, now_ns, pose, Decision(**decision), limited_by_scan=limited)
 
 
 START, REFUSED = (event(GoalState.start, goal(1, 2), refusal) for refusal in (None, "in a wall"))
@@ -23,7 +24,8 @@ REFUSE, REACH = event(GoalState.refuse, "far"), event(GoalState.reach, "near")
 LOSE, EXPLORE = (event(GoalState.lose_pose, activity, "unsure") for activity in ("lost", "exploring"))
 NO_BELIEF, FIND = event(GoalState.lose_belief, "no belief"), GoalState.find_pose
 CANCEL, SUSPEND = GoalState.cancel, GoalState.suspend
-MOVES, HINDERED = progress(0, moving=True), progress(1, limited=True)
+IN_THE_WAY = "the scan shows something in the way"
+FREE, HINDERED = progress(0), progress(1, limited=True)
 
 
 @pytest.mark.parametrize(
@@ -48,11 +50,14 @@ MOVES, HINDERED = progress(0, moving=True), progress(1, limited=True)
         ([START, NO_BELIEF, SUSPEND], "navigating", "", True),
         ([START, HINDERED], "navigating", "slowed by the scan", True),
         ([START, HINDERED, progress(2.9, limited=True)], "navigating", "slowed by the scan", True),
-        ([START, HINDERED, progress(3, limited=True)], "blocked", "the scan shows something in the way", True),
+        ([START, HINDERED, progress(3, limited=True)], "blocked", IN_THE_WAY, True),
         ([START, HINDERED, progress(3, state="blocked", reason="a box")], "blocked", "a box", True),
         ([START, HINDERED, progress(3, reason="slow")], "navigating", "slow", True),
-        ([START, HINDERED, MOVES, progress(3, limited=True)], "navigating", "slowed by the scan", True),
-        ([START, HINDERED, progress(3, limited=True), MOVES], "navigating", "", True),
+        ([START, HINDERED, FREE, progress(3, limited=True)], "navigating", "slowed by the scan", True),
+        ([START, HINDERED, progress(3, limited=True), FREE], "navigating", "", True),
+        ([START, HINDERED, progress(3, at=(0, 0.01, 0.01), limited=True)], "blocked", IN_THE_WAY, True),
+        ([START, HINDERED, progress(3, at=(0, 0.03, 0), limited=True)], "navigating", "slowed by the scan", True),
+        ([START, HINDERED, progress(3, at=(0, 0, 0.1), limited=True)], "navigating", "slowed by the scan", True),
         ([START, progress(0, recovering=True, reason="backs off")], "blocked", "backs off", True),
         ([START, progress(0, recovering=True), LOSE, FIND], "navigating", "", True),
     ],

@@ -149,3 +149,31 @@ def test_round_post_keeps_its_place(radius, distance):
     points = safety.scan_points(scan_of(np.where(hit, depth, np.inf)))
     assert points[:, 0].min() < distance - radius + 0.004
     assert (np.hypot(points[:, 0] - distance, points[:, 1]) > radius - 0.008).all()
+
+
+def test_end_of_a_wall_seen_at_a_grazing_angle_stays():
+    """A thin wall along x that begins 0.35 m ahead and 0.05 m aside."""
+    bearing = np.clip(BEAMS, 1e-6, None)
+    along = 0.05 / np.tan(bearing)
+    hit = (BEAMS > 0) & (along > 0.35) & (along < 1.4)
+    ranges = np.where(hit, 0.05 / np.sin(bearing), np.inf)
+    nearest = ranges[hit].min()
+    assert np.hypot(*safety.scan_points(scan_of(ranges)).T).min() == pytest.approx(nearest, abs=1e-3)
+
+
+def test_too_close_beams_are_not_averaged():
+    ranges = np.full(622, 0.1)
+    ranges[311] = -np.inf
+    points = safety.scan_points(scan_of(ranges))
+    assert np.sort(np.hypot(*points.T))[:2] == pytest.approx([0.05, 0.1], abs=1e-3)
+
+
+@pytest.mark.parametrize("front", [0.29, 0.5])
+@pytest.mark.parametrize(("width", "too_far"), [(0.02, 1e-6), (0.005, 0.045)])
+def test_post_close_to_a_wall(front, width, too_far):
+    ahead = np.abs(BEAMS) < 1
+    on_post = ahead & (np.abs(front * np.tan(BEAMS)) < width / 2)
+    for depth in (0.02, 0.04, 0.055, 0.07):
+        wall = np.where(ahead, (front + depth) / np.cos(BEAMS), np.inf)
+        points = safety.scan_points(scan_of(np.where(on_post, front / np.cos(BEAMS), wall)))
+        assert points[:, 0].min() <= front + too_far
