@@ -7,9 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.geometry.world import World
+from common.geometry import se2
+from common.geometry.world import World, load_world
+from common.robot.scanner import SCANNERS
 from services.estimator.precise.field import DistanceField, FieldModel
+from services.estimator.precise.learning import weights
 from services.estimator.shared.generative_models import RayCaster
+from services.estimator.shared.model_folder import SHIPPED
 
 ANGLES = np.deg2rad(np.linspace(-135, 135, 61))
 BOX = World(name="box", boundary=[(0, 0), (6, 0), (6, 4), (0, 4)])
@@ -59,6 +63,16 @@ def test_derivatives(seed):
     error = np.abs(found - numeric)[smooth] / (1 + np.abs(numeric[smooth]))
     assert smooth.mean() > 0.4
     assert np.quantile(error, 0.9) < 0.05
+
+
+@pytest.mark.parametrize("name", ["corridor", "maze", "office", "twins"])
+def test_shipped_fields_show_no_surface_where_there_is_none(name):
+    world, scanner = load_world(name), SCANNERS["tim571"]
+    field = weights.load(weights.find(SHIPPED, world, name))[0].field
+    lasers = se2.compose(world.sample_poses(500, np.random.default_rng(0), 0.27), np.array(scanner.mount))
+    true = world.ray_distances(lasers, scanner.angles())
+    too_near = field.trace(lasers, scanner.angles()).ranges < true - 0.05
+    assert too_near.mean() < 5e-4  # beams that pass a corner closely
 
 
 def test_no_surface():
