@@ -10,12 +10,17 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from services.mapper.slam.elements import Elements
 
+Shifts = npt.NDArray[np.int64]  # (K, 3) number of a turn, and cells along x and y
+
 CELL_M = 0.15  # of the grid that is searched
-SECTORS = 8  # of the directions of normals
+BLOCK = 4  # shifts in a row that are bounded together
+SECTORS = 8  # of the directions of normals, one bit of a cell each
 TURN_STEP = 0.03  # rad
 MAX_ELEMENTS = 200  # of the moved group that are used
 PEAKS = 4  # poses returned
 PEAK_DISTANCE_M, PEAK_TURN = 0.5, 0.15  # between them
+BLOCKS_AT_ONCE = 512  # whose poses are scored before the next look at the peaks
+MAX_RANKED = 2000  # poses among which peaks are looked for
 
 
 def correlative_search(
@@ -23,71 +28,107 @@ def correlative_search(
 ) -> Array:
     """The best poses (K, 3) of ``moved`` in the frame of ``target``, at most ``window`` (3,) from ``around`` (3,).
 
-    There are none if ``moved`` is empty.
+    There are none if ``moved`` is empty. A pose's score is the number of elements of ``moved`` in or beside cells with
+    similar elements of ``target``; among equal ones, those near ``around`` are better. Branch and bound (Hess et al.,
+    ICRA 2016): the score of a whole block of shifts has an upper bound, and blocks that cannot be among the best are
+    left out.
     """
     if not len(moved):
         return np.zeros((0, 3))
     window = np.minimum(window, [np.inf, np.inf, np.pi])
     sample = moved.part(np.linspace(0, len(moved) - 1, min(len(moved), MAX_ELEMENTS)).astype(int))
-    reach = np.hypot(*sample.points.T).max() + np.hypot(*window[:2])
+    reach = np.hypot(*sample.points.T).max() + np.hypot(*window[:2]) + BLOCK * CELL_M
     low = around[:2] - reach - 2 * CELL_M
     grid = _rasterise(target, low, int(2 * (reach + 2 * CELL_M) / CELL_M) + 2)
     count = np.ceil(window[:2] / CELL_M).astype(int)
     turns = around[2] + turn_step * np.arange(-np.ceil(window[2] / turn_step), np.ceil(window[2] / turn_step) + 1)
-    scores = np.zeros((len(turns), 2 * count[1] + 1, 2 * count[0] + 1), np.int32)
-    for k, turn in enumerate(turns):
-        placed = sample.transformed(np.array([*around[:2], turn]))
-        column, row = np.floor((placed.points - low) / CELL_M).astype(np.int64).T
-        _count_hits(grid, _sector(placed.normals), row, column, scores[k])
-    return _peaks(scores, turns, around, count)
-
-
-def _peaks(scores: npt.NDArray[np.int32], turns: Array, around: Array, count: npt.NDArray[np.int_]) -> Array:
-    """The highest scores that are apart, as poses (K, 3)."""
-    order = np.argsort(scores, axis=None)[::-1][:2000]
-    k, i, j = np.unravel_index(order, scores.shape)
-    poses = np.column_stack([around[0] + CELL_M * (j - count[0]), around[1] + CELL_M * (i - count[1]), turns[k]])
-    found: list[Array] = []
-    for pose in poses:
-        off = se2.difference(pose, np.array(found).reshape(-1, 3))
-        if not ((np.hypot(off[:, 0], off[:, 1]) < PEAK_DISTANCE_M) & (np.abs(off[:, 2]) < PEAK_TURN)).any():
-            found.append(pose)
-        if len(found) == PEAKS:
+    placed = [sample.transformed(np.array([*around[:2], turn])) for turn in turns]
+    sector = np.array([_sector(each.normals) for each in placed])
+    cells = np.array([np.floor((each.points - low) / CELL_M).astype(np.int64) for each in placed])  # (T, N, 2)
+    firsts = [np.arange(-n, n + 1, BLOCK) for n in count.tolist()]
+    blocks = np.stack(np.meshgrid(np.arange(len(turns)), *firsts, indexing="ij"), axis=-1).reshape(-1, 3)
+    bounds = _count_hits(_pooled(grid), sector, cells, blocks)
+    order = np.argsort(-bounds, kind="stable")
+    shifts, scores = np.zeros((0, 3), np.int64), np.zeros(0, np.int32)  # the best ones so far
+    peaks, lowest = np.zeros((0, 3)), 0
+    for begin in range(0, len(order), BLOCKS_AT_ONCE):
+        chosen = order[begin : begin + BLOCKS_AT_ONCE]
+        if len(peaks) == PEAKS and lowest > bounds[chosen[0]]:
             break
-    return np.array(found)
+        more = _shifts_within(blocks[chosen], count)
+        shifts, scores = np.concatenate([shifts, more]), np.append(scores, _count_hits(grid, sector, cells, more))
+        off_centre = ((shifts - [len(turns) // 2, 0, 0]) ** 2).sum(axis=1)
+        best = np.lexsort([off_centre, -scores])[:MAX_RANKED]
+        shifts, scores = shifts[best], scores[best]
+        poses = np.column_stack([around[:2] + CELL_M * shifts[:, 1:], turns[shifts[:, 0]]])
+        which = _apart(poses)
+        peaks, lowest = poses[which], int(scores[which[-1]])
+    return peaks
 
 
-def _sector(normals: Array) -> npt.NDArray[np.int64]:
+def _shifts_within(blocks: Shifts, count: npt.NDArray[np.int_]) -> Shifts:
+    """The shifts (K, 3) of blocks (B, 3), without those beyond ``count`` (2,) cells."""
+    ahead = np.stack(np.meshgrid(0, np.arange(BLOCK), np.arange(BLOCK)), axis=-1).reshape(-1, 3)
+    shifts = (blocks[:, None] + ahead).reshape(-1, 3)
+    return np.asarray(shifts[(shifts[:, 1:] <= count).all(axis=1)])
+
+
+def _apart(poses: Array) -> list[int]:
+    """The first ones of some poses (K, 3), at most `PEAKS`, that are apart from one another."""
+    chosen: list[int] = []
+    for number, pose in enumerate(poses):
+        off = se2.difference(pose, poses[chosen])
+        if not ((np.hypot(off[:, 0], off[:, 1]) < PEAK_DISTANCE_M) & (np.abs(off[:, 2]) < PEAK_TURN)).any():
+            chosen.append(number)
+        if len(chosen) == PEAKS:
+            break
+    return chosen
+
+
+def _sector(normals: Array) -> npt.NDArray[np.uint8]:
     """The sector of directions (K,) in which each of the normals (K, 2) lies."""
     angle = np.arctan2(normals[:, 1], normals[:, 0])
-    return np.asarray(np.floor(angle / (2 * np.pi) * SECTORS).astype(np.int64) % SECTORS)
+    return np.asarray(np.floor(angle / (2 * np.pi) * SECTORS) % SECTORS, np.uint8)
 
 
 def _rasterise(elements: Elements, low: Array, size: int) -> npt.NDArray[np.uint8]:
-    """Grid (sector, row, column) of cells with an element in or beside them, in the same sector or one beside it."""
-    grid = np.zeros((SECTORS, size, size), np.uint8)
+    """Grid (row, column) of cells; bit s is set if an element of sector s, or one beside it, is in or near the cell."""
+    grid = np.zeros((size, size), np.uint8)
     column, row = np.floor((elements.points - low) / CELL_M).astype(np.int64).T
     inside = (column > 0) & (column < size - 1) & (row > 0) & (row < size - 1)
     column, row, sector = column[inside], row[inside], _sector(elements.normals[inside])
-    for turn in (-1, 0, 1):
-        for i in (-1, 0, 1):
-            for j in (-1, 0, 1):
-                grid[(sector + turn) % SECTORS, row + i, column + j] = 1
+    bits = sum((np.uint8(1) << (sector + turn) % SECTORS for turn in (SECTORS - 1, 0, 1)), np.zeros_like(sector))
+    for i in (-1, 0, 1):
+        for j in (-1, 0, 1):
+            np.bitwise_or.at(grid, (row + i, column + j), bits)
     return grid
+
+
+def _pooled(grid: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """The grid with the bits of all `BLOCK` x `BLOCK` cells from each cell on."""
+    rows = grid.copy()
+    for k in range(1, BLOCK):
+        rows[:-k] |= grid[k:]
+    pooled = rows.copy()
+    for k in range(1, BLOCK):
+        pooled[:, :-k] |= rows[:, k:]
+    return np.asarray(pooled)
 
 
 @numba.njit(cache=True, nogil=True)
 def _count_hits(
     grid: npt.NDArray[np.uint8],
-    sector: npt.NDArray[np.int64],
-    row: npt.NDArray[np.int64],
-    column: npt.NDArray[np.int64],
-    scores: npt.NDArray[np.int32],
-) -> None:
-    """Counts, for each shift (rows, columns) of the window, the elements that fall into marked cells."""
-    rows, columns = scores.shape
-    for n in range(len(sector)):
-        for i in range(rows):
-            y = row[n] + i - rows // 2
-            for j in range(columns):
-                scores[i, j] += grid[sector[n], y, column[n] + j - columns // 2]
+    sector: npt.NDArray[np.uint8],
+    cells: npt.NDArray[np.int64],
+    shifts: npt.NDArray[np.int64],
+) -> npt.NDArray[np.int32]:
+    """The number (K,) of elements in cells with the bit of their sector, for each of the ``shifts`` (K, 3).
+
+    ``sector`` (T, N) and ``cells`` (T, N, 2), column and row, are of the elements after each turn.
+    """
+    hits = np.zeros(len(shifts), np.int32)
+    for k in range(len(shifts)):
+        turn, columns, rows = shifts[k]
+        for n in range(sector.shape[1]):
+            hits[k] += grid[cells[turn, n, 1] + rows, cells[turn, n, 0] + columns] >> sector[turn, n] & 1
+    return hits

@@ -53,11 +53,13 @@ class PieceJoiner:
         in_map = of_segment == largest_component(component)
         targets = _spaced_out(segments, poses, np.flatnonzero(in_map))
         for second in np.flatnonzero(~in_map).tolist():
+            of_part = of_segment == of_segment[second]
+            if np.count_nonzero(of_part) < MIN_SUPPORT:
+                continue
             for first in targets:
                 if (first, second) not in self._searched:
                     self._searched.add((first, second))
                     self._candidates += _search_segment(segments, first, second, poses)
-            of_part = of_segment == of_segment[second]
             candidates = [
                 each for each in self._candidates if in_map[each.closure.first] and of_part[each.closure.second]
             ]
