@@ -118,8 +118,10 @@ def _train(
 
     beams_per_sweep = max(options.recipe.beams_per_sweep, MIN_BEAMS_PER_SAMPLE * len(scans["train"]))
     recipe = replace(options.recipe, beams_per_sweep=beams_per_sweep)
-    beams = Beams.of(poses["train"], mount, angles, scans["train"])
-    learned = learn_field(beams, recipe, report, threads=os.cpu_count() or 1)
+    # The beams are not kept here: in large buildings, they are most of the memory.
+    learned = learn_field(
+        Beams.of(poses["train"], mount, angles, scans["train"]), recipe, report, threads=os.cpu_count() or 1
+    )
     # The weights are stored in half precision, so that the model is evaluated with the same precision.
     learned = replace(learned, phi=learned.phi.astype(np.float16).astype(np.float32))
     report("standard deviations", 1.0)

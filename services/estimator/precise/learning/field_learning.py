@@ -36,7 +36,6 @@ CARVED_DISTANCE_CELLS = 0.5  # minimum of phi at a node through which beams pass
 PASSING_CELLS = 0.25  # a beam passes a node within this distance
 EM_STEPS = 15  # of expectation maximisation
 OUTLIER_SHARE, OUTLIER_RANGE_M = 0.1, 25.0  # weight and width of the uniform part of the density
-BEAMS_AT_ONCE = 2_000_000  # processed together in a sweep, which limits memory
 MAX_ERROR_M = 0.1  # a larger error means that the beam ended at another surface
 MIN_FACING = 0.15  # minimum |n . u| of a beam that shapes the field: cosine of its angle of incidence
 PRIOR_COUNT, PRIOR_SCALE_M = 20, 0.05  # pseudo-count of each class, and its error, for classes that are seldom seen
@@ -138,7 +137,10 @@ def _clear_passed_nodes(field: DistanceField, beams: Beams, threads: int) -> Flo
         count_at_nodes(starts, part.unit(), part.ranges, h, PASSING_CELLS * h, PASSED_DEPTH_M, *counts)
         return counts
 
-    ended, passed = sum(_map_parts(count, beams, threads))
+    total = np.zeros((2, *field.phi.shape))
+    for part in beams.parts():
+        total += sum(_map_parts(count, part, threads))
+    ended, passed = total
     return np.where(are_mostly_passed(ended, passed), np.maximum(field.phi, np.float32(PASSING_CELLS * h)), field.phi)
 
 
@@ -157,8 +159,7 @@ def _descend(field: DistanceField, beams: Beams, sample: npt.NDArray[np.intp], r
     1 / |n . u|². Surfaces that most beams passed through are removed: planes extended past an edge, objects that moved.
     """
     ended, passed, up, norm = np.zeros((4, field.phi.size))
-    for begin in range(0, len(sample), BEAMS_AT_ONCE):
-        part = beams.part(sample[begin : begin + BEAMS_AT_ONCE])
+    for part in beams.parts(sample):
         _add_errors(field, part, ended, passed, up, norm, threads)
     absent = are_mostly_passed(ended, passed)
     phi = np.where(absent, np.maximum(field.phi.ravel(), CARVED_DISTANCE_CELLS * field.resolution), field.phi.ravel())

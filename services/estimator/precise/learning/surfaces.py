@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from common.geometry.se2 import Array, compose
 from services.estimator.precise.field import DistanceField, Floats
 from services.estimator.precise.learning.beam_cells import count_crossings
 
+BEAMS_AT_ONCE = 2_000_000  # processed together, which limits memory
 POOL_CELLS = 1  # cells to each side whose points are pooled to find a normal
 ELEMENT_RADIUS_CELLS = 2.0  # around a surface element, within which it shapes the field
 MIN_POINTS_PER_CELL = 3  # cells with fewer points are no surface
@@ -48,6 +50,20 @@ class Beams:
         """Returns the beams that a mask, indices or a slice select."""
         return Beams(self.starts[which], self.directions[which], self.ranges[which])
 
+    def parts(self, which: npt.NDArray[np.intp] | None = None) -> Iterator[Beams]:
+        """All beams, or those that indices select, at most `BEAMS_AT_ONCE` at a time."""
+        for begin in range(0, len(self.ranges if which is None else which), BEAMS_AT_ONCE):
+            part = slice(begin, begin + BEAMS_AT_ONCE)
+            yield self.part(part if which is None else which[part])
+
+    def bounds(self) -> tuple[Array, Array]:
+        """The least and the greatest x and y (2,) in m of starts and ends."""
+        low, high = np.full(2, np.inf), np.full(2, -np.inf)
+        for part in self.parts():
+            for points in (part.starts, part.ends()):
+                low, high = np.minimum(low, points.min(0)), np.maximum(high, points.max(0))
+        return low, high
+
     def joined(self, other: Beams) -> Beams:
         """Returns these beams and those of ``other``."""
         mine, theirs = (vars(each).values() for each in (self, other))
@@ -69,22 +85,21 @@ class SurfaceCells:
     @classmethod
     def of(cls, beams: Beams, h: float) -> SurfaceCells:
         """The cells of ``h`` m in which beams end."""
-        ends, unit = beams.ends(), beams.unit()
-        low = np.minimum(ends.min(0), beams.starts.min(0)) - 4 * h
-        shape = np.ceil((np.maximum(ends.max(0), beams.starts.max(0)) + 4 * h - low) / h).astype(int)[::-1] + 1
-        cell = np.floor((ends - low) / h).astype(int)
-        index = cell[:, 1] * shape[1] + cell[:, 0]
-
-        def pooled(values: Array | None) -> Array:
-            return _pooled(np.bincount(index, values, int(shape.prod())).reshape(shape))
-
-        own = np.bincount(index, minlength=int(shape.prod())).reshape(shape).astype(float)
-        local = ends - low  # smaller numbers, so that sums of squares lose less precision
-        count = np.maximum(pooled(None), 1)
-        mx, my = pooled(local[:, 0]) / count, pooled(local[:, 1]) / count
-        xx, yy = pooled(local[:, 0] ** 2) / count - mx**2, pooled(local[:, 1] ** 2) / count - my**2
-        xy = pooled(local[:, 0] * local[:, 1]) / count - mx * my
-        dx, dy = pooled(unit[:, 0]), pooled(unit[:, 1])
+        low, high = beams.bounds()
+        low = low - 4 * h
+        shape = np.ceil((high + 4 * h - low) / h).astype(int)[::-1] + 1
+        sums = np.zeros((8, int(shape.prod())))
+        for part in beams.parts():
+            local, (ux, uy) = part.ends() - low, part.unit().T
+            cell = np.floor(local / h).astype(int)
+            index, (x, y) = cell[:, 1] * shape[1] + cell[:, 0], local.T
+            for total, values in zip(sums, (None, x, y, x**2, y**2, x * y, ux, uy), strict=True):
+                np.add(total, np.bincount(index, values, len(total)), out=total)
+        own = sums[0].reshape(shape)
+        number, sx, sy, sxx, syy, sxy, dx, dy = (_pooled(each.reshape(shape)) for each in sums)
+        count = np.maximum(number, 1)
+        mx, my = sx / count, sy / count
+        xx, yy, xy = sxx / count - mx**2, syy / count - my**2, sxy / count - mx * my
         angle = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the surface, the long axis of the points
         nx, ny = -np.sin(angle), np.cos(angle)
         flip = np.where(nx * dx + ny * dy > 0, -1.0, 1.0)  # normals point against the beams, towards free space
@@ -98,8 +113,11 @@ class SurfaceCells:
     def crossings(self, beams: Beams) -> Array:
         """Counts (ny, nx) of beams that passed through the element of each cell."""
         crossed, elements = np.zeros(self.own.shape), (self.mx, self.my, self.nx, self.ny)
-        starts = beams.starts - self.low
-        count_crossings(starts, beams.unit(), beams.ranges, self.h, self.is_surface, *elements, PASSED_DEPTH_M, crossed)
+        for part in beams.parts():
+            starts = part.starts - self.low
+            count_crossings(
+                starts, part.unit(), part.ranges, self.h, self.is_surface, *elements, PASSED_DEPTH_M, crossed
+            )
         return crossed
 
     def contradicted_by(self, beams: Beams) -> npt.NDArray[np.bool_]:

@@ -11,7 +11,7 @@ from common.errors import UserError
 from common.geometry.world import World
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.global_seeds import Seeds
-from services.estimator.precise.learning import field_learning, weights
+from services.estimator.precise.learning import field_learning, surfaces, weights
 from services.estimator.precise.learning.evaluation import evaluate_model
 from services.estimator.precise.learning.field_learning import Recipe, learn_field, learn_scales
 from services.estimator.precise.learning.surfaces import Beams, field_of_surfaces
@@ -65,7 +65,7 @@ def test_same_result_again():
 
 
 def test_beams_in_parts(model, monkeypatch):
-    monkeypatch.setattr(field_learning, "BEAMS_AT_ONCE", 7000)
+    monkeypatch.setattr(surfaces, "BEAMS_AT_ONCE", 7000)
     assert np.allclose(learned().phi, model.field.phi, atol=1e-6)
     assert not np.array_equal(learned().phi, learned(seed=5).phi)
 
