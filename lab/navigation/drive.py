@@ -1,13 +1,13 @@
-"""The numbers of one drive.
+"""Results of one drive.
 
 Definitions:
 
 - A scan with a contact counts as moving if the true speed is above `MIN_MOVING_SPEED` before or after it.
 - The path ratio is the driven length, plus the straight distance left to the goal, divided by the length of the
   shortest path with clearance (`shortest_path`). Stopping short of the goal therefore gains nothing.
-- The time ratio is the time from the first scan until the controller reports `reached`, divided by a lower bound for
-  every drive: at full speed around the corners of the shortest path, without a turn or a stop.
-- The distance left to the goal is that of the true pose once the robot stands.
+- The time ratio is the time from the first scan until the end of the drive, divided by a lower bound: at full speed
+  around the corners of the shortest path, without a turn or a stop.
+- The distance left to the goal is that of the last true pose.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ def _clearance_to_people(trace: RunTrace, robot: Robot) -> float | None:
 def _localisation(trace: RunTrace) -> dict[str, Any]:
     """Localisation errors from the first belief in state `tracking` on, its time, and for how long tracking was lost.
 
-    `claimed_error_max_m` covers only beliefs in state `tracking`.
+    `claimed_error_max_m` covers only beliefs in state `tracking`; `longest_untracked_s` also the time before the first.
     """
     count = min(len(trace.truths), len(trace.beliefs))  # an aborted run may lack the last belief
     tracking = np.array([belief.state == "tracking" for belief in trace.beliefs[:count]], bool)

@@ -6,11 +6,13 @@
 | EXPLORING, RETURNING | a viewpoint is worth a visit | EXPLORING |
 | EXPLORING, RETURNING | no viewpoint is worth a visit | RETURNING |
 | RETURNING | the robot has arrived | FINISHED |
-| RETURNING | the way back stays refused | FAILED |
+| RETURNING | the way back stays refused, and the robot does not move | FAILED |
 
-A viewpoint is given up if it is refused, or if the robot does not move towards it for `STALLED_NS`.
+A viewpoint is given up if it is refused, or if the robot does not move `STALLED_M` in `STALLED_NS`; so is the way back
+if both hold.
 
-A goal of a user pauses the exploration until `PAUSE_NS` after that goal was reached, refused or cancelled.
+A goal of a user pauses the exploration until `PAUSE_NS` after that goal was reached or refused. Cancelling a goal ends
+the exploration.
 
 While the robot is not localised in the map, it keeps its goal, and the controller first localises it.
 """
@@ -35,7 +37,7 @@ PAUSE_NS = 2_000_000_000  # how long the robot stands at a goal of a user before
 STALLED_NS = 8_000_000_000  # after this time without a motion of `STALLED_M`, the goal counts as unreachable
 STALLED_M = 0.2
 VIEWPOINT_TOLERANCE_M = 0.1
-RETURN_TOLERANCE_M = 0.01  # of the goal at the start, so that the robot surely stands within 2 cm of it
+RETURN_TOLERANCE_M = 0.01  # of the goal at the start, so that the robot stands within 2 cm of it
 SAME_PLACE_M = 0.1  # a new viewpoint this close to the present goal does not replace it
 
 
@@ -80,7 +82,7 @@ class Explorer:
         self.map, self.viewpoint_due = planned, self.drives
 
     def pause(self) -> None:
-        """Pauses the exploration, because a user has set or cancelled a goal."""
+        """Pauses the exploration, because a user has set a goal."""
         self.goal, self.paused, self._user_goal_over_since_ns = None, True, None
 
     def move(self, pose: Array, *, located: bool) -> None:
@@ -110,7 +112,7 @@ class Explorer:
         elif self.paused:
             self.viewpoint_due |= self._resume_after_user_goal(state, stamp_ns)
         elif self.goal is not None:
-            self._note_motion(stamp_ns)
+            self._record_motion(stamp_ns)
             stalled = stamp_ns - self._last_moved[1] > STALLED_NS
             if self.phase == "returning":
                 self.viewpoint_due |= self._update_return(state, stalled=stalled)
@@ -127,7 +129,7 @@ class Explorer:
             self.paused, self._last_moved = False, (self._pose, 0)
         return not self.paused
 
-    def _note_motion(self, stamp_ns: int) -> None:
+    def _record_motion(self, stamp_ns: int) -> None:
         """Stores when the robot last moved by `STALLED_M`."""
         place, since_ns = self._last_moved
         if np.hypot(*(self._pose - place)[:2]) > STALLED_M or not 0 < since_ns <= stamp_ns:

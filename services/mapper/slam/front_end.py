@@ -96,7 +96,7 @@ class ScanPose:
 
     pose: Array  # (3,)
     covariance: Array  # (3, 3) relative to the last key scans
-    matched: bool  # False if only the motion model gives the pose
+    matched: bool  # False for a scan that is suspect, or of which too little matches
     piece: int = 0  # of the drive, or `NO_PIECE` for a suspect scan
     linked: bool = False  # whether this scan begins a piece with a link to the one before
 
@@ -119,7 +119,7 @@ class FrontEnd:
         self.stamps: list[float] = []  # s
         self.poses: list[Array] = []  # (3,)
         self.pieces: list[int] = []
-        self.unmatched = 0  # number of scans that did not match
+        self.unmatched = 0  # number of scans that are suspect, or of which too little matches
         # One entry for each key scan.
         self.keys: list[int] = []  # its number among all scans
         self._key_pieces: list[int] = []
@@ -155,7 +155,7 @@ class FrontEnd:
         contradiction = self._contradiction(scan, found, prior)
         known = [self.poses[-1], prior.mean] if used_odometry else [self.poses[-1]]
         suspect = contradiction > MAX_CONTRADICTION or self._is_suspect(found, prior, known, period)
-        # If the odometry still agrees with the local map after many such scans, more likely much has moved.
+        # If odometry and registration agree even after many suspect scans, the surroundings have changed.
         confirmed = self._suspect_scans + 1 >= MAX_SUSPECT_SCANS and used_odometry and not _is_far(found, prior)
         if found is not None and (confirmed or not suspect):
             doubtful = suspect or self._is_doubtful(contradiction) or prior.difference(found.pose)[1] > MAX_SLIP**2

@@ -25,7 +25,7 @@ TARGET_SPACING_M = 2.0  # between segments of the map in which a segment is sear
 SEARCH_RANGE_M, TURN_STEP = 4.0, 0.06  # m to either side of a target, and rad between the headings that are tried
 SAME_PLACE_M, SAME_PLACE_RAD = 0.5, 0.1  # two candidates agree if they place the piece this close together
 MIN_SUPPORT = 2  # number of segments that must agree
-# A place is rejected if more than this share of the elements contradicts the nearest segments; people cause less.
+# A place is rejected if a larger share of the elements contradicts the nearest segments: this plus twice the usual one.
 MAX_CONTRADICTION, NEAREST_SEGMENTS = 0.03, 3
 
 
@@ -79,7 +79,7 @@ def largest_component(component: npt.NDArray[np.int_]) -> int:
 
 
 def _spaced_out(segments: Sequence[Segment], poses: Array, numbers: npt.NDArray[np.int_]) -> list[int]:
-    """Those of some segments that are `TARGET_SPACING_M` apart."""
+    """Selects segments at least `TARGET_SPACING_M` apart."""
     chosen: list[int] = []
     for number in numbers.tolist():
         place = poses[segments[number].reference, :2]
@@ -106,9 +106,9 @@ def _search_segment(segments: Sequence[Segment], first: int, second: int, poses:
 def _agreed_closures(
     candidates: Sequence[JoinCandidate], parts: tuple[list[int], list[int]], segments: Sequence[Segment], poses: Array
 ) -> list[LoopClosure]:
-    """The loop closures that agree on the pose of one part of the drive in another, if no other pose is as good.
+    """The loop closures that agree on the pose of a part of the drive in the map, if no other pose is as good.
 
-    ``parts`` are the numbers of their segments, those of the map first.
+    ``parts`` are the numbers of the segments of the map, and of the part.
     """
     if not candidates:
         return []
