@@ -151,6 +151,8 @@ def _too_large(path: Path) -> UserError:
 
 def _normalised(image: Image) -> tuple[Array, Array | None]:
     """Colours and alpha of an image of any pixel type, as `_pixels` returns them."""
+    if image.mode == "F":
+        raise ValueError("its pixels are floating-point numbers, use 8 or 16 bits")
     if image.mode.startswith("I"):  # 16 bits per pixel, which Pillow may hold in 32
         return np.asarray(image, float)[..., None] / 65535, None
     mode = "RGBA" if image.has_transparency_data else "RGB"

@@ -12,8 +12,8 @@ from common.robot.robot import Robot
 
 REACTION_TIME_S = 2 / 15  # the scan is up to one 15 Hz period old, and the command holds for another
 PATH_STEP_S = 1 / 60  # between the points of a stopping path: 17 mm at 1 m/s, which is exact to 0.1 mm
-# A beam is averaged with those at most this far to either side whose range differs from its own by at most this much: a
-# few times the noise of usual scanners. Whatever stands farther in front of a wall keeps its distance.
+# A beam is usable with its neighbours within 1 cm whose ranges differ by at most 6 cm, a few times the noise of usual
+# scanners. Whatever stands farther in front of a wall keeps its distance.
 AVERAGE_WITHIN_M, MAX_RANGE_DIFFERENCE_M = 0.01, 0.06
 MAX_AVERAGED_BEAMS = 8  # to either side
 
@@ -23,8 +23,9 @@ def scan_points(scan: Scan) -> Array:
 
     Each is the mean of the end points of a beam and of pairs of beams, one to either side, that end within centimetres.
     Otherwise the robot would stop before the largest of hundreds of errors: several centimetres too early. The mean on
-    a straight wall lies on the wall, also at its end; that of a corner or a round post lies behind the surface by less
-    than a centimetre. A post thinner than 2 cm within 6 cm of the wall behind it may appear up to 4.5 cm too far away.
+    a straight wall lies on the wall, also at its end; that of a round post or a corner lies behind the surface by less
+    than a centimetre, of a corner sharper than 60° by up to 3 cm. A post thinner than 2 cm within 6 cm of the wall
+    behind it may appear nearly 6 cm too far away.
     """
     close = np.isneginf(scan.ranges)
     hit = is_surface(scan.ranges) | close
@@ -34,14 +35,14 @@ def scan_points(scan: Scan) -> Array:
     with np.errstate(invalid="ignore"):  # inf times cos(90°)
         ends = np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=-1)
     spacing = abs(scan.angle_increment) * ranges  # m between neighbouring end points across the beam
-    averaged = np.where(close, np.inf, ranges)  # a surface that is too close may be anywhere nearer than range_min
+    usable = np.where(close, np.inf, ranges)  # a surface that is too close may be anywhere nearer than range_min
     total, count = ends.copy(), np.ones(len(ranges))
     for offset in range(1, min(MAX_AVERAGED_BEAMS, (len(ranges) - 1) // 2) + 1):
         before, here, after = slice(None, -2 * offset), slice(offset, -offset), slice(2 * offset, None)
         same = offset * spacing[here] <= AVERAGE_WITHIN_M
-        for other in (before, after):  # both, because the mean would move along a wall that ends on one side
+        for other in (before, after):  # with one of them alone, the mean at the end of a wall would move along it
             with np.errstate(invalid="ignore"):  # inf - inf
-                same &= np.abs(averaged[here] - averaged[other]) <= MAX_RANGE_DIFFERENCE_M
+                same &= np.abs(usable[here] - usable[other]) <= MAX_RANGE_DIFFERENCE_M
         total[here][same] += ends[before][same] + ends[after][same]
         count[here] += 2 * same
     return se2.transform(scan.mount.array(), total[hit] / count[hit, None])
@@ -155,8 +156,8 @@ def _ramp_velocities(current: Array, target: Array, robot: Robot, times: Array) 
 
 def _is_path_clear(current: Array, target: Array, points: Array, robot: Robot, hold: float) -> bool:
     """Whether the footprint keeps the robot's margin from every point that it approaches on the stopping path."""
-    path, nearest = stopping_path(current, target, robot, hold), robot.radius + robot.margin
+    path, min_distance = stopping_path(current, target, robot, hold), robot.radius + robot.margin
     travelled = float(np.hypot(*np.diff(path, axis=0).T).sum())
-    points = points[np.hypot(points[:, 0], points[:, 1]) < nearest + travelled]
+    points = points[np.hypot(points[:, 0], points[:, 1]) < min_distance + travelled]
     distance = np.hypot(path[:, None, 0] - points[:, 0], path[:, None, 1] - points[:, 1])
-    return not bool(((distance[1:] < nearest) & (np.diff(distance, axis=0) < -1e-7)).any())
+    return not bool(((distance[1:] < min_distance) & (np.diff(distance, axis=0) < -1e-7)).any())

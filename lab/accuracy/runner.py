@@ -44,7 +44,7 @@ class AccuracyJob:
 
 
 def run_all(jobs: list[AccuracyJob], workers: int, console: Console) -> list[dict[str, Any]]:
-    """Rows of all jobs, in their order; jobs that differ only in the seed are one row. Shows a progress bar."""
+    """Rows of all jobs, in their order; jobs that differ only in the seed are pooled. Shows a progress bar."""
     if workers == 1:
         measured = [run(job) for job in track(jobs, "measuring", console=console, transient=True)]
     else:

@@ -33,9 +33,9 @@ def _learn(path: Path, world: World, scanner: Scanner) -> None:
     options = TrainPreciseOptions(world.name, scanner, out=path.parent)
     rng = np.random.default_rng(options.recipe.seed)
     scene = Scene(world, scanner, rng)
-    counts = {"train": default_samples(world), "test": CALIBRATION_SAMPLES + TEST_SAMPLES}
+    counts = {"train": default_samples(world), "held out": CALIBRATION_SAMPLES + TEST_SAMPLES}
     poses = {name: scene.poses(count) for name, count in counts.items()}
     clean = {name: scene.clean(places) for name, places in poses.items()}
-    scans = {"train": scanner.add_noise(clean["train"], rng), "test": clean["test"]}
+    scans = {"train": scanner.add_noise(clean["train"], rng), "held out": clean["held out"]}
     with Progress(console=Console(quiet=True), disable=True) as bar:
         learn_and_save(path, options, world, poses, {name: scanner.limit(each) for name, each in scans.items()}, bar)

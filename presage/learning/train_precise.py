@@ -34,9 +34,9 @@ from services.estimator.precise.learning.field_learning import (
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.model_folder import training_folder
 
-CALIBRATION_SAMPLES, TEST_SAMPLES = 250, 250  # scans without noise, from which the model is not learned
+CALIBRATION_SAMPLES, TEST_SAMPLES = 250, 250  # scans without noise, for the standard deviations and the errors
 MIN_SAMPLES, SAMPLES_PER_M2 = 5000, 10  # training scans; the error depends on the number of beams that meet a surface
-MIN_BEAMS_PER_SAMPLE = 400  # of each training scan, in each sweep of learning
+MIN_BEAMS_PER_SAMPLE = 400  # of a training scan, on average, in each sweep of learning
 
 
 @dataclass(frozen=True)
@@ -65,14 +65,14 @@ def train_precise(options: TrainPreciseOptions, link: Link, console: Console) ->
     path = weights.path_of(options.out, world.name)
     weights.refuse_to_overwrite(path, world)
     rng = np.random.default_rng(options.recipe.seed)
-    counts = {"train": options.samples or default_samples(world), "test": CALIBRATION_SAMPLES + TEST_SAMPLES}
+    counts = {"train": options.samples or default_samples(world), "held out": CALIBRATION_SAMPLES + TEST_SAMPLES}
     poses = {name: world.sample_poses(count, rng, Robot().radius) for name, count in counts.items()}
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console) as bar:
         with scanner_on_bus(link, options.world, options.simulator_arguments, world, scanner, console) as bus:
             train = collect(bus, poses["train"], scanner, options.recipe.seed, bar, "training scans")
-            test = collect(bus, poses["test"], scanner, None, bar, "test scans")
-        card = learn_and_save(path, options, world, poses, {"train": train, "test": test}, bar)
+            held_out = collect(bus, poses["held out"], scanner, None, bar, "test scans")
+        card = learn_and_save(path, options, world, poses, {"train": train, "held out": held_out}, bar)
     _draw(weights.load(path)[0], card, path.with_suffix(".png"))
     position_error_m = card.test_position_error_rms_m
     assert position_error_m is not None  # noqa: S101 - it was just measured
@@ -92,9 +92,9 @@ def learn_and_save(
     scans: dict[str, se2.Array],
     bar: Progress,
 ) -> weights.FieldCard:
-    """Learns from the `train` scans at their poses, saves the weights with their errors on the `test` scans.
+    """Learns from the `train` scans at their poses, saves the weights with their errors on the scans `held out`.
 
-    The test scans have no noise. Returns the model card.
+    Those have no noise. Returns the model card.
     """
     start = time.monotonic()
     model, errors = _train(options, poses, scans, bar)
@@ -126,15 +126,15 @@ def _train(
     learned = replace(learned, phi=learned.phi.astype(np.float16).astype(np.float32))
     report("standard deviations", 1.0)
     count = CALIBRATION_SAMPLES
-    scales = learn_scales(learned, poses["test"][:count], mount, angles, scans["test"][:count], 0.0)
-    ripple = measure_ripple(learned, se2.compose(poses["test"][:count], mount), angles)
+    scales = learn_scales(learned, poses["held out"][:count], mount, angles, scans["held out"][:count], 0.0)
+    ripple = measure_ripple(learned, se2.compose(poses["held out"][:count], mount), angles)
     model = FieldModel(learned, scales, ripple)
     errors = evaluate_model(
         model,
-        poses["test"][count:],
+        poses["held out"][count:],
         mount,
         angles,
-        scans["test"][count:],
+        scans["held out"][count:],
         scanner.range_max,
         max(scanner.sigma, MIN_SIGMA_M),
         scanner.sigma_relative,

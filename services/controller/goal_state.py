@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from services.controller.policies.decision import Decision
 
 BLOCKED_AFTER_S = 2.0  # time without motion before an obstacle after which the phase becomes BLOCKED
-# Less motion is none. Before an obstacle, a robot still moves by millimetres with the noise of the scan.
+# A smaller motion counts as standing: before an obstacle, the robot moves by millimetres with the noise of the scan.
 MIN_MOTION_M, MIN_MOTION_RAD = 0.02, 0.05
 
 StatusState = Literal["idle", "navigating", "reached", "blocked", "lost", "exploring"]  # of the message Status
@@ -65,7 +65,7 @@ class GoalState:
 
     def _enter(self, phase: Phase, reason: str = "") -> None:
         self.phase, self.reason = phase, reason
-        # Since when, in ns, and at which pose (3,) the robot has stood before an obstacle; None without one.
+        # Since when, in ns, and at which pose (3,) the robot has stood before an obstacle; None if there is none.
         self._standing_since: tuple[int, Array] | None = None
 
     @property
@@ -116,8 +116,13 @@ class GoalState:
             self.goal = None
             self._enter(Phase.IDLE)
 
-    def update_progress(self, stamp_ns: int, pose: Array, decision: Decision, *, limited_by_scan: bool) -> None:
-        """Processes a decision of the policy at a pose (3,); ``limited_by_scan``: obstacles reduced its velocity."""
+    def update_progress(
+        self, stamp_ns: int, pose: Array, decision: Decision, *, moving: bool, limited_by_scan: bool
+    ) -> None:
+        """Processes a decision of the policy at a pose (3,).
+
+        ``moving``: the command moves the robot. ``limited_by_scan``: obstacles in the scan reduced its velocity.
+        """
         if self.phase not in {Phase.NAVIGATING, Phase.BLOCKED}:
             return
         self.reason = decision.reason or ("slowed by the scan" if limited_by_scan else "")
@@ -125,7 +130,7 @@ class GoalState:
             self.phase = Phase.BLOCKED
         elif not (limited_by_scan or decision.state == "blocked"):
             self.phase, self._standing_since = Phase.NAVIGATING, None
-        elif self._standing_since is None or _has_moved(self._standing_since[1], pose):
+        elif self._standing_since is None or (moving and _has_moved(self._standing_since[1], pose)):
             self.phase, self._standing_since = Phase.NAVIGATING, (stamp_ns, pose)
         elif (stamp_ns - self._standing_since[0]) * 1e-9 >= BLOCKED_AFTER_S:
             self.phase, self.reason = Phase.BLOCKED, decision.reason or "the scan shows something in the way"

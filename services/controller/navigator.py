@@ -20,7 +20,7 @@ from services.controller.lifts import LiftRide, plan_ride
 from services.controller.manual_drive import ManualDrive
 from services.controller.policies.decision import Decision, Policy
 from services.controller.policies.goal_check import wall_refusal
-from services.controller.policies.motion_model import delay_until_effect, turn_rate
+from services.controller.policies.motion_model import delay_until_effect, is_moving, turn_rate
 from services.controller.policies.paper_action import ActionParameters
 from services.controller.policies.straight_line import StraightLinePolicy
 from services.controller.velocity_command import VelocityCommand
@@ -217,7 +217,10 @@ class Navigator:
         if goal is not None and distance is not None and self.goal_state.active:
             desired = self._goal_velocity(belief, pose, goal, distance)
         command, limited_by_scan = self._command.limit(belief.stamp_ns, desired, self._scan_points)
-        self.goal_state.update_progress(belief.stamp_ns, pose, self.decision, limited_by_scan=limited_by_scan)
+        moving = is_moving(self._command.velocity)
+        self.goal_state.update_progress(
+            belief.stamp_ns, pose, self.decision, moving=moving, limited_by_scan=limited_by_scan
+        )
         if self.explorer is not None:
             self.explorer.update(self.goal_state, belief.stamp_ns)
         status = self._add_exploration(self.goal_state.status(belief.stamp_ns, shown_distance))

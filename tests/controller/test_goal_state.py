@@ -14,9 +14,9 @@ def event(method, *args, **more):
     return lambda state: method(state, *args, **more)
 
 
-def progress(seconds, *, at=(0, 0, 0), limited=False, **decision):
+def progress(seconds, *, at=(0, 0, 0), moving=True, limited=False, **decision):
     pose, now_ns = np.array(at, dtype=float), round(seconds * 1e9)
-    return event(GoalState.update_progress, now_ns, pose, Decision(**decision), limited_by_scan=limited)
+    return event(GoalState.update_progress, now_ns, pose, Decision(**decision), moving=moving, limited_by_scan=limited)
 
 
 START, REFUSED = (event(GoalState.start, goal(1, 2), refusal) for refusal in (None, "in a wall"))
@@ -58,6 +58,7 @@ FREE, HINDERED = progress(0), progress(1, limited=True)
         ([START, HINDERED, progress(3, at=(0, 0.01, 0.01), limited=True)], "blocked", IN_THE_WAY, True),
         ([START, HINDERED, progress(3, at=(0, 0.03, 0), limited=True)], "navigating", "slowed by the scan", True),
         ([START, HINDERED, progress(3, at=(0, 0, 0.1), limited=True)], "navigating", "slowed by the scan", True),
+        ([START, HINDERED, progress(3, at=(0, 9, 0), moving=False, limited=True)], "blocked", IN_THE_WAY, True),
         ([START, progress(0, recovering=True, reason="backs off")], "blocked", "backs off", True),
         ([START, progress(0, recovering=True), LOSE, FIND], "navigating", "", True),
     ],

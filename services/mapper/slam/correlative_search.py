@@ -10,16 +10,16 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from services.mapper.slam.elements import Elements
 
-Shifts = npt.NDArray[np.int64]  # (K, 3) number of a turn, and cells along x and y
+Candidates = npt.NDArray[np.int64]  # (K, 3) number of a turn, and shifts along x and y in cells
 
 CELL_M = 0.15  # of the grid that is searched
-BLOCK = 4  # shifts in a row that are bounded together
+BLOCK = 4  # cells, edge length of a block of shifts that are bounded together
 SECTORS = 8  # of the directions of normals, one bit of a cell each
 TURN_STEP = 0.03  # rad
 MAX_ELEMENTS = 200  # of the moved group that are used
 PEAKS = 4  # poses returned
 PEAK_DISTANCE_M, PEAK_TURN = 0.5, 0.15  # between them
-BLOCKS_AT_ONCE = 512  # whose poses are scored before the next look at the peaks
+FIRST_BLOCKS = 512  # blocks that are scored first; then twice as many, and so on
 MAX_RANKED = 2000  # poses among which peaks are looked for
 
 
@@ -28,16 +28,15 @@ def correlative_search(
 ) -> Array:
     """The best poses (K, 3) of ``moved`` in the frame of ``target``, at most ``window`` (3,) from ``around`` (3,).
 
-    There are none if ``moved`` is empty. A pose's score is the number of elements of ``moved`` in or beside cells with
-    similar elements of ``target``; among equal ones, those near ``around`` are better. Branch and bound (Hess et al.,
-    ICRA 2016): the score of a whole block of shifts has an upper bound, and blocks that cannot be among the best are
-    left out.
+    A pose's score is the number of elements of ``moved`` in or beside cells with similar elements of ``target``; those
+    with a score of 0 are left out. Among equal scores, a pose near ``around`` is better; a turn by ``turn_step`` counts
+    as a cell. Branch and bound (Hess et al., ICRA 2016): blocks of shifts whose bound is too low are not scored.
     """
     if not len(moved):
         return np.zeros((0, 3))
     window = np.minimum(window, [np.inf, np.inf, np.pi])
     sample = moved.part(np.linspace(0, len(moved) - 1, min(len(moved), MAX_ELEMENTS)).astype(int))
-    reach = np.hypot(*sample.points.T).max() + np.hypot(*window[:2]) + BLOCK * CELL_M
+    reach = np.hypot(*sample.points.T).max() + np.hypot(*window[:2])
     low = around[:2] - reach - 2 * CELL_M
     grid = _rasterise(target, low, int(2 * (reach + 2 * CELL_M) / CELL_M) + 2)
     count = np.ceil(window[:2] / CELL_M).astype(int)
@@ -45,36 +44,36 @@ def correlative_search(
     placed = [sample.transformed(np.array([*around[:2], turn])) for turn in turns]
     sector = np.array([_sector(each.normals) for each in placed])
     cells = np.array([np.floor((each.points - low) / CELL_M).astype(np.int64) for each in placed])  # (T, N, 2)
-    firsts = [np.arange(-n, n + 1, BLOCK) for n in count.tolist()]
-    blocks = np.stack(np.meshgrid(np.arange(len(turns)), *firsts, indexing="ij"), axis=-1).reshape(-1, 3)
+    corners = [np.arange(-n, n + 1, BLOCK) for n in count.tolist()]
+    blocks = np.stack(np.meshgrid(np.arange(len(turns)), *corners, indexing="ij"), axis=-1).reshape(-1, 3)
     bounds = _count_hits(_pooled(grid), sector, cells, blocks)
-    order = np.argsort(-bounds, kind="stable")
-    shifts, scores = np.zeros((0, 3), np.int64), np.zeros(0, np.int32)  # the best ones so far
-    peaks, lowest = np.zeros((0, 3)), 0
-    for begin in range(0, len(order), BLOCKS_AT_ONCE):
-        chosen = order[begin : begin + BLOCKS_AT_ONCE]
-        if len(peaks) == PEAKS and lowest > bounds[chosen[0]]:
-            break
-        more = _shifts_within(blocks[chosen], count)
-        shifts, scores = np.concatenate([shifts, more]), np.append(scores, _count_hits(grid, sector, cells, more))
-        off_centre = ((shifts - [len(turns) // 2, 0, 0]) ** 2).sum(axis=1)
-        best = np.lexsort([off_centre, -scores])[:MAX_RANKED]
-        shifts, scores = shifts[best], scores[best]
-        poses = np.column_stack([around[:2] + CELL_M * shifts[:, 1:], turns[shifts[:, 0]]])
-        which = _apart(poses)
-        peaks, lowest = poses[which], int(scores[which[-1]])
+    order = np.argsort(-bounds, kind="stable")[: np.count_nonzero(bounds)]
+    best, scores = np.zeros((0, 3), np.int64), np.zeros(0, np.int32)  # of the candidates so far
+    peaks, lowest_score = np.zeros((0, 3)), 0
+    begin, size = 0, FIRST_BLOCKS
+    while begin < len(order) and not (len(peaks) == PEAKS and lowest_score > bounds[order[begin]]):
+        candidates = _shifts_within(blocks[order[begin : begin + size]], count)
+        best = np.concatenate([best, candidates])
+        scores = np.append(scores, _count_hits(grid, sector, cells, candidates))
+        distance = ((best - [len(turns) // 2, 0, 0]) ** 2).sum(axis=1)
+        rank = np.lexsort([distance, -scores])[: min(MAX_RANKED, np.count_nonzero(scores))]
+        best, scores = best[rank], scores[rank]
+        poses = np.column_stack([around[:2] + CELL_M * best[:, 1:], turns[best[:, 0]]])
+        if chosen := _distant_poses(poses):
+            peaks, lowest_score = poses[chosen], int(scores[chosen[-1]])
+        begin, size = begin + size, 2 * size
     return peaks
 
 
-def _shifts_within(blocks: Shifts, count: npt.NDArray[np.int_]) -> Shifts:
-    """The shifts (K, 3) of blocks (B, 3), without those beyond ``count`` (2,) cells."""
-    ahead = np.stack(np.meshgrid(0, np.arange(BLOCK), np.arange(BLOCK)), axis=-1).reshape(-1, 3)
-    shifts = (blocks[:, None] + ahead).reshape(-1, 3)
-    return np.asarray(shifts[(shifts[:, 1:] <= count).all(axis=1)])
+def _shifts_within(blocks: Candidates, count: npt.NDArray[np.int_]) -> Candidates:
+    """All candidates in blocks (B, 3), without those shifted by more than ``count`` (2,) cells."""
+    within = np.stack(np.meshgrid(0, np.arange(BLOCK), np.arange(BLOCK)), axis=-1).reshape(-1, 3)
+    candidates = (blocks[:, None] + within).reshape(-1, 3)
+    return np.asarray(candidates[(candidates[:, 1:] <= count).all(axis=1)])
 
 
-def _apart(poses: Array) -> list[int]:
-    """The first ones of some poses (K, 3), at most `PEAKS`, that are apart from one another."""
+def _distant_poses(poses: Array) -> list[int]:
+    """Indices of the first `PEAKS` of some poses (K, 3) that are distant from one another."""
     chosen: list[int] = []
     for number, pose in enumerate(poses):
         off = se2.difference(pose, poses[chosen])
@@ -105,7 +104,7 @@ def _rasterise(elements: Elements, low: Array, size: int) -> npt.NDArray[np.uint
 
 
 def _pooled(grid: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """The grid with the bits of all `BLOCK` x `BLOCK` cells from each cell on."""
+    """The bits of all cells in the block of `BLOCK` x `BLOCK` cells that begins at each cell."""
     rows = grid.copy()
     for k in range(1, BLOCK):
         rows[:-k] |= grid[k:]
@@ -120,15 +119,15 @@ def _count_hits(
     grid: npt.NDArray[np.uint8],
     sector: npt.NDArray[np.uint8],
     cells: npt.NDArray[np.int64],
-    shifts: npt.NDArray[np.int64],
+    candidates: Candidates,
 ) -> npt.NDArray[np.int32]:
-    """The number (K,) of elements in cells with the bit of their sector, for each of the ``shifts`` (K, 3).
+    """The number (K,) of elements in cells with the bit of their sector, for each of the ``candidates`` (K, 3).
 
     ``sector`` (T, N) and ``cells`` (T, N, 2), column and row, are of the elements after each turn.
     """
-    hits = np.zeros(len(shifts), np.int32)
-    for k in range(len(shifts)):
-        turn, columns, rows = shifts[k]
+    hits = np.zeros(len(candidates), np.int32)
+    for k in range(len(candidates)):
+        turn, columns, rows = candidates[k]
         for n in range(sector.shape[1]):
             hits[k] += grid[cells[turn, n, 1] + rows, cells[turn, n, 0] + columns] >> sector[turn, n] & 1
     return hits

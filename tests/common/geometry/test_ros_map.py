@@ -113,6 +113,7 @@ def test_keys_of_map_yaml(tmp_path):
         ({"image": "none.pgm"}, "none.pgm: no such file"),
         ({"image": "map.yaml"}, "not an image"),
         ({"image": "cut.png"}, "cut.png: cannot be read"),
+        ({"image": "float.pgm"}, "float.pgm: cannot be read .its pixels are floating-point numbers"),
         ({"image": "pipe.pgm"}, r"map image .*pipe.pgm: a folder, pipe or device, not a file"),
         ({}, "image: missing"),
         ({"image": "map.pgm", "mode": "quaternary"}, "mode: .*'trinary', 'scale' or 'raw'"),
@@ -126,6 +127,7 @@ def test_invalid_maps(tmp_path, keys, message):
     write_map(tmp_path, values_of("#.? ..."))
     Image.fromarray(ALPHAS).save(tmp_path / "cut.png")
     (tmp_path / "cut.png").write_bytes((tmp_path / "cut.png").read_bytes()[:100])
+    (tmp_path / "float.pgm").write_bytes(b"Pf 1 1 -1.0\n" + np.float32(0.5).tobytes())
     os.mkfifo(tmp_path / "pipe.pgm")
     with pytest.raises(UserError, match=message):
         load_world(str(write_yaml(tmp_path, **keys)))

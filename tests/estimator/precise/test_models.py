@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from common.geometry import se2
 from common.geometry.world import World, load_world
+from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS
 from services.estimator.precise.field import DistanceField, FieldModel
 from services.estimator.precise.learning import weights
@@ -69,7 +70,7 @@ def test_derivatives(seed):
 def test_shipped_fields_show_no_surface_where_there_is_none(name):
     world, scanner = load_world(name), SCANNERS["tim571"]
     field = weights.load(weights.find(SHIPPED, world, name))[0].field
-    lasers = se2.compose(world.sample_poses(500, np.random.default_rng(0), 0.27), np.array(scanner.mount))
+    lasers = se2.compose(world.sample_poses(500, np.random.default_rng(0), Robot().radius), np.array(scanner.mount))
     true = world.ray_distances(lasers, scanner.angles())
     too_near = field.trace(lasers, scanner.angles()).ranges < true - 0.05
     assert too_near.mean() < 5e-4  # beams that pass a corner closely
