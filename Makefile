@@ -101,12 +101,12 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	mkdir -p $(RESULTS)
 	$(BIN)/presage bench accuracy --estimators all --seed 3211 --seeds 5 --trials 10 --minutes 0.2 --json $(RESULTS)/accuracy.json --figure $(RESULTS)/accuracy.png
 	$(BIN)/presage experiment --out $(RESULTS) all
-	$(BIN)/presage experiment --seed 3465 --out $(RESULTS) navigation --trials 30
-	$(BIN)/presage experiment --seed 3468 --out $(RESULTS) navigation --start unknown --trials 30
+	$(BIN)/presage experiment --seed 3469 --out $(RESULTS) navigation --trials 30
+	$(BIN)/presage experiment --seed 3470 --out $(RESULTS) navigation --start unknown --trials 30
 	$(BIN)/presage experiment --seed 3421 --out $(RESULTS) navigation --worlds office --people 10 --trials 50
 	$(BIN)/presage experiment --seed 3467 --out $(RESULTS) navigation --worlds hall --drives holonomic --max-range 4 --beams 271 --prior odometry --slip 0.05 --limit 60 --trials 50
 	$(BIN)/presage experiment --seed 3467 --out $(RESULTS) navigation --worlds hall --drives holonomic --max-range 4 --beams 271 --prior odometry --slip 0.05 --limit 60 --trials 50 --no-epistemic
-	$(BIN)/presage experiment --seed 3466 --out $(RESULTS) navigation --worlds twins --start unknown --trials 50
+	$(BIN)/presage experiment --seed 3471 --out $(RESULTS) navigation --worlds twins --start unknown --trials 50
 	$(BIN)/presage experiment --seed 4300 --out $(RESULTS) navigation --worlds twins --start unknown --trials 50 --drives holonomic --no-epistemic
 	$(BIN)/presage experiment --seed 3424 --out $(RESULTS) docking --trials 64
 	$(BIN)/presage experiment --seed 51 --out $(RESULTS) exploration
