@@ -575,6 +575,7 @@ class PreciseEstimator:
         if evidence[best] > self.modes[0].log_weight:
             self._search_interval = 1
             if carried[best] > stayed[best]:
+                self._change_rate.forget_latest()
                 self._restart_local_map(view)
         self._unknown_place.exclude_mapped_places()
         self._set_hypotheses([*self.modes, *added])

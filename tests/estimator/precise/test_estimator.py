@@ -101,6 +101,7 @@ def test_kidnapping():
     outcome = tasks.kidnapped(made, scene, 15, iter)
     assert outcome["kidnapped, 1 scan"].found == 15
     assert outcome["kidnapped, 3 scans"].wrong == 0
+    assert made._change_rate.remembered < 1  # nothing around the robot has changed
 
 
 def test_blocked_beams():

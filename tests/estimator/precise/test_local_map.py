@@ -167,6 +167,9 @@ def test_change_rate():
         rate.learn(5, period)
     assert sum(n * math.exp(rate.log_probability(n, period)) for n in range(100)) == pytest.approx(5, rel=0.1)
     busy = rate.log_probability(5, period)
+    rate.learn(7, period)
+    rate.forget_latest()
+    assert rate.log_probability(5, period) == pytest.approx(busy, abs=0.05)
     for _ in range(3000):
         rate.learn(0, period)
     assert rate.log_probability(5, period) == pytest.approx(quiet, abs=5)
