@@ -58,10 +58,10 @@ NO_PIECE = -1  # of a suspect scan, instead of the number of a piece
 # Standard deviations of the motion. With odometry: of its error, as a share of the motion. Without: of the change of
 # the velocity in one second, m/s and rad/s, and of the velocity itself where the last one is unknown.
 ODOMETRY_PATH, ODOMETRY_TURN_BY_PATH, ODOMETRY_TURN = 0.4, 0.5, 1.0  # m/m, rad/m, rad/rad
-ACCELERATION = np.array([1.0, 1.0, 3.0])  # change of the velocity in one second
-MAX_VELOCITY = np.array([1.0, 1.0, 1.5])  # the velocity itself
+VELOCITY_CHANGE_DEVIATION = np.array([1.0, 1.0, 3.0])
+VELOCITY_DEVIATION = np.array([1.0, 1.0, 1.5])
 STANDING_DEVIATION = np.array([0.002, 0.002, 0.002])  # m, m, rad: in addition to both
-MAX_MOTION = 3 * MAX_VELOCITY  # in one second; a robot that seems to move faster was kidnapped
+MAX_VELOCITY = 3 * VELOCITY_DEVIATION  # a robot that seems to move faster was kidnapped
 # Scans over which these deviations are learned, and the largest error that counts, in deviations.
 LEARNING_SCANS, MAX_LEARNED_SIGMAS = 100, 10.0
 # Errors of a registration that do not average out, for each key scan: moving things, the surfaces' roughness.
@@ -188,8 +188,9 @@ class FrontEnd:
             path, turn = ODOMETRY_PATH * moved, ODOMETRY_TURN_BY_PATH * moved + ODOMETRY_TURN * turned
             return motion, STANDING_DEVIATION + np.array([path, path, turn])
         if velocity is None:
-            return np.zeros(3), STANDING_DEVIATION + MAX_VELOCITY * period
-        return velocity * period, STANDING_DEVIATION + np.minimum(ACCELERATION * period, MAX_VELOCITY) * period
+            return np.zeros(3), STANDING_DEVIATION + VELOCITY_DEVIATION * period
+        deviation = np.minimum(VELOCITY_CHANGE_DEVIATION * period, VELOCITY_DEVIATION)
+        return velocity * period, STANDING_DEVIATION + deviation * period
 
     def _correct(self, ranges: Array, motion: Array, period: float) -> _Scan:
         """The scan as if measured at its stamp, with a ``motion`` (3,) since the scan before."""
@@ -232,7 +233,7 @@ class FrontEnd:
         last one and, with odometry, the next one: odometry that paused reports the motion of several scans at once.
         """
         pose = prior.mean if found is None else found.pose
-        if all((np.abs(se2.between(each, pose)) > MAX_MOTION * period).any() for each in known):
+        if all((np.abs(se2.between(each, pose)) > MAX_VELOCITY * period).any() for each in known):
             return True
         if found is not None and found.share > FAMILIAR_SHARE:
             return False
