@@ -12,7 +12,7 @@ from common.robot.robot import Robot
 
 REACTION_TIME_S = 2 / 15  # the scan is up to one 15 Hz period old, and the command holds for another
 PATH_STEP_S = 1 / 60  # between the points of a stopping path: 17 mm at 1 m/s, which is exact to 0.1 mm
-# A beam is usable with its neighbours within 1 cm whose ranges differ by at most 6 cm, a few times the noise of usual
+# A beam is averaged with its neighbours within 1 cm whose ranges differ by at most 6 cm, a few times the noise of usual
 # scanners. Whatever stands farther in front of a wall keeps its distance.
 AVERAGE_WITHIN_M, MAX_RANGE_DIFFERENCE_M = 0.01, 0.06
 MAX_AVERAGED_BEAMS = 8  # to either side

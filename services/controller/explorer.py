@@ -8,8 +8,8 @@
 | RETURNING | the robot has arrived | FINISHED |
 | RETURNING | the way back stays refused, and the robot does not move | FAILED |
 
-A viewpoint is given up if it is refused, or if the robot does not move `STALLED_M` in `STALLED_NS`; so is the way back
-if both hold.
+A viewpoint is given up if it is refused, or if the robot does not move `STALLED_M` in `STALLED_NS`. The way back is
+given up only if both hold.
 
 A goal of a user pauses the exploration until `PAUSE_NS` after that goal was reached or refused. Cancelling a goal ends
 the exploration.

@@ -149,5 +149,5 @@ class GoalState:
 
 
 def _has_moved(before: Array, now: Array) -> bool:
-    moved, turned = np.hypot(*(now - before)[:2]), abs(se2.wrap(now[2] - before[2]))
-    return bool(moved > MIN_MOTION_M or turned > MIN_MOTION_RAD)
+    x, y, turn = se2.difference(now, before)
+    return bool(np.hypot(x, y) > MIN_MOTION_M or abs(turn) > MIN_MOTION_RAD)

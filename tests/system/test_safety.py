@@ -14,6 +14,7 @@ from common.geometry.world import Box, Obstacle
 from common.messages.definitions import Belief, CmdVel, Goal, Pose, Status, Truth, Twist
 from common.messages.requests import ObstacleRequest, Reply
 from common.messages.topics import BELIEF, CMD_VEL, GOAL, OBSTACLE, STATUS, TRUTH
+from common.robot.robot import Robot
 from tests.conftest import WAIT_TIMEOUT_S, wait_for_message
 
 TIMEOUT_S = 60.0
@@ -77,8 +78,11 @@ def test_obstacle_stop_of_the_base(process, bus, truths, stop):
     # Without the obstacle stop there is contact, so the test is meaningful.
     assert seen[-1].contact == (stop == "--no-obstacle-stop")
     assert seen[-1].stopped == (stop == "--obstacle-stop")
-    # It stands, but for millimetres where noise makes the gap look larger than it is.
-    assert not seen[-1].stopped or seen[-1].pose.x - seen[-RATE].pose.x < 0.005
+    if seen[-1].stopped:
+        box = seen[-SCANS_WITH_BOX - 1].pose.x + BOX_DISTANCE  # x of the robot if it touched the box
+        assert box - seen[-1].pose.x > Robot().margin
+        # It stands, but for millimetres where noise makes the gap look larger than it is.
+        assert seen[-1].pose.x - seen[-RATE].pose.x < 0.005
     assert simulator.stop() == 0, simulator.output
 
 

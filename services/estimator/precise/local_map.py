@@ -83,7 +83,7 @@ class ChangeRate:
     """
 
     remembered: float = 0.0  # changes, forgotten exponentially
-    _latest: int = 0  # number of changes learned last
+    _remembered_before: float = 0.0  # without the changes learned last
 
     def log_probability(self, changes: int, period: float) -> float:
         """Log probability in nats of a number of changes within ``period`` s."""
@@ -93,13 +93,12 @@ class ChangeRate:
 
     def learn(self, changes: int, period: float) -> None:
         """Learns from a number of changes within ``period`` s, and forgets earlier ones exponentially."""
-        self.remembered = math.exp(-period / CHANGE_MEMORY_S) * self.remembered + changes
-        self._latest = changes
+        self._remembered_before = math.exp(-period / CHANGE_MEMORY_S) * self.remembered
+        self.remembered = self._remembered_before + changes
 
     def forget_latest(self) -> None:
         """Forgets the changes learned last, because the robot was carried: nothing around it has changed."""
-        self.remembered -= self._latest
-        self._latest = 0
+        self.remembered = self._remembered_before
 
 
 @dataclass
