@@ -130,6 +130,29 @@ def bench_mapping_faults(
     raise typer.Exit(run(worlds, seed, seconds, json_file, console))
 
 
+@app.command("training")
+def bench_training(
+    models: Annotated[
+        str, typer.Option(help="Comma-separated models, corridor-precise. Defaults to all shipped.")
+    ] = "",
+    seeds: Annotated[int, typer.Option(min=1, help="Number of trainings of each model, with seeds from 1 on.")] = 5,
+    samples: Annotated[
+        int | None, typer.Option(min=10, help="Training scans. Defaults to those of the shipped model.")
+    ] = None,
+    out: GeneratedFolder = None,
+    json_file: Json = None,
+) -> None:
+    """Errors of the shipped models, and of the same models trained with other seeds.
+
+    Each is trained and tested by `presage train`. After Ctrl-C the same command continues.
+
+    Examples: `presage bench training --models maze-precise --seeds 2`; `presage bench training --json training.json`.
+    """
+    from lab.benchmarks.training import bench_training as run
+
+    raise typer.Exit(run(models, seeds, samples, out or Path("training"), json_file, console))
+
+
 @app.command("refinement")
 def bench_refinement(
     worlds: Annotated[int, typer.Option(min=0, max=1000, help="Number of generated buildings beside office.")] = 2,

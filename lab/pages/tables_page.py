@@ -34,6 +34,7 @@ MODULES = {
     "mapping-faults": "lab.benchmarks.mapping_faults",
     "live-refinement": "lab.benchmarks.live_refinement",
     "area": "lab.benchmarks.area",
+    "training": "lab.benchmarks.training",
 }
 # Results with and without the terms of information, in one table.
 COMPARED = {
