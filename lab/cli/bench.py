@@ -304,7 +304,7 @@ def bench_integrity(
     seed: Annotated[int, typer.Option(min=0, max=2**20, help="Each seed has its own buildings.")] = 1,
     cases: Annotated[str, typer.Option(help="Comma-separated cases of docs/integrity.md. Defaults to all.")] = "",
     estimators: Annotated[
-        str, typer.Option(help="Comma-separated: precise, particle-filter, amcl-defaults.")
+        str, typer.Option(help="Comma-separated: precise, particle-filter, particle-filter-recovery, amcl-defaults.")
     ] = "precise,particle-filter",
     model: Annotated[
         str, typer.Option(help="Of precise: learned (30 s for each map), or exact for a quick run.")

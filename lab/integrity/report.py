@@ -13,11 +13,11 @@ from rich.console import Console
 from common.errors import UserError
 from lab.experiments.results import Result, markdown, millimetres, number
 from lab.integrity.cases import CASES
-from lab.integrity.runner import IntegrityPlan, run
+from lab.integrity.runner import RECOVERING_FILTER, IntegrityPlan, run
 from presage.plotting.style import BOUND, COLOURS, GOAL, figure_of, legend_below
 from presage.terminal.output import make_folder
 
-ESTIMATORS = ("precise", "particle-filter", "amcl-defaults")
+ESTIMATORS = ("precise", "particle-filter", RECOVERING_FILTER, "amcl-defaults")
 HEADS = ("`tracking` %", "wrong of these %; longest", "correct %", "error (mm)", "NEES")  # of each estimator
 LEGEND = """*Tracking*: share of the scans that are reported as `tracking`. *Wrong*: share of these with an error above
 0.2 m or 5°, with Wilson's 95 % interval (too narrow, because scans of one trial depend on each other), or its upper

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -22,10 +22,13 @@ from services.estimator.factory import (
     ScannerGeometry,
     prepare_factory,
 )
+from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.precise.learning import weights
-from services.estimator.shared.interface import Posterior
+from services.estimator.shared.interface import PoseEstimator, Posterior
 
 SEEDS_PER_RUN = 1000  # worlds of one run; the next seed of a run has other worlds
+# The tuned particle filter that also searches elsewhere after it was given a start pose, which by default it keeps
+RECOVERING_FILTER = "particle-filter-recovery"
 
 
 @dataclass(frozen=True)
@@ -149,13 +152,26 @@ def run_trial(job: IntegrityJob) -> dict[str, Any]:
 
 
 def make_factory(job: IntegrityJob, trial: IntegrityTrial) -> EstimatorFactory:
-    """The estimators of a trial, made as by the estimator service."""
-    model = job.model
+    """The estimators of a trial, made as by the estimator service but for `RECOVERING_FILTER`."""
+    model, seed = job.model, job.source.seed
+    if job.estimator == RECOVERING_FILTER:
+        return _with_recovery(prepare_factory(EstimatorOptions(trial.map_world, "particle-filter", seed=seed)))
     if job.estimator == "precise" and model == "learned":
         model = str(weights.path_of(job.models, trial.map_world.name))  # learned before the trials
-    return prepare_factory(
-        EstimatorOptions(trial.map_world, cast("EstimatorPreset", job.estimator), model, seed=job.source.seed)
-    )
+    preset = cast("EstimatorPreset", job.estimator)
+    return prepare_factory(EstimatorOptions(trial.map_world, preset, model, seed=seed))
+
+
+def _with_recovery(factory: EstimatorFactory) -> EstimatorFactory:
+    """Particle filters that do not keep a start pose at all costs."""
+
+    def make(geometry: ScannerGeometry) -> PoseEstimator:
+        estimator = factory(geometry)
+        assert isinstance(estimator, ParticleFilter)  # noqa: S101 - for the type checker
+        estimator.settings = replace(estimator.settings, keep_initial_pose=False)
+        return estimator
+
+    return make
 
 
 def localise(trial: IntegrityTrial, factory: EstimatorFactory) -> Estimates:

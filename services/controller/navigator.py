@@ -290,7 +290,9 @@ class Navigator:
     def _goal_velocity(self, belief: Belief, pose: Array, goal: Goal, distance: float) -> Array:
         """Velocity (3,) in base_link that the policy chooses, before any limit; updates the state of the goal."""
         if belief.state in {"lost", "localising", "ambiguous"}:
-            self.decision = self.policy.decide_unlocalised(belief, self._command.velocity)
+            self.decision = self.policy.decide_unlocalised(
+                belief, self._command.velocity, self._motion_until_effect(belief.stamp_ns)
+            )
             self.goal_state.lose_pose(self.decision.state, self.decision.reason)
             self._interrupt_docking()
             return self.decision.action
@@ -314,7 +316,7 @@ class Navigator:
         return self._policy_velocity(belief)
 
     def _policy_velocity(self, belief: Belief) -> Array:
-        self.decision = self.policy.decide(belief, self._command.velocity)
+        self.decision = self.policy.decide(belief, self._command.velocity, self._motion_until_effect(belief.stamp_ns))
         if self.decision.refused:
             self.goal_state.refuse(self.decision.reason)
         return self.decision.action
@@ -331,9 +333,7 @@ class Navigator:
 
     def _docking_velocity(self, docking: Docking, belief: Belief, pose: Array, goal: Goal) -> Array | None:
         """Velocity (3,) in base_link on the line to the goal; None while the policy drives to the line."""
-        delay = delay_until_effect(self.robot, self._scan)
-        ahead = self._command.motion_until_effect(belief.stamp_ns, delay)
-        velocity = docking.velocity(se2.compose(pose, ahead))
+        velocity = docking.velocity(se2.compose(pose, self._motion_until_effect(belief.stamp_ns)))
         if velocity is None:
             return None
         self.policy.interrupt()
@@ -341,6 +341,10 @@ class Navigator:
         if not velocity.any() and self._has_stood(belief.stamp_ns, STANDING_TIME_S) and docking.arrived(pose):
             self.goal_state.reach(_arrival(belief, goal))
         return velocity
+
+    def _motion_until_effect(self, stamp_ns: int) -> Array:
+        """Motion (3,) in base_link from a stamp until a command with that stamp takes effect."""
+        return self._command.motion_until_effect(stamp_ns, delay_until_effect(self.robot, self._scan))
 
     def _has_stood(self, stamp_ns: int, seconds: float) -> bool:
         """Whether the base has stood for this time before a stamp, and no command is still to take effect."""

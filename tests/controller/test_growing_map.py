@@ -76,7 +76,7 @@ def test_a_new_map_renews_the_plan():
     pose, seen = np.array([*NEAR, 0.0]), furnished(6, 2)
     for stamp in (0, PERIOD_NS):
         policy.observe(scan(stamp, pose, seen), belief(stamp, pose))
-        decision = policy.decide(belief(stamp, pose), np.zeros(3))
+        decision = policy.decide(belief(stamp, pose), np.zeros(3), np.zeros(3))
     assert len(decision.path)
     assert decision.action[0] > 0
     closed = half_known(6.0).grid.values.copy()
@@ -84,7 +84,7 @@ def test_a_new_map_renews_the_plan():
     message = half_known(6.0).model_copy(update={"grid": OccupancyGrid.of(closed, CELL, (-0.1, -0.1, 0.0))})
     policy.use_map(PlannedMap.of(message, 0.27).graph, jumped=False)
     policy.observe(scan(2 * PERIOD_NS, pose, seen), belief(2 * PERIOD_NS, pose))
-    decision = policy.decide(belief(2 * PERIOD_NS, pose), np.zeros(3))
+    decision = policy.decide(belief(2 * PERIOD_NS, pose), np.zeros(3), np.zeros(3))
     assert decision.refused
     assert "cannot be reached" in decision.reason
 

@@ -8,7 +8,7 @@ import pytest
 from common.robot.robot import Robot
 from services.controller.navigator import Navigator
 from services.controller.policies.planner import GeodesicPolicy
-from tests.controller.driving import PERIOD_NS, PERIOD_S, belief, box, goal, path_length, room, session
+from tests.controller.driving import PERIOD_NS, PERIOD_S, belief, box, drive, goal, path_length, room, session
 
 ROOM = room(10, 4)
 
@@ -37,6 +37,17 @@ def test_robot_stands_when_the_goal_is_reached():
     navigator.on_goal(goal(3, 2, yaw=-2, yaw_tolerance=0.05))
     log = session(navigator, [1.5, 2.5, 2], [None] * 150, ROOM)
     assert len({tuple(pose) for _, status, pose in log if status.state == "reached"}) == 1
+
+
+@pytest.mark.parametrize("kind", ["holonomic", "differential"])
+def test_latency_of_several_scans(kind):
+    """Several commands are still to take effect when the next one is chosen."""
+    scans = []
+    for latency in (0.0, 0.3):
+        poses, statuses, contacts = drive(ROOM, Robot(drive=kind, latency=latency), (1.5, 2.5, 2.0), goal(8.5, 1.5))
+        assert (statuses[-1].state, contacts) == ("reached", 0)
+        scans.append(len(poses))
+    assert scans[1] < scans[0] + 20  # the latency at the start, at the end, and of the turn
 
 
 def test_stamps_of_commands():

@@ -78,8 +78,8 @@ def wander(observed):
     policy, pose = GeodesicPolicy(Robot(), HALL), observed.mount.array()
     policy.set_goal(np.array([6.0, 3.0]))
     policy.observe(observed, belief(observed.stamp_ns, pose, "lost"))
-    policy.decide_unlocalised(belief(0, pose, "lost"), np.zeros(3))
-    decision = policy.decide_unlocalised(belief(2 * 10**9, pose, "lost"), np.zeros(3))
+    policy.decide_unlocalised(belief(0, pose, "lost"), np.zeros(3), np.zeros(3))
+    decision = policy.decide_unlocalised(belief(2 * 10**9, pose, "lost"), np.zeros(3), np.zeros(3))
     assert decision.state == "exploring"
     return decision.action
 
@@ -113,6 +113,6 @@ def test_no_view_ahead():
     policy, pose = GeodesicPolicy(Robot(drive="differential"), HALL), np.array([4.0, 3.0, 0.0])
     policy.set_goal(np.array([6.0, 3.0]))
     policy.observe(scan(0, pose, HALL, BACKWARDS), belief(0, pose))
-    decision = policy.decide(belief(0, pose), np.zeros(3))
+    decision = policy.decide(belief(0, pose), np.zeros(3), np.zeros(3))
     assert decision.reason == BLIND_AHEAD
     assert not decision.action[:2].any()

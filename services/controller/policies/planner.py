@@ -21,7 +21,6 @@ from services.controller.policies.geodesic_field import WALL_COST_RANGE_M, CostF
 from services.controller.policies.goal_check import near_wall, refusal_text, wall_refusal
 from services.controller.policies.motion_model import (
     STEP_S,
-    delay_until_effect,
     is_moving,
     turn_rate,
     turn_to_attractor,
@@ -167,10 +166,8 @@ class GeodesicPolicy:
         if (cell := self.graph.nearest_free(pose[:2], self.graph.min_clearance, map_only=True)) is not None:
             self._component = int(self.graph.component[cell])
 
-    def decide(self, belief: Belief, velocity: Array) -> Decision:
-        """Chooses the velocity of least expected free energy; ``velocity`` (3,) in base_link is the latest command."""
-        # The pose at which the command takes effect; until then the latest command applies.
-        ahead = velocity * delay_until_effect(self.robot, self._scan)
+    def decide(self, belief: Belief, velocity: Array, ahead: Array) -> Decision:
+        """Chooses the velocity of least expected free energy; arguments as for `Policy.decide`."""
         pose, stamp_ns = se2.compose(belief.pose.array(), ahead), belief.stamp_ns
         if (refusal := self._refusal_from_here()) is not None:
             return Decision(reason=refusal, state="blocked", refused=True)
@@ -229,7 +226,7 @@ class GeodesicPolicy:
             return np.full(points.shape[:-1], MAX_COST_TO_GOAL_M)
         return np.minimum(self.field.cost.ravel()[self.free.grid.cell_of(points)], MAX_COST_TO_GOAL_M)
 
-    def decide_unlocalised(self, belief: Belief, velocity: Array) -> Decision:
+    def decide_unlocalised(self, belief: Belief, velocity: Array, ahead: Array) -> Decision:
         """Chooses a velocity with which the pose becomes known.
 
         Without `epistemic`, an ambiguous belief leads to the goal, as if its best hypothesis were true.
@@ -241,7 +238,7 @@ class GeodesicPolicy:
             points = safety.scan_points(self._scan)
             points = points[np.hypot(*points.T) < OBSTACLE_RANGE_M]
             return self.localiser.decide(belief, self._scan, points, velocity, self._field_of_view)
-        decision = self.decide(belief, velocity)
+        decision = self.decide(belief, velocity, ahead)
         decision.reason = decision.reason or f"the belief is {belief.state}: assuming its best hypothesis"
         return decision
 

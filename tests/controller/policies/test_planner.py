@@ -144,7 +144,7 @@ def test_nearest_reachable_place():
     policy.set_goal(other)
     pose = np.array([2.0, 2.5, 0.0])
     policy.observe(scan(0, pose, TWO_ROOMS), belief(0, pose))
-    decision = policy.decide(belief(0, pose), np.zeros(3))
+    decision = policy.decide(belief(0, pose), np.zeros(3), np.zeros(3))
     assert (decision.refused, decision.action.any()) == (True, False)
     assert f"cannot be reached from here{nearest}4.5" in decision.reason
 
@@ -193,7 +193,7 @@ def test_backing_off():
     """As in a doorway that is free for the planner but not for the limits: the velocity stays zero."""
     policy, pose = GeodesicPolicy(Robot(), HALL), np.array([5.0, 1.5, 0.0])
     policy.set_goal(np.array([9.0, 1.5]))
-    reasons = [policy.decide(belief(k * 66_000_000, pose), np.zeros(3)).reason for k in range(60)]
+    reasons = [policy.decide(belief(k * 66_000_000, pose), np.zeros(3), np.zeros(3)).reason for k in range(60)]
     assert (reasons[0], reasons[-1]) == ("", "stuck: backing off")
 
 
@@ -209,7 +209,7 @@ def test_backing_off_while_not_localised(state):
             ranges = np.ones(motions.poses()[..., 0].size, np.float32)
             policy.use_predictions(PredictReply(angles=np.zeros(1, np.float32), ranges=ranges))
         # It turns to and fro a little, because of noise in the scans, and gets nowhere.
-        decision = policy.decide_unlocalised(unsure, np.array([0.0, 0.0, 0.2 * (-1) ** number]))
+        decision = policy.decide_unlocalised(unsure, np.array([0.0, 0.0, 0.2 * (-1) ** number]), np.zeros(3))
     assert (decision.reason, decision.recovering) == ("stuck: backing off", True)
 
 
@@ -225,7 +225,7 @@ def test_place_that_was_reached():
 
     def candidates(seconds, velocity):
         now = unsure.model_copy(update={"stamp_ns": round(seconds * 1e9)})
-        policy.decide_unlocalised(now, velocity)
+        policy.decide_unlocalised(now, velocity, np.zeros(3))
         return policy.prediction_request(now).displacements
 
     place = candidates(1, np.zeros(3))[0]

@@ -11,7 +11,7 @@ from rich.console import Console
 from common.errors import UserError
 from lab.integrity.cases import BEAMS, CASES, make_trial
 from lab.integrity.report import bench_integrity
-from lab.integrity.runner import IntegrityPlan
+from lab.integrity.runner import RECOVERING_FILTER, IntegrityPlan
 
 
 @pytest.mark.parametrize("name", ["kidnapped-similar", "crowd", "slip", "wrong-map"])
@@ -46,6 +46,16 @@ def test_run(tmp_path, capsys):
     assert stored["correct"]["count"] == stored["correct"]["of"] == 6
     assert "| unchanged | 100 | 0 " in capsys.readouterr().out
     assert len((tmp_path / "integrity.trials.jsonl").read_text().splitlines()) == 1
+
+
+def test_a_filter_with_recovery_finds_a_kidnapped_robot(tmp_path):
+    filters = ("particle-filter", RECOVERING_FILTER)
+    plan = IntegrityPlan(1, 2, ("kidnapped-anywhere",), filters, "exact", 4.0)
+    assert bench_integrity(plan, tmp_path, 1, Console(quiet=True)) == 0
+    scores = json.loads((tmp_path / "integrity.json").read_text())["summary"]
+    kept, searched = (scores[name]["kidnapped-anywhere"]["correct"]["count"] for name in filters)
+    assert kept <= 30  # the robot is carried at scan 30, and the filter keeps the pose that it was given
+    assert searched > 40
 
 
 @pytest.mark.parametrize(
