@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 HEALTH_PERIOD_S = 1.0
 RESTORE_PERIOD_S = 5.0  # after its start, a service keeps querying latched topics for this long until one answers
+MAX_KEYS, MAX_KEY_LENGTH = 200, 200  # in a health message; anyone on the bus can publish under new keys
 SOURCE_TIMEOUT_S = 0.3  # a source silent for longer is replaced by another source of the same topic
 
 
@@ -227,7 +228,8 @@ class Loop:
             reply = call.query.reply(ok=False, reason=str(error))
         except Exception as error:
             self.failed += 1
-            self.service.log.exception("request failed", query=call.query.name)
+            if self._may_log("request failed"):
+                self.service.log.exception("request failed", query=call.query.name, so_far=self.failed)
             call.refuse(f"{self.service.name} failed: {type(error).__name__}: {error}")
             return
         call.reply(reply.encode())
@@ -237,21 +239,20 @@ class Loop:
         return build_config_reply(self.service.name, config, time.monotonic() - self.began)
 
     def _health(self, now: float) -> Health:
-        inbox, total = self.inbox, Counter[str]()
-        total.update(dict(inbox.received))  # a copy, because zenoh's threads change the counts
-        total.update(self.published)
+        received, dropped, oversized = self.inbox.received_counts()
+        total = received + self.published
         elapsed, self._last_health = max(now - self._last_health, 1e-3), now
         rows = [
             TopicHealth(
-                key=key[:200],
-                received=inbox.received[key],
+                key=key[:MAX_KEY_LENGTH],
+                received=received[key],
                 published=self.published[key],
-                dropped=inbox.dropped[key],
-                undecodable=self.undecodable[key] + inbox.oversized[key],
+                dropped=dropped[key],
+                undecodable=self.undecodable[key] + oversized[key],
                 rate=max(0, total[key] - self._totals_at_last_health[key]) / elapsed,
                 **self.service.extra_counts(key),
             )
-            for key in sorted(total)[:200]
+            for key in sorted(total)[:MAX_KEYS]
         ]
         self._totals_at_last_health = total
         counters: dict[str, int] = {**self.service.counters, "failed": self.failed}

@@ -29,7 +29,7 @@ from services.mapper.slam.drive import Laser, RawDrive
 from services.mapper.slam.grid import grid_of_scans
 from services.mapper.slam.trajectory import DriveTrajectory, build_trajectory, distribute_corrections
 
-MIN_SCANS = 2
+MIN_SCANS_FOR_SLAM = 2
 
 
 @dataclass(frozen=True)
@@ -59,16 +59,13 @@ def map_command(options: MapOptions, console: Console, progress: Console) -> Pat
     if stamps is None:  # not needed for a map, but for a drive
         stamps = np.arange(len(scans.ranges), dtype=np.float64)
     scans = replace(scans, stamps=stamps)
-    if options.models is not None and len(scans) < drive_learning.MIN_SCANS:
-        least = drive_learning.MIN_SCANS
-        raise UserError(
-            f"{options.log}: {len(scans)} scans; a model needs at least {least}: add --no-learn for the map alone"
-        )
+    _check_number(len(scans), options)
     if options.poses == "slam":
         scans = replace(scans, truth=_build_poses(scans, stamps, rough, former, options, console, progress))
     drive = drive_of(scans, options.log)
     if options.half:
         drive = split(drive)[0 if options.half == "first" else 1]
+    _check_number(len(drive.ranges), options)  # before anything is written
     laser = Laser(drive.angles, drive.mount, drive.range_max)
     unseen = None if rough is None else rasterise(rough, options.cell)
     grid = grid_of_scans(drive.poses, drive.ranges, laser, options.cell, unseen)
@@ -81,7 +78,7 @@ def map_command(options: MapOptions, console: Console, progress: Console) -> Pat
         soft_wrap=True,
     )
     if options.models is not None:
-        # In the rough map, for the model where the drive saw nothing
+        # Where the drive saw nothing, the model learns from scans simulated in the rough map.
         samples = 0 if rough is None else enough_scans(rough)
         training = TrainDriveOptions(options.log, str(path), options.models, samples, rough=rough, former=former)
         train_on_drive(training, drive, console)
@@ -110,6 +107,14 @@ def _check(options: MapOptions) -> None:
         files.append(weights.path_of(options.models, options.out.stem))
     if existing := next((path for path in files if path.exists()), None):
         raise UserError(f"{existing} exists already: choose another name with --out, or remove it")
+
+
+def _check_number(count: int, options: MapOptions) -> None:
+    """Raises UserError if so many scans are too few for a model."""
+    least = drive_learning.MIN_SCANS
+    if options.models is not None and count < least:
+        problem = f"{count} scans to learn from; a model needs at least {least}"
+        raise UserError(f"{options.log}: {problem}: add --no-learn for the map alone")
 
 
 def _model_of(rough: World, options: MapOptions) -> Path | None:
@@ -157,8 +162,8 @@ def _build_trajectory(
     scans: Scans, stamps: Array, options: MapOptions, console: Console, progress: Console
 ) -> DriveTrajectory:
     """Matches the scans with one another, and prints the result."""
-    if len(scans) < MIN_SCANS:
-        raise UserError(f"{options.log}: {len(scans)} scans; a map needs at least {MIN_SCANS}")
+    if len(scans) < MIN_SCANS_FOR_SLAM:
+        raise UserError(f"{options.log}: {len(scans)} scans; a map needs at least {MIN_SCANS_FOR_SLAM}")
     complete = scans.odom is not None and bool(np.isfinite(scans.odom).all())
     odom = scans.odom if options.odometry and complete else None
     drive = raw_drive(scans, stamps, odom)

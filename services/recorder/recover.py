@@ -29,7 +29,7 @@ from services.recorder.files.writer import PROFILE, UNFINISHED_SUFFIX, claim, is
 
 INCOMPLETE_SUFFIX = ".incomplete"  # appended to the name of an unfinished source file after recovery
 # Where reading may resume after damage: the prefix of a chunk, an attachment or metadata shorter than 2^40 bytes.
-LANDMARK = re.compile(rb"[\x06\x09\x0c](?=.{5}\x00\x00\x00)", re.DOTALL)
+RECORD_START = re.compile(rb"[\x06\x09\x0c](?=.{5}\x00\x00\x00)", re.DOTALL)
 
 
 @dataclass(frozen=True)
@@ -88,17 +88,21 @@ def recover(
     """
     path = path or target_of(source)
     try:
-        with source.open("rb") as stream:
-            if is_being_written(source):
-                raise UserError(f"{source}: is being written by a running recorder; stop it first")
-            if source.stat().st_size == 0:
-                raise UserError(f"{source}: is empty, there is nothing to recover: it can be removed")
-            declared = _declared(stream)
-            with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
-                found = _copy(data, RecoveryResult(source, path, len(data)), declared, on_progress)
+        stream = source.open("rb")
     except OSError as error:
-        file = error.filename or source
-        raise UserError(f"{file}: cannot be read or written ({error.strerror}); name another file with --out") from None
+        raise UserError(f"{source}: cannot be read ({error.strerror})") from None
+    with stream:
+        if is_being_written(source):
+            raise UserError(f"{source}: is being written by a running recorder; stop it first")
+        if source.stat().st_size == 0:
+            raise UserError(f"{source}: is empty, there is nothing to recover: it can be removed")
+        declared = _declared(stream)
+        with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            try:
+                found = _copy(data, RecoveryResult(source, path, len(data)), declared, on_progress)
+            except OSError as error:
+                problem = f"cannot be written ({error.strerror}); free some space, or choose another file with --out"
+                raise UserError(f"{path}: {problem}") from None
     if source.name.endswith(UNFINISHED_SUFFIX):
         source.rename(source.with_name(source.name.removesuffix(UNFINISHED_SUFFIX) + INCOMPLETE_SUFFIX))
     return found
@@ -131,7 +135,7 @@ def _copy(
         copier = _Copier(stream, found, declared)
         for records, end in _walk(data, found):
             for record in records:
-                copier.take(record)
+                copier.copy(record)
             on_progress(end / found.size)
         copier.finish()
         stream.close()
@@ -155,14 +159,14 @@ class _Copier:
         self._keys: dict[int, str] = {}
         self._started = False
 
-    def take(self, record: McapRecord) -> None:
+    def copy(self, record: McapRecord) -> None:
         """Copies one record. Skips indexes and statistics, which the writer generates itself."""
         if not self._started:
             header = record if isinstance(record, Header) else Header(PROFILE, "presage recover")
             self._writer.start(header.profile, header.library)
             self._started = True
             for each in self._declared:
-                self.take(each)
+                self.copy(each)
         if isinstance(record, Message):
             self._message(record)
         elif isinstance(record, Schema) and record.id not in self._schemas:
@@ -229,7 +233,7 @@ def _walk(data: mmap.mmap, found: RecoveryResult) -> Iterator[tuple[list[McapRec
         opcode, length = PREFIX.unpack_from(data, offset)
         if opcode == Opcode.DATA_END:
             found.source_finished = True
-            found.altered = not found.damages and not _is_checksum(data, offset, records[0])
+            found.altered = not found.damages and not _checksum_matches(data, offset, records[0])
             return
         offset += PREFIX.size + length
         # In a chunked file, a message outside of the chunks is a misread index record.
@@ -261,7 +265,7 @@ def _parse(data: mmap.mmap, offset: int) -> list[McapRecord] | None:
         return None
 
 
-def _is_checksum(data: mmap.mmap, end: int, record: McapRecord) -> bool:
+def _checksum_matches(data: mmap.mmap, end: int, record: McapRecord) -> bool:
     """Whether the checksum of the bytes before ``end`` matches, or the file has none."""
     if not isinstance(record, DataEnd) or not record.data_section_crc:
         return True
@@ -270,12 +274,12 @@ def _is_checksum(data: mmap.mmap, end: int, record: McapRecord) -> bool:
 
 
 def _next_intact(data: mmap.mmap, damaged: int) -> int:
-    """Offset at which reading resumes after a damaged record: the following record, or else the next landmark."""
+    """Offset at which reading resumes after a damaged record: the following record, or else the next one found."""
     if damaged + PREFIX.size <= len(data):
         following = damaged + PREFIX.size + int(PREFIX.unpack_from(data, damaged)[1])
         if _parse(data, following) is not None:
             return following
-    for landmark in LANDMARK.finditer(data, damaged + 1):
-        if _parse(data, landmark.start()) is not None:
-            return landmark.start()
+    for start in RECORD_START.finditer(data, damaged + 1):
+        if _parse(data, start.start()) is not None:
+            return start.start()
     return len(data)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 
 import pytest
@@ -189,6 +190,22 @@ def test_other_files(tmp_path, content, message):
     with pytest.raises(UserError, match=message):
         recover(tmp_path / "x.mcap")
     assert not (tmp_path / "x-recovered.mcap").exists()
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(UserError, match=r"run\.mcap: cannot be read \(No such file or directory\)"):
+        recover(tmp_path / "run.mcap")
+
+
+def test_full_disk(tmp_path, monkeypatch):
+    def fail(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    path, _ = write_chunks(tmp_path)
+    monkeypatch.setattr("mcap.writer.Writer.finish", fail)
+    with pytest.raises(UserError, match=r"out\.mcap: cannot be written \(No space left on device\); free some space"):
+        recover(path, tmp_path / "out.mcap")
+    assert not list(tmp_path.glob("out*"))
 
 
 def test_nothing_is_overwritten(tmp_path):

@@ -59,8 +59,9 @@ if TYPE_CHECKING:
 
 START_COVARIANCE = np.diag([0.25, 0.25, 0.09])  # of a pose given without one
 MAX_SEARCH_INTERVAL = 150  # scans between two searches without success; the interval doubles from 1
-# Probability (a guess) that a match with the local map is wrong, and the right motion one of many that fit the map.
-WRONG_MATCH = 1e-6
+# Probability (a guess) that a match with the local map is wrong. The match is rejected if the scan is less probable
+# than this at its pose in the map, relative to the pose that fits the map best.
+LOCAL_MISMATCH_PROBABILITY = 1e-6
 # A scan that the map predicts worse than the last one by more than this, in nats, may be matched at a wrong pose (a
 # guess). Then a wider area is searched.
 MAX_FIT_DROP = 20.0
@@ -70,7 +71,8 @@ SIGNIFICANT_MAP_ERROR = 0.25
 # explained less than 5 to 9 % of the scan at nine of ten wrong poses in the buildings used for development.
 EXPLAINED_BY_CHANCE = 0.1
 UNKNOWN_SIGMA_M = 100.0  # published where the map is unknown
-SUDDEN_CHANGES = 0.01  # a less probable number of changes (a guess) may be due to a kidnapping, so a search is due soon
+# A less probable number of changes (a guess) may be due to a kidnapping, so a search is due soon.
+SUDDEN_CHANGE_PROBABILITY = 0.01
 TARGET_BEAMS = 2000  # a scan with at least twice as many is thinned, because the time of a search grows with the beams
 
 
@@ -299,12 +301,13 @@ class PreciseEstimator:
         map_evidence, local_evidence = _log_at_poses(
             view, both, view.surfaces.small, np.tile(self.modes[0].surroundings, (2, 1))
         )[0]
-        return match if map_evidence + np.log(WRONG_MATCH) > local_evidence else by_local_map
+        return match if map_evidence + np.log(LOCAL_MISMATCH_PROBABILITY) > local_evidence else by_local_map
 
     def _correct_motion_again(
         self, view: View, observation: Observation, match: ScanMatch, period: float
     ) -> tuple[View, ScanMatch]:
         """Corrects the scan for the motion that the match has shown, and matches it again."""
+        # Not `between(last, this)`: beams are moved in base_link at this scan.
         velocity = -se2.between(match.poses[0], self.modes[0].pose) / period
         view = self._correct_motion(view, observation, velocity)
         poses, evidence = view.descend(match.poses, _prior_of([each[-1] for each in match.motions]))
@@ -388,7 +391,7 @@ class PreciseEstimator:
         certain = doubt <= 1 - self.settings.tracking_probability
         if certain or 1 - self._probability_of_being_near(best) > 0.5 * doubt:
             return []
-        motion = candidates[0]
+        motion = candidates[-2] if len(candidates) > 1 else candidates[0]  # the last one is any possible motion
         found = search_near(view, motion.mean, motion.covariance, self.seeds, self.settings, self._rng)
         at_best = before.log_evidence + _prior_of([motion]).energy(best.pose[None])[0]
         return [
@@ -410,16 +413,17 @@ class PreciseEstimator:
         states = view.surface_evidence(poses)
         self._last_log_fit = _log_fit(view, states)
         seen, appeared = self._local_map.find_old_beams(local, view, states.weights[0] > 0.5)
-        old, small = seen | appeared | view.surfaces.small, view.surfaces.small
+        small = view.surfaces.small
+        old = seen | appeared | small
 
         # Changes are equally probable at all hypotheses. If there are suddenly more of them, a search is due soon.
-        log_changes = 0.0
+        log_count = 0.0
         if self._last:
             changes = self._local_map.count_changes(self._last, LocalScan(local, view))
-            log_changes = self._change_rate.log_probability(changes, period)
+            log_count = self._change_rate.log_probability(changes, period)
             self._change_rate.learn(changes, period)
-        log_change = log_changes + _log_unmapped(view, ~appeared | seen | small)
-        if log_changes < np.log(SUDDEN_CHANGES):
+        log_change = log_count + _log_unmapped(view, ~appeared | seen | small)
+        if log_count < np.log(SUDDEN_CHANGE_PROBABILITY):
             self._search_interval = 1
 
         present, surroundings = _log_at_poses(view, poses, old, np.array([mode.surroundings for mode in modes]))
@@ -559,9 +563,6 @@ class PreciseEstimator:
 
     def _add_hypotheses(self, found: list[Mode], view: View) -> None:
         """Adds hypotheses: the robot may have been there since one of the key scans, or was carried there just now."""
-        if not found:
-            self._unknown_place.exclude_mapped_places()
-            return
         stayed, surroundings = self._log_stayed(found, view)
         present = np.array([mode.present for mode in found])
         carried = self._unknown_place.log_evidence + present - _log_reference(view, view.surfaces.small)
@@ -616,7 +617,9 @@ class PreciseEstimator:
         predicted = (
             self._predicted(view.expected(poses[0])) if same_beams else self.predict(poses[0][None], observation.angles)
         )
-        return self._posterior(view, poses, predicted, self._probability())
+        posterior = self._posterior(view, poses, predicted, self._probability())
+        self._was_tracking |= posterior.state == "tracking"
+        return posterior
 
     def _predicted(self, expected: Expected) -> Predicted:
         unknown = np.isinf(expected.scale)
@@ -658,7 +661,6 @@ class PreciseEstimator:
 
     def _state(self, probability: float) -> State:
         if probability >= self.settings.tracking_probability:
-            self._was_tracking = True
             return "tracking"
         known = 1 - self._unknown_place.weight
         if len(self.modes) > 1:

@@ -29,7 +29,7 @@ from services.mapper.slam.elements import Elements, concatenate, elements_of_sca
 from services.mapper.slam.pose_graph import PoseLink
 from services.mapper.slam.registration import (
     MIN_PARTNERS,
-    PRIOR_SCALE,
+    PRIOR_INFLATION,
     PosePrior,
     Registration,
     Surface,
@@ -96,7 +96,7 @@ class ScanPose:
 
     pose: Array  # (3,)
     covariance: Array  # (3, 3) relative to the last key scans
-    matched: bool  # False for a scan that is suspect, or of which too little matches
+    matched: bool  # to the local map; also true for the first scan of a piece, whose pose is arbitrary
     piece: int = 0  # of the drive, or `NO_PIECE` for a suspect scan
     linked: bool = False  # whether this scan begins a piece with a link to the one before
 
@@ -150,7 +150,7 @@ class FrontEnd:
         if self._odom is None and len(self._local.elements) < MIN_PARTNERS <= len(scan.elements):
             return self._begin_piece(self.poses[-1], scan)  # so far there was nothing that a scan could match
         prior, covariance = self._prior(motion, deviation)
-        self._since_key = self._since_key + PRIOR_SCALE**2 * covariance
+        self._since_key = self._since_key + PRIOR_INFLATION**2 * covariance
         found = self._register(scan, prior, period)
         contradiction = self._contradiction(scan, found, prior)
         known = [self.poses[-1], prior.mean] if used_odometry else [self.poses[-1]]
@@ -158,7 +158,9 @@ class FrontEnd:
         # If odometry and registration agree even after many suspect scans, the surroundings have changed.
         confirmed = self._suspect_scans + 1 >= MAX_SUSPECT_SCANS and used_odometry and not _is_far(found, prior)
         if found is not None and (confirmed or not suspect):
-            doubtful = suspect or self._is_doubtful(contradiction) or prior.difference(found.pose)[1] > MAX_SLIP**2
+            doubtful = suspect or prior.difference(found.pose)[1] > MAX_SLIP**2
+            if not suspect:  # otherwise moving objects did not cause the contradiction
+                doubtful |= self._exceeds_recent_contradiction(contradiction)
             return self._add_matched(scan, found, prior, deviation, period, doubtful=doubtful)
         self.unmatched += 1
         if used_odometry:
@@ -230,7 +232,7 @@ class FrontEnd:
         """Whether a registration implies that the robot was kidnapped, or may match by chance.
 
         It was kidnapped if it is farther from all ``known`` poses (3,) than it can drive in ``period`` s. These are the
-        last one and, with odometry, the next one: odometry that paused reports the motion of several scans at once.
+        last pose and, with odometry, the one that it predicts: after a pause it reports the motion of several scans.
         """
         pose = prior.mean if found is None else found.pose
         if all((np.abs(se2.between(each, pose)) > MAX_VELOCITY * period).any() for each in known):
@@ -248,8 +250,8 @@ class FrontEnd:
         counted = compare_segments(self._local, self._surface, Segment(0, 0, scan.elements, scans), pose)
         return counted.contradicting / (counted.agreeing + PRIOR_AGREEMENT + counted.contradicting)
 
-    def _is_doubtful(self, contradiction: float) -> bool:
-        """Whether a share of contradictions is more than moving objects have caused recently."""
+    def _exceeds_recent_contradiction(self, contradiction: float) -> bool:
+        """Remembers a share of contradictions; returns whether it is more than moving objects caused recently."""
         before = self._recent_contradiction
         self._recent_contradiction = max(contradiction, before * (1 - 1 / FADING_SCANS))
         return contradiction > max(DOUBTFUL_CONTRADICTION, DOUBTFUL_RATIO * before)
@@ -276,6 +278,7 @@ class FrontEnd:
         """Adds a scan of which too little matches, at the pose that the motion model predicts."""
         scan_pose = ScanPose(pose, self._since_key, matched=False, piece=self._key_pieces[-1])
         self._append(scan_pose)
+        # Not earlier, although it sees something new: its pose is only predicted.
         if self._is_key_due(scan, familiar=True):
             self._add_linked_key(scan, np.zeros((3, 3)))
         return scan_pose

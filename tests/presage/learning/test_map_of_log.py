@@ -65,6 +65,15 @@ def test_map_of_a_half(log, tmp_path, half, world):
     assert abs(np.median(seen - rays)) < 0.025  # half a cell
 
 
+def test_half_with_too_few_scans_for_a_model(tmp_path):
+    log, map_file = tmp_path / "drive.npz", tmp_path / "made.yaml"
+    real_drive.save(log, real_drive.drive(60))
+    options = MapOptions(log, map_file, "first", reading=HERE, poses="reference", models=tmp_path)
+    with pytest.raises(UserError, match="30 scans to learn from; a model needs at least 50: add --no-learn"):
+        map_command(options, QUIET, QUIET)
+    assert not map_file.exists()  # so that the command can be given again
+
+
 def test_who_walks_through_is_not_in_the_map():
     count, angles = 20, np.deg2rad(np.arange(-90, 91.0))
     ranges = np.full((count, len(angles)), 4.0)
