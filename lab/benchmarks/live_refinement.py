@@ -15,7 +15,6 @@ import numpy as np
 import psutil
 
 from common.geometry.se2 import Array
-from common.geometry.world import World
 from lab.accuracy.scenes import Scene
 from lab.benchmarks.mapping import fitted
 from lab.benchmarks.refinement import DRIVE_SEED, ROUGH_SEED, TEST_SECONDS, TEST_SEED, drive_for
@@ -33,17 +32,17 @@ from services.estimator.precise.learning.live_learning import ModelVersion, lear
 DELAY_S = 15.0  # of the drive, in which a version is learned
 
 
-def start_estimator(rough: World, scene: Scene, start: Array) -> PreciseEstimator:
-    """An estimator in the rough map, near a pose."""
-    estimator = prepare_factory(EstimatorOptions(rough, model="exact"))(ScannerGeometry.of(scene.scanner))
+def start_estimator(options: EstimatorOptions, scene: Scene, start: Array) -> PreciseEstimator:
+    """An estimator that starts near a pose."""
+    estimator = prepare_factory(options)(ScannerGeometry.of(scene.scanner))
     assert isinstance(estimator, PreciseEstimator)  # noqa: S101 - for the type checker
     estimator.restart(start + START_DEVIATION * scene.rng.standard_normal(3), np.diag(START_DEVIATION**2))
     return estimator
 
 
-def drive_and_learn(rough: World, scene: Scene, path: Array) -> tuple[dict[str, Any], ModelVersion | None]:
+def drive_and_learn(options: EstimatorOptions, scene: Scene, path: Array) -> tuple[dict[str, Any], ModelVersion | None]:
     """Drives along poses (N, 3); returns what was learned when, at what cost, and the last version."""
-    estimator = start_estimator(rough, scene, path[0])
+    estimator = start_estimator(options, scene, path[0])
     original, places = estimator.model, estimator.seeds.places
     keys = KeyScanCollector(scene.scanner.angles(), np.array(scene.scanner.mount), scene.scanner.range_max)
     versions: list[dict[str, Any]] = []
@@ -93,13 +92,15 @@ def key_scan_bytes(keys: KeyScanCollector) -> int:
     return sum(key.ranges.nbytes for key in keys.verified.values())
 
 
-def errors_of_test_drive(rough: World, scene: Scene, path: Array, version: ModelVersion | None) -> dict[str, float]:
-    """Position errors of another drive along poses (N, 3), with a version or with the rough map.
+def errors_of_test_drive(
+    options: EstimatorOptions, scene: Scene, path: Array, version: ModelVersion | None
+) -> dict[str, float]:
+    """Position errors of another drive along poses (N, 3), with a version or with the original model.
 
     For the aligned errors, the estimated path is first moved and turned as a whole to fit the true one best, so that an
     offset of the whole map does not count.
     """
-    estimator = start_estimator(rough, scene, path[0])
+    estimator = start_estimator(options, scene, path[0])
     if version is not None:
         estimator.use_model(version.model, version.seeds)
     clean = scene.clean(path)
@@ -117,7 +118,7 @@ def refine(name: str, seed: int, seconds: float) -> dict[str, Any]:
     """Results in one world."""
     building = building_of(name)
     world = building.world
-    rough = noisy_grid(Scene.of(world, BEAMS, [seed, ROUGH_SEED]))
+    rough = EstimatorOptions(noisy_grid(Scene.of(world, BEAMS, [seed, ROUGH_SEED])), model="exact")
     scene = Scene.of(world, BEAMS, [seed, DRIVE_SEED])
     learned, version = drive_and_learn(rough, scene, drive_for(scene, building, seconds))
     tests = [Scene.of(world, BEAMS, [seed, TEST_SEED]) for _ in range(2)]  # both with the same noise

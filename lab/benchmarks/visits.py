@@ -35,9 +35,11 @@ from presage.learning.map_of_log import MapOptions, map_command
 from presage.logs.log import Reading
 from presage.terminal.output import check_file, make_folder, provenance, write_json
 from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
+from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.field_learning import Recipe, learn_field
+from services.estimator.precise.learning.live_learning import ModelVersion
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.interface import Observation
 
@@ -139,9 +141,9 @@ def _visit(
         np.any([contains(room, poses[:, :2]) for room in rooms], axis=0).tolist() for rooms in (changing, entered)
     )
     for name, file in ((FIRST, first), (BEFORE, before), (AFTER, after)):
-        row[name] = _localise(EstimatorOptions(str(file), models=out), scene.scanner, scans, poses)
-    present = EstimatorOptions(scene.world, generative_model=_learn_present_world(scene))
-    row[PRESENT] = _localise(present, scene.scanner, scans, poses)
+        row[name] = errors_of_single_scans(EstimatorOptions(str(file), models=out), scene.scanner, scans, poses)
+    present = EstimatorOptions(scene.world, generative_model=learn_at_true_poses(scene))
+    row[PRESENT] = errors_of_single_scans(present, scene.scanner, scans, poses)
     return row
 
 
@@ -217,11 +219,18 @@ def _map_drive(path: Array, options: MapOptions) -> dict[str, Any]:
     }
 
 
-def _localise(
-    options: EstimatorOptions, scanner: Scanner, scans: list[Observation], poses: Array
+def errors_of_single_scans(
+    options: EstimatorOptions,
+    scanner: Scanner,
+    scans: list[Observation],
+    poses: Array,
+    version: ModelVersion | None = None,
 ) -> list[float | None]:
-    """Errors in m of single scans from unknown poses; None if not found."""
+    """Errors in m of single scans from unknown poses, with a ``version`` of the model if given; None if not found."""
     estimator = prepare_factory(options)(ScannerGeometry.of(scanner))
+    if version is not None:
+        assert isinstance(estimator, PreciseEstimator)  # noqa: S101 - for the type checker
+        estimator.use_model(version.model, version.seeds)
     errors: list[float | None] = []
     for scan, pose in zip(scans, poses, strict=True):
         estimator.restart()
@@ -230,8 +239,8 @@ def _localise(
     return errors
 
 
-def _learn_present_world(scene: Scene) -> FieldModel:
-    """A field learned from scans with noise at true poses in the present world."""
+def learn_at_true_poses(scene: Scene) -> FieldModel:
+    """A field learned from scans with noise at true poses."""
     poses, mount, angles = scene.poses(PRESENT_SCANS), np.array(scene.scanner.mount), scene.scanner.angles()
     ranges = np.array([scene.observe(clean, 0.0).ranges for clean in scene.clean(poses)])
     return FieldModel(learn_field(Beams.of(poses, mount, angles, ranges), Recipe(0.05)))
@@ -275,7 +284,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     cells = []
     for title, visits in (("second", [row for row in tested if row["visit"] == 2]), ("all", tested)):
         for rooms, (changed, entered) in ROOMS.items():
-            cells.append([title, rooms, *(_found(_errors(visits, name, changed, entered)) for name in MODELS)])
+            cells.append([title, rooms, *(found_of(_errors(visits, name, changed, entered)) for name in MODELS)])
     return markdown(("visits", "rooms", *MODELS), cells)
 
 
@@ -287,6 +296,7 @@ def _errors(rows: list[dict[str, Any]], model: str, changed: bool | None, entere
     return [error for error, *room in scans if changed in (None, room[0]) and entered in (None, room[1])]
 
 
-def _found(errors: list[float | None]) -> str:
+def found_of(errors: list[float | None]) -> str:
+    """Single scans found of all, and the median error of these in mm."""
     found = [error for error in errors if error is not None]
     return f"{len(found)}/{len(errors)}; {millimetres(float(np.median(found)) if found else None)}"

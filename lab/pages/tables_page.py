@@ -33,6 +33,7 @@ MODULES = {
     "visits": "lab.benchmarks.visits",
     "mapping-faults": "lab.benchmarks.mapping_faults",
     "live-refinement": "lab.benchmarks.live_refinement",
+    "live-changes": "lab.benchmarks.live_changes",
     "area": "lab.benchmarks.area",
     "training": "lab.benchmarks.training",
 }

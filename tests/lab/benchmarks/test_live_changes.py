@@ -1,0 +1,17 @@
+"""The benchmark of learning while driving where furniture was moved."""
+
+from __future__ import annotations
+
+from lab.benchmarks.live_changes import AFTER, BEFORE, PRESENT, follow_changes, table
+
+
+def test_short_drive():
+    row = follow_changes("office", seed=1, seconds=4.0, scans=3)
+    assert [len(row[model]) for model in (BEFORE, AFTER, PRESENT)] == [3, 3, 3]
+    assert row[BEFORE] == row[AFTER]  # too short to learn anything
+    assert row["versions"] == []
+
+
+def test_table():
+    text = table([{"world": "office", BEFORE: [0.002, None], AFTER: [0.001, 0.003], PRESENT: [0.001, 0.001]}])
+    assert "| office | 1/2; 2.00 | 2/2; 2.00 | 2/2; 1.00 |" in text
