@@ -120,8 +120,8 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	$(if $(LOGS),$(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/fr079.npz' --mount 0,0,0 --world $(RESULTS)/second_half.yaml --exchange --every 200 --name fr079_exchanged)
 	$(if $(LOGS),$(BIN)/presage map '$(LOGS)/fr079.npz' --mount 0,0,0 --poses reference --half first --no-learn -o $(RESULTS)/first_half.yaml)
 	$(if $(LOGS),$(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/fr079.npz' --mount 0,0,0 --world $(RESULTS)/first_half.yaml --every 30 --name fr079)
-	$(if $(LOGS),$(BIN)/presage map '$(LOGS)/uwb.npz' --mount 0,0,0 --poses reference --half first --no-learn -o $(RESULTS)/first_half.yaml)
-	$(if $(LOGS),$(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/uwb.npz' --mount 0,0,0 --world $(RESULTS)/first_half.yaml --every 10 --name uwb)
+	$(if $(LOGS),$(BIN)/presage map '$(LOGS)/uwb.npz' --mount 0,0,0 --poses reference --half first --no-learn -o $(RESULTS)/uwb_first_half.yaml)
+	$(if $(LOGS),$(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/uwb.npz' --mount 0,0,0 --world $(RESULTS)/uwb_first_half.yaml --every 10 --name uwb)
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity --worlds 3 --seed 3458 --model exact --seconds 10
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-long-corridor --worlds 20 --seed 3462 --model exact --seconds 10 --cases long-corridor --estimators precise
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-noisy-map --worlds 20 --seed 3457 --model exact --seconds 40 --cases noisy-map

@@ -13,7 +13,7 @@ from common.errors import UserError
 from common.runtime.metrics import ServiceMetrics
 
 if TYPE_CHECKING:
-    from common.runtime.service_loop import Loop
+    from common.runtime.service_loop import ServiceLoop
 
 LOOPBACK = "127.0.0.1"
 
@@ -49,7 +49,7 @@ def serve_registry(registry: CollectorRegistry, setting: str) -> Iterator[str]:
 
 
 @contextmanager
-def serve_loop_metrics(loop: Loop, setting: str) -> Iterator[ServiceMetrics]:
+def serve_loop_metrics(loop: ServiceLoop, setting: str) -> Iterator[ServiceMetrics]:
     """Serves the metrics of a service loop at the address ``setting`` until the block ends; yields the metrics."""
     service = loop.service
 

@@ -19,7 +19,7 @@ from common.messages.topics import Query, Topic
 from common.messages.wire import DecodeError
 from common.runtime.config import ServiceSettings, load_settings
 from common.runtime.runnable import Runnable
-from common.runtime.service_loop import Loop
+from common.runtime.service_loop import ServiceLoop
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -49,10 +49,10 @@ class Service(ABC):
         self.counters: Counter[str] = Counter()  # published in health
         self.note = ""  # published in health
         self.idle = False  # published in health: results are not expected now
-        self._loop: Loop | None = None
+        self._loop: ServiceLoop | None = None
 
     @property
-    def loop(self) -> Loop:
+    def loop(self) -> ServiceLoop:
         """The loop that runs this service; raises RuntimeError before it exists."""
         if self._loop is None:
             raise RuntimeError(f"service {self.name!r} is not running")
@@ -103,7 +103,7 @@ class Service(ABC):
 
     def make_loop(self, bus: Bus) -> Runnable:
         """Creates the loop that runs this service on a session."""
-        return Loop(self, bus, Inbox())
+        return ServiceLoop(self, bus, Inbox())
 
     def send_request(self, query: Query, request: Request, timeout: float = 5.0) -> int:
         """Sends a request without waiting.

@@ -33,7 +33,7 @@ MAX_KEYS, MAX_KEY_LENGTH = 200, 200  # in a health message; anyone on the bus ca
 SOURCE_TIMEOUT_S = 0.3  # a source silent for longer is replaced by another source of the same topic
 
 
-class Loop:
+class ServiceLoop:
     """Runs one service on one session."""
 
     def __init__(self, service: Service, bus: Bus, inbox: Inbox) -> None:

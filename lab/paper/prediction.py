@@ -36,7 +36,7 @@ PAPER_SIGMA = 1.0  # m, the paper's Σ_o
 SIGMA_FACTORS = tuple(np.round(np.arange(0.25, 4.01, 0.25), 2).tolist())  # multiples of the predicted deviation
 GAUSSIAN = {1: 0.6827, 2: 0.9545, 3: 0.9973}  # share of a Gaussian within k deviations
 # A beam counts as imprecise (`unsure` in the results) if its deviation exceeds the scanner's noise by this factor, that
-# is if m > σ.
+# is if the deviation τ of the learned field is larger than the noise σ.
 IMPRECISE_FACTOR = float(np.sqrt(2))
 FRONT_MARGIN = 0.3  # m between the sample's robot and the line of the objects
 FAR_RESIDUAL = 0.1  # m; larger residuals are counted in the figure
@@ -203,10 +203,10 @@ def _calibration(axes: Axes, model_row: dict[str, Any], scans: int) -> None:
     """Plots the share of beams within k predicted deviations, and that of a Gaussian."""
     factors = np.array(SIGMA_FACTORS)
     axes.plot(factors, _gaussian(factors), "-", color=drawing.BOUND, label="Gaussian: perfect calibration")
-    unsure = f"{model_row['unsure_share']:.1%} of beams: m > σ"
+    unsure = f"{model_row['unsure_share']:.1%} of beams: τ > σ"
     for key, colour, mark, label in (
-        ("within", drawing.COLOURS["precise"], "o", "all beams, predicted √(σ² + m²)"),
-        ("unsure_within", drawing.GOAL, "^", f"{unsure}, predicted √(σ² + m²)"),
+        ("within", drawing.COLOURS["precise"], "o", "all beams, predicted √(σ² + τ²)"),
+        ("unsure_within", drawing.GOAL, "^", f"{unsure}, predicted √(σ² + τ²)"),
         ("unsure_within_noise_alone", drawing.COLOURS["particle-filter"], "s", f"{unsure}, σ alone"),
     ):
         if model_row[key]:
@@ -240,6 +240,6 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
     for name, row in summary.items():
         if 0 < row["unsure_share"] < 1:
             shares = (f"{row[f'unsure_within_{k}_sigma']:.1%}" for k in GAUSSIAN)
-            rows.append([f"{name}, {row['unsure_share']:.1%} of beams with m > σ", "", "", "", *shares])
+            rows.append([f"{name}, {row['unsure_share']:.1%} of beams with τ > σ", "", "", "", *shares])
     rows.append(["Gaussian", "", "", "", *(f"{share:.1%}" for share in GAUSSIAN.values())])
     return results.markdown(heads, rows)

@@ -10,7 +10,7 @@ from common.messages.definitions import Stamped
 from common.messages.requests import Request
 from common.messages.topics import Query, Topic
 from common.runtime.service import Service
-from common.runtime.service_loop import Loop
+from common.runtime.service_loop import ServiceLoop
 
 
 class InProcessServices:
@@ -23,7 +23,7 @@ class InProcessServices:
         """Opens the services; raises UserError if one cannot start."""
         self.robot, self.instance = robot, "in-process"
         self._outbox: deque[tuple[Topic, bytes]] = deque()
-        self._loops = [Loop(service, self, Inbox()) for service in services]  # type: ignore[arg-type] # as bus
+        self._loops = [ServiceLoop(service, self, Inbox()) for service in services]  # type: ignore[arg-type] # as bus
         for service in services:
             service.open()
 

@@ -17,7 +17,7 @@ from common.log import LogRateLimiter, logger
 from common.messages.topics import SCAN
 from common.runtime.runnable import Runnable
 from common.runtime.service import Service
-from common.runtime.service_loop import Loop
+from common.runtime.service_loop import ServiceLoop
 from services.estimator.service import EstimatorService, SharedModels
 from services.estimator.settings import ROBOT_NAME, EstimatorSettings
 from services.estimator.shared.interface import SearchingEstimator
@@ -233,7 +233,7 @@ class FleetLoop:
 
     def _add(self, name: str, *, named: bool) -> None:
         robot = FleetRobot(self.settings, name, self.models, self._start_search, named=named)
-        loop = Loop(robot, self.bus.for_robot(name), Inbox(INBOX_MESSAGES, INBOX_BYTES, self._changed))
+        loop = ServiceLoop(robot, self.bus.for_robot(name), Inbox(INBOX_MESSAGES, INBOX_BYTES, self._changed))
         loop.open()
         robot.active = loop.try_start()
         self._robots[name] = robot

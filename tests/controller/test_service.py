@@ -8,7 +8,7 @@ import pytest
 from common.bus.inbox import Inbox
 from common.messages.requests import PredictReply, Reply
 from common.messages.topics import BELIEF, CMD_VEL, PREDICT, SCAN
-from common.runtime.service import Loop
+from common.runtime.service import ServiceLoop
 from services.controller import service as shell
 from services.controller.policies.active_localisation import CandidateDrives
 from services.controller.service import ControllerService
@@ -68,7 +68,7 @@ def test_answers(monkeypatch, needs_predictions, events, answers):
     clock = Clock()
     monkeypatch.setattr(shell, "time", clock)
     service, bus = ControllerService(ControllerSettings(preset="paper", world="")), FakeBus()
-    loop = Loop(service, bus, Inbox())
+    loop = ServiceLoop(service, bus, Inbox())
     service.open()
     service.navigator.on_goal(goal(8, 2))
     service.geodesic = policy = Predicting(needs_predictions)

@@ -15,7 +15,7 @@ from common.geometry.world import load_world
 from common.messages.definitions import Pose
 from common.messages.requests import PredictReply, PredictRequest
 from common.messages.topics import PREDICT, SCAN
-from common.runtime.service import Loop
+from common.runtime.service import ServiceLoop
 from services.estimator.prediction_query import answer_prediction
 from services.estimator.shared.interface import Predicted
 from tests.estimator.test_service import SCANNER, TRUTH, WORLD, a_scan, opened
@@ -155,7 +155,7 @@ def test_belief_is_unchanged():
 def ask(service, payload: bytes):
     """Passes a request through the service's loop; returns the reply, or the refusal as text."""
     found = []
-    loop = Loop(service, SimpleNamespace(robot="robot"), Inbox())
+    loop = ServiceLoop(service, SimpleNamespace(robot="robot"), Inbox())
     loop._answer(
         IncomingRequest(PREDICT, payload, lambda reply: found.append(PredictReply.decode(reply)), found.append)
     )

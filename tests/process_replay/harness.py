@@ -14,7 +14,7 @@ from common.bus.inbox import Inbox, IncomingRequest, RequestResult, Sample
 from common.messages.definitions import Stamped
 from common.messages.requests import ModelReply, Reply, Request, SampleReply, WorldReply
 from common.messages.topics import Query, Topic
-from common.runtime.service import Loop, Service
+from common.runtime.service import Service, ServiceLoop
 from tests.process_replay.reference import Row, of_array, of_symmetric
 
 ROBOT = "replayed"
@@ -94,7 +94,7 @@ def drive(service: Service, events: Iterable[Event]) -> list[Row]:
     Each row has the number of the event that caused it.
     """
     bus = FakeBus()
-    loop = Loop(service, bus, Inbox())  # type: ignore[arg-type]
+    loop = ServiceLoop(service, bus, Inbox())  # type: ignore[arg-type]
     service.open()
     rows: list[Row] = []
     try:
@@ -120,7 +120,7 @@ def drive(service: Service, events: Iterable[Event]) -> list[Row]:
     return [*rows, {"end": counts}]
 
 
-def _feed(loop: Loop, event: Event, number: int, rows: list[Row]) -> None:
+def _feed(loop: ServiceLoop, event: Event, number: int, rows: list[Row]) -> None:
     if event.what is None:
         loop.run_guarded(loop.service.on_timer)
     elif isinstance(event.what, Topic):

@@ -51,7 +51,7 @@ from common.messages.topics import (
 )
 from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS
-from common.runtime.service import Loop
+from common.runtime.service import ServiceLoop
 from services.controller.service import ControllerService
 from services.controller.settings import ControllerSettings
 from services.estimator.service import EstimatorService
@@ -222,7 +222,7 @@ def recorder(folder: Path, **changes: Any) -> list[Row]:
         ("estimator", "config"): ConfigReply(service="estimator", config="{}", versions={"python": "3"}),
         ("estimator", "model"): model,
     }
-    loop = Loop(service, bus, Inbox())  # type: ignore[arg-type]
+    loop = ServiceLoop(service, bus, Inbox())  # type: ignore[arg-type]
     thread = threading.Thread(target=loop.run)
     thread.start()
     try:

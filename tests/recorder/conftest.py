@@ -13,7 +13,7 @@ from common.messages.definitions import Health, Odom, Pose, TopicHealth, Twist
 from common.messages.requests import RecordReply, RecordRequest, WorldReply
 from common.messages.topics import HEALTH, ODOM, RECORDING, WORLD
 from common.robot.robot import Robot
-from common.runtime.service import Loop, Service
+from common.runtime.service import Service, ServiceLoop
 from services.recorder.settings import RecorderSettings
 from tests.conftest import Running
 from tests.recorder import sessions
@@ -99,7 +99,7 @@ class DescribedSimulator(Service):
 @pytest.fixture
 def simulator(bus) -> Iterator[DescribedSimulator]:
     service = DescribedSimulator(SimulatorSettings(robot=bus.robot))
-    loop = Loop(service, bus, Inbox())
+    loop = ServiceLoop(service, bus, Inbox())
     thread = threading.Thread(target=loop.run)
     thread.start()
     yield service

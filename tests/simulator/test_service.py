@@ -12,7 +12,7 @@ from common.bus.inbox import Inbox, IncomingRequest
 from common.messages.definitions import CmdVel, Pose, Twist
 from common.messages.requests import PoseRequest, Request, ResetRequest, SpeedRequest
 from common.messages.topics import PAUSE, RESET, RESUME, SCAN, SPEED, STEP, TELEPORT, TRUTH, WORLD
-from common.runtime.service import Loop
+from common.runtime.service import ServiceLoop
 from services.simulator import service as shell
 from services.simulator.service import SimulatorService
 from services.simulator.settings import SimulatorSettings
@@ -76,7 +76,7 @@ def simulator(monkeypatch):
     @contextmanager
     def run(**settings):
         service, bus = SimulatorService(SimulatorSettings(beams=61, **settings)), FakeBus()
-        loop = Loop(service, bus, Inbox())
+        loop = ServiceLoop(service, bus, Inbox())
         service.open()
         try:
             yield Running(service, loop, bus, clock)
