@@ -19,6 +19,7 @@ from presage.terminal.output import make_folder
 
 ESTIMATORS = ("precise", "particle-filter", RECOVERING_FILTER, "amcl-defaults")
 HEADS = ("`tracking` %", "wrong of these %; longest", "correct %", "error (mm)", "NEES")  # of each estimator
+SHORT_COLUMNS = 3  # of these, in a table of more than two estimators
 LEGEND = """*Tracking*: share of the scans that are reported as `tracking`. *Wrong*: share of these with an error above
 0.2 m or 5°, with Wilson's 95 % interval (too narrow, because scans of one trial depend on each other), or its upper
 bound if none was wrong. *Longest*: wrong stretch. *Correct*: scans within 0.2 m and 5°, in any state. *Error*:
@@ -53,11 +54,20 @@ def _check(plan: IntegrityPlan) -> None:
 
 
 def table(scores: dict[str, dict[str, Any]]) -> str:
-    """The Markdown table, with a row for each case and columns for each estimator."""
+    """The Markdown table, with a row for each case and columns for each estimator.
+
+    With more than two estimators, it would be too wide: then only the first has all columns of `HEADS`.
+    """
     cases = list(dict.fromkeys(case for by_case in scores.values() for case in by_case))
     cases = cases[:1] if set(cases[1:]) <= {"all", "all with a correct map"} else cases  # the same trials again
-    heads = [f"{name}: {HEADS[0]}" if k == 0 else HEADS[k] for name in scores for k in range(len(HEADS))]
-    rows = [[case, *(cell for by_case in scores.values() for cell in _cells(by_case.get(case)))] for case in cases]
+    columns = dict.fromkeys(scores, len(HEADS))
+    if len(scores) > 2:
+        columns |= dict.fromkeys([*scores][1:], SHORT_COLUMNS)
+    heads = [f"{name}: {HEADS[0]}" if k == 0 else HEADS[k] for name, count in columns.items() for k in range(count)]
+    rows = [
+        [case, *(cell for name, count in columns.items() for cell in _cells(scores[name].get(case))[:count])]
+        for case in cases
+    ]
     return markdown(["case", *heads], rows)
 
 

@@ -26,6 +26,7 @@ from lab.integrity.models import field_file
 from lab.peers.scans import BUILDING, DRIVES, PLACES, TrialScans, map_file, read_trial_scans
 from lab.statistics import bootstrap_interval, median, root_mean_square, wilson_interval
 from presage.learning.train_drive import TrainDriveOptions, card_of, rectangle
+from presage.terminal.output import make_folder
 from services.estimator.factory import EstimatorFactory, EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.drive_learning import learn_drive
@@ -74,7 +75,7 @@ class PeersJob:
     """One trial of one estimator."""
 
     folder: str  # of the scans
-    out: str  # folder of the learned models
+    models: str  # folder of the learned models
     estimator: str  # its name in `ESTIMATORS`
     task: str
     number: int  # of the place or drive
@@ -98,8 +99,10 @@ def run(
 ) -> results.Result:
     """Localises the scans of ``folder``, at most ``trials`` of each task. Writes peers.json into ``out``."""
     map_file(folder)
+    models = out / "peers-models"
+    make_folder(models)
     jobs = [
-        PeersJob(str(folder), str(out), estimator, task, number, seed)
+        PeersJob(str(folder), str(models), estimator, task, number, seed)
         for estimator in estimators
         for task in TASKS
         for number in range(min(trials, len(PeersJob(str(folder), "", estimator, task, 0, seed).scans.truth)))
@@ -122,8 +125,8 @@ def _model_file(job: PeersJob) -> str:
     """The weights that the job's estimator learns; empty if it learns none."""
     kind = ESTIMATORS[job.estimator].map
     if kind == FIELD:
-        return str(weights.path_of(Path(job.out), load_world(str(map_file(Path(job.folder)))).name))
-    return str(weights.path_of(Path(job.out), f"posed-{job.training_drives}")) if kind == POSED else ""
+        return str(weights.path_of(Path(job.models), load_world(str(map_file(Path(job.folder)))).name))
+    return str(weights.path_of(Path(job.models), f"posed-{job.training_drives}")) if kind == POSED else ""
 
 
 def learn(job: PeersJob) -> dict[str, Any]:
