@@ -62,9 +62,9 @@ def drive_and_learn(options: EstimatorOptions, scene: Scene, path: Array) -> tup
             estimator.use_model(version.model, version.seeds)
         if pending is None and (drive := keys.take_drive()) is not None:
             begin, since = time.process_time(), stamp
-            pending = learn_version(original, places, estimator.model, drive)
+            pending = learn_version(original, places, estimator.model, drive, learned_until=keys.learned_until)
             if pending is not None:
-                keys.correct_poses(drive.stamps, pending.key_poses)
+                keys.set_learned(drive.stamps, pending.key_poses)
             versions.append({
                 "at_s": stamp,
                 "key_scans": len(drive.poses),

@@ -53,7 +53,8 @@ class Learner:
         """Adds a scan, and starts learning if enough key scans are new; ``present`` is the model in use."""
         self.keys.add(posterior, observation)
         if self._running is None and (drive := self.keys.take_drive()) is not None:
-            self._stamps, self._running = drive.stamps, self._pool.submit(self._learn, present, drive)
+            self._stamps = drive.stamps
+            self._running = self._pool.submit(self._learn, present, drive, self.keys.learned_until)
 
     def take(self) -> EncodedVersion | None:
         """Returns the version that was learned since the last call, or None; raises RuntimeError if learning failed.
@@ -64,7 +65,7 @@ class Learner:
             return None
         done, self._running = self._running, None
         if (learned := done.result()) is not None:
-            self.keys.correct_poses(self._stamps, learned.version.key_poses)
+            self.keys.set_learned(self._stamps, learned.version.key_poses)
         return learned
 
     def close(self) -> None:
@@ -74,13 +75,13 @@ class Learner:
         if (process := self._process) is not None:
             process.terminate()
 
-    def _learn(self, present: GenerativeModel, drive: ReferenceDrive) -> EncodedVersion | None:
+    def _learn(self, present: GenerativeModel, drive: ReferenceDrive, learned_until: float) -> EncodedVersion | None:
         # Forking would copy the locks of threads. `start` takes a while, as it sends the arguments to the new process.
         context = multiprocessing.get_context("spawn")
         receiver, sender = context.Pipe(duplex=False)
         process = context.Process(
             target=_learn_and_send,
-            args=(sender, os.getpid(), self._original, self._places, present, drive),
+            args=(sender, os.getpid(), self._original, self._places, present, drive, learned_until),
             daemon=True,
         )
         process.start()
@@ -104,10 +105,11 @@ def _learn_and_send(
     places: Array,
     present: GenerativeModel,
     drive: ReferenceDrive,
+    learned_until: float,
 ) -> None:
     end_with_parent(parent)
     os.nice(NICENESS)
-    version, learned = learn_version(original, places, present, drive), None
+    version, learned = learn_version(original, places, present, drive, learned_until=learned_until), None
     if version is not None:
         data = weights.encode(version.model, version.seeds.places)
         model, seeds = weights.decode(data)

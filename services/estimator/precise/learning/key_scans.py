@@ -60,6 +60,7 @@ class KeyScanCollector:
         self.verified: dict[tuple[int, int, int], KeyScan] = {}  # by cell
         self.verified_total = 0  # scans verified so far, including those that newer ones replaced
         self.dropped_total = 0  # scans dropped because their pose may be wrong
+        self.learned_until = -np.inf  # s, stamp of the newest key scan from which the model in use was learned
         self._unverified: deque[KeyScan] = deque()
         self._taken_total = 0
         self._size = PLACE_M
@@ -118,8 +119,12 @@ class KeyScanCollector:
             self.range_max,
         )
 
-    def correct_poses(self, stamps: Array, poses: Array) -> None:
-        """Gives the key scans taken at ``stamps`` (N,) the ``poses`` (N, 3) found in learning; some may be gone."""
+    def set_learned(self, stamps: Array, poses: Array) -> None:
+        """Notes that the model in use was learned from the key scans taken at ``stamps`` (N,) s; some may be gone.
+
+        They get the ``poses`` (N, 3) that were found in learning.
+        """
+        self.learned_until = float(stamps.max())
         corrected = dict(zip(stamps.tolist(), poses, strict=True))
         for cell, key in self.verified.items():
             self.verified[cell] = replace(key, pose=corrected.get(key.stamp, key.pose))

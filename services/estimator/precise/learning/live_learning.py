@@ -62,12 +62,18 @@ class ModelVersion:
 
 
 def learn_version(
-    original: GenerativeModel, places: Array, present: GenerativeModel, keys: ReferenceDrive, recipe: Recipe = RECIPE
+    original: GenerativeModel,
+    places: Array,
+    present: GenerativeModel,
+    keys: ReferenceDrive,
+    recipe: Recipe = RECIPE,
+    learned_until: float = -np.inf,
 ) -> ModelVersion | None:
     """Learns a field from key scans and the ``original`` model, which knows the surroundings of ``places`` (S, 2) m.
 
-    Returns None if the new field predicts held-out key scans no better than the model in use, ``present``. It may do so
-    by predicting more surfaces, if it is not much worse at those that both predict.
+    Returns None if the new field predicts held-out key scans no better than the model in use, ``present``, which was
+    learned from key scans up to the stamp ``learned_until`` s: only later ones are new to both. It may predict them
+    better by predicting more surfaces, if it is not much worse at those that both predict.
     """
     tracked = remove_moving_objects(keys)
     sigma = estimate_noise(tracked.ranges, tracked.angles)
@@ -83,6 +89,7 @@ def learn_version(
     others, held_out = hold_out(aligned)
     trial = _learn(others, overlapping, recipe, EPOCHS)
     _, unaligned = hold_out(tracked)
+    unaligned = unaligned.part(unaligned.stamps > learned_until)
     errors, present_errors = (
         errors_of_beams(model, _match_key_scans(model, unaligned, unaligned.poses, sigma))[
             np.isfinite(unaligned.ranges)

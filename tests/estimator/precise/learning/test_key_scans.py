@@ -58,11 +58,12 @@ def test_corrected_poses():
     drive = Drive().go(8.0)
     before = {key.stamp: key.pose for key in drive.keys.verified.values()}
     drive.go(3.0)
-    drive.keys.correct_poses(np.array(list(before)), np.array(list(before.values())) + np.array([0.01, 0.0, 0.0]))
+    drive.keys.set_learned(np.array(list(before)), np.array(list(before.values())) + np.array([0.01, 0.0, 0.0]))
     for key in drive.keys.verified.values():
         x = before[key.stamp][0] + 0.01 if key.stamp in before else round(key.pose[0], 2)
         assert key.pose[0] == pytest.approx(x)
     assert len(drive.keys) > len(before)
+    assert drive.keys.learned_until == max(before)
 
 
 @pytest.mark.parametrize("changes", [{"state": "ambiguous"}, {"protection": None}, {"protection": (0.02, 0.3, 0.01)}])
