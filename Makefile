@@ -108,24 +108,25 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	$(BIN)/presage experiment --seed 3467 --out $(RESULTS) navigation --worlds hall --drives holonomic --max-range 4 --beams 271 --prior odometry --slip 0.05 --limit 60 --trials 50 --no-epistemic
 	$(BIN)/presage experiment --seed 3471 --out $(RESULTS) navigation --worlds twins --start unknown --trials 50
 	$(BIN)/presage experiment --seed 4300 --out $(RESULTS) navigation --worlds twins --start unknown --trials 50 --drives holonomic --no-epistemic
-	$(BIN)/presage experiment --seed 3424 --out $(RESULTS) docking --trials 64
+	$(BIN)/presage experiment --seed 3475 --out $(RESULTS) docking --trials 64
 	$(BIN)/presage experiment --seed 51 --out $(RESULTS) exploration
 	$(BIN)/presage bench mapping-faults --worlds 2 --seed 990 --seconds 60 --json $(RESULTS)/mapping-faults.json
 	$(BIN)/presage bench refinement --worlds 3 --seed 3447 --seconds 300 --out $(RESULTS)/refinement --json $(RESULTS)/refinement.json
 	$(BIN)/presage bench visits --worlds 0 --visits 6 --scans 100 --seed 4711 --out $(RESULTS)/visits --json $(RESULTS)/visits-office.json
 	$(BIN)/presage bench training --out $(RESULTS)/training --json $(RESULTS)/training.json
+	$(BIN)/python -m lab.benchmarks.live_changes --worlds office,3480,3481 --seed 3480 --json $(RESULTS)/live-changes.json
 	$(BIN)/python -m lab.benchmarks.live_refinement --worlds office,3447,3448 --seed 3447 --json $(RESULTS)/live-refinement.json
 	$(if $(PEERS),OMP_NUM_THREADS=1 $(BIN)/presage experiment --seed 3611 --out $(RESULTS) peers '$(PEERS)' --trials 100)
-	$(if $(LOGS),$(BIN)/presage map '$(LOGS)/fr079.npz' --mount 0,0,0 --poses reference --half second --no-learn -o $(RESULTS)/second_half.yaml)
-	$(if $(LOGS),$(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/fr079.npz' --mount 0,0,0 --world $(RESULTS)/second_half.yaml --exchange --every 200 --name fr079_exchanged)
-	$(if $(LOGS),$(BIN)/presage map '$(LOGS)/fr079.npz' --mount 0,0,0 --poses reference --half first --no-learn -o $(RESULTS)/first_half.yaml)
-	$(if $(LOGS),$(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/fr079.npz' --mount 0,0,0 --world $(RESULTS)/first_half.yaml --every 30 --name fr079)
-	$(if $(LOGS),$(BIN)/presage map '$(LOGS)/uwb.npz' --mount 0,0,0 --poses reference --half first --no-learn -o $(RESULTS)/uwb_first_half.yaml)
-	$(if $(LOGS),$(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/uwb.npz' --mount 0,0,0 --world $(RESULTS)/uwb_first_half.yaml --every 10 --name uwb)
-	$(BIN)/presage bench integrity --out $(RESULTS)/integrity --worlds 3 --seed 3458 --model exact --seconds 10
+	$(if $(LOGS),$(BIN)/presage map '$(LOGS)/fr079.npz' --mount 0,0,0 --poses reference --half second --no-learn -o $(RESULTS)/maps/second_half.yaml)
+	$(if $(LOGS),$(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/fr079.npz' --mount 0,0,0 --world $(RESULTS)/maps/second_half.yaml --exchange --every 200 --name fr079_exchanged)
+	$(if $(LOGS),$(BIN)/presage map '$(LOGS)/fr079.npz' --mount 0,0,0 --poses reference --half first --no-learn -o $(RESULTS)/maps/first_half.yaml)
+	$(if $(LOGS),$(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/fr079.npz' --mount 0,0,0 --world $(RESULTS)/maps/first_half.yaml --every 30 --name fr079)
+	$(if $(LOGS),$(BIN)/presage map '$(LOGS)/uwb.npz' --mount 0,0,0 --poses reference --half first --no-learn -o $(RESULTS)/maps/uwb_first_half.yaml)
+	$(if $(LOGS),$(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/uwb.npz' --mount 0,0,0 --world $(RESULTS)/maps/uwb_first_half.yaml --every 10 --name uwb)
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity --worlds 3 --seed 3478 --model exact --seconds 10 --estimators precise,particle-filter,particle-filter-recovery
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-long-corridor --worlds 20 --seed 3462 --model exact --seconds 10 --cases long-corridor --estimators precise
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-noisy-map --worlds 20 --seed 3457 --model exact --seconds 40 --cases noisy-map
-	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-50 --worlds 20 --seed 3463 --model exact --cases moved-50
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-50 --worlds 20 --seed 3479 --model exact --cases moved-50 --estimators precise,particle-filter,particle-filter-recovery
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-100 --worlds 20 --seed 3460 --model exact --seconds 10 --cases moved-100 --estimators precise
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-single-scan --worlds 20 --seed 3464 --model exact --cases single-scan-moved-50 --estimators precise
 	for folder in $(RESULTS)/integrity*/; do cp $$folder/integrity.json docs/experiments/$$(basename $$folder).json || exit 1; done

@@ -8,49 +8,46 @@ from typing import Any
 from lab.accuracy import report
 from lab.experiments.results import markdown, number, read
 from lab.peers.experiment import table_with_others
-from lab.real_logs.experiment import claims_of
 
-PRESETS = {"precise": "presage", "particle-filter": "particle filter, tuned", "amcl-defaults": "AMCL-like defaults"}
-# Labels in README, and the tasks of `presage bench accuracy`
+PRESETS = {"precise": "presage", "particle-filter": "particle filter, tuned"}
+# Labels in README, and the tasks of `presage experiment real` and of `presage bench accuracy`
+REAL_TASKS = {
+    "with odometry": "a: tracking with odometry",
+    "laser alone": "b: tracking without",
+    "unknown start": "c: from nothing",
+    "kidnapped": "d: carried off",
+}
 TASKS = {
-    "unknown start, 1 scan": "from nothing, 1 scan",
     "unknown start, 20 scans": "standing, 20 scans",
     "30 % blocked, 20 scans": "30 % blocked, 20 scans",
     "kidnapped, 20 scans": "kidnapped, 20 scans",
     "tracking, no odometry": "tracking, no odometry",
 }
 MOVED = "half of the furniture moved"
+MOVED_FILTERS = {"no recovery": "particle-filter", "tuned": "particle-filter-recovery"}
 
 
 def real_logs(folder: Path) -> str:
     """A real log, for each estimator: the second half localised with the first, and the reverse.
 
-    Pairs are with odometry; without.
+    Each cell: scans with a correct pose, or starts found; and the wrong ones among the scans in state `tracking`.
     """
     lines, longest = [], [0.0] * len(PRESETS)
     for half, name in (("second half", "real-fr079"), ("first half", "real-fr079_exchanged")):
         summary = read(folder / f"{name}.json")["summary"]
-        odometry, laser, unknown = (
-            [summary[f"{task}, {preset}"] for preset in PRESETS]
-            for task in ("a: tracking with odometry", "b: tracking without", "c: from nothing")
-        )
-        pairs = list(zip(odometry, laser, strict=True))
-        lines += [
-            [
-                f"{half}: pose correct",
-                *("; ".join(f"{row['tracked_share']:.1%}" for row in pair) for pair in pairs),
-            ],
-            [
-                f"{half}: `tracking`, wrong of these",
-                *("; ".join(map(claims_of, pair)) for pair in pairs),
-            ],
-            [f"{half}: unknown start found", *(f"{row['found']} of {row['trials']}" for row in unknown)],
-        ]
-        for k, preset in enumerate(PRESETS):
-            own = [row["wrong_claim_longest_s"] for task, row in summary.items() if task.endswith(f", {preset}")]
-            longest[k] = max(longest[k], *own)
+        for label, task in REAL_TASKS.items():
+            rows = [summary[f"{task}, {preset}"] for preset in PRESETS]
+            lines.append([f"{half}: {label}", *map(_correct_and_wrong, rows)])
+            longest = [max(each, row["wrong_claim_longest_s"]) for each, row in zip(longest, rows, strict=True)]
     lines.append(["longest wrong `tracking`", *(f"{each:.1f} s" for each in longest)])
     return markdown(["", *PRESETS.values()], lines)
+
+
+def _correct_and_wrong(row: dict[str, Any]) -> str:
+    correct = f"{row['tracked_share']:.1%}" if row["trials"] == 1 else f"{row['found']} of {row['trials']}"
+    if not row["claimed_share"]:
+        return f"{correct}; –"
+    return f"{correct}; {row['wrong_claims_share'] / row['claimed_share']:.1%}"
 
 
 def simulation(folder: Path) -> str:
@@ -64,8 +61,9 @@ def simulation(folder: Path) -> str:
         bound = f"{number(1e3 * own['bound_rms_m'], 2)} mm" if own["bound_rms_m"] else ""
         lines.append([label, report.cell(own), f"{variant}: {report.cell(best)}", report.cell(matcher), bound])
     moved = read(folder / "integrity-moved-50.json")["summary"]
-    own, tuned = (_integrity(moved[name]["moved-50"]) for name in ("precise", "particle-filter"))
-    lines.append([MOVED, own, f"tuned: {tuned}", "", ""])
+    filters = {name: moved[preset]["moved-50"] for name, preset in MOVED_FILTERS.items()}
+    name, best = min(filters.items(), key=lambda each: each[1]["wrong"]["count"] / each[1]["wrong"]["of"])
+    lines.append([MOVED, _integrity(moved["precise"]["moved-50"]), f"{name}: {_integrity(best)}", "", ""])
     return markdown(["", "presage", "best particle filter", "scan matcher", "bound (RMS)"], lines)
 
 
@@ -89,7 +87,7 @@ def _best_filter(rows: list[dict[str, Any]]) -> dict[str, Any]:
 def _integrity(row: dict[str, Any]) -> str:
     tracking, wrong = (100 * row[name]["count"] / row[name]["of"] for name in ("tracking", "wrong"))
     low, high = (100 * bound for bound in row["wrong"]["interval_95"])
-    return f"{tracking:.1f} % `tracking`, of which {wrong:.1f} % wrong ({low:.2g} to {high:.2g} %)"
+    return f"{tracking:.1f} % `tracking`, of which {wrong:.1f} % wrong ({low:.3g} to {high:.3g} %)"
 
 
 TABLES = {
