@@ -73,6 +73,7 @@ def drive_and_learn(options: EstimatorOptions, scene: Scene, path: Array) -> tup
                 "error_median_m": float(np.median(errors[-round(10 / PERIOD_S):])),
             })  # fmt: skip
             print(versions[-1], flush=True)
+    version = pending or version  # the robot waits until the last one is learned
     mean, (median, most) = np.mean(update_ms, axis=0), np.quantile(update_ms, (0.5, 0.99), axis=0)
     costs = {
         f"{name}_{kind}_ms": float(values[column])
