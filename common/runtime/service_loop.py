@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 HEALTH_PERIOD_S = 1.0
 RESTORE_PERIOD_S = 5.0  # after its start, a service keeps querying latched topics for this long until one answers
-MAX_KEYS, MAX_KEY_LENGTH = 200, 200  # in a health message; anyone on the bus can publish under new keys
+MAX_REPORTED_KEYS, MAX_KEY_LENGTH = 200, 200  # in a health message
 SOURCE_TIMEOUT_S = 0.3  # a source silent for longer is replaced by another source of the same topic
 
 
@@ -252,7 +252,7 @@ class ServiceLoop:
                 rate=max(0, total[key] - self._totals_at_last_health[key]) / elapsed,
                 **self.service.extra_counts(key),
             )
-            for key in sorted(total)[:MAX_KEYS]
+            for key in sorted(total)[:MAX_REPORTED_KEYS]
         ]
         self._totals_at_last_health = total
         counters: dict[str, int] = {**self.service.counters, "failed": self.failed}

@@ -18,12 +18,12 @@ from common.geometry.se2 import Array
 from lab.accuracy.scenes import Scene
 from lab.benchmarks.mapping import fitted
 from lab.benchmarks.refinement import DRIVE_SEED, ROUGH_SEED, TEST_SECONDS, TEST_SEED, drive_for
-from lab.benchmarks.visits import PERIOD_S, building_of
+from lab.benchmarks.visits import PERIOD_S, building_of, make_estimator
 from lab.experiments.results import markdown, millimetres
 from lab.integrity.cases import BEAMS, START_DEVIATION
 from lab.integrity.maps import noisy_grid
 from presage.terminal.output import check_file, provenance, write_json
-from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
+from services.estimator.factory import EstimatorOptions
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.key_scans import KeyScanCollector
@@ -32,10 +32,11 @@ from services.estimator.precise.learning.live_learning import ModelVersion, lear
 DELAY_S = 15.0  # of the drive, in which a version is learned
 
 
-def start_estimator(options: EstimatorOptions, scene: Scene, start: Array) -> PreciseEstimator:
-    """An estimator that starts near a pose."""
-    estimator = prepare_factory(options)(ScannerGeometry.of(scene.scanner))
-    assert isinstance(estimator, PreciseEstimator)  # noqa: S101 - for the type checker
+def start_estimator(
+    options: EstimatorOptions, scene: Scene, start: Array, version: ModelVersion | None = None
+) -> PreciseEstimator:
+    """An estimator that starts near a pose, with a ``version`` of its model if given."""
+    estimator = make_estimator(options, scene.scanner, version)
     estimator.restart(start + START_DEVIATION * scene.rng.standard_normal(3), np.diag(START_DEVIATION**2))
     return estimator
 
@@ -101,9 +102,7 @@ def errors_of_test_drive(
     For the aligned errors, the estimated path is first moved and turned as a whole to fit the true one best, so that an
     offset of the whole map does not count.
     """
-    estimator = start_estimator(options, scene, path[0])
-    if version is not None:
-        estimator.use_model(version.model, version.seeds)
+    estimator = start_estimator(options, scene, path[0], version)
     clean = scene.clean(path)
     found = np.array([estimator.update(scene.observe(each, k * PERIOD_S)).pose for k, each in enumerate(clean)])
     errors, aligned = (np.hypot(*(poses - path)[:, :2].T) for poses in (found, fitted(found, path)))

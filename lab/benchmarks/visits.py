@@ -219,6 +219,17 @@ def _map_drive(path: Array, options: MapOptions) -> dict[str, Any]:
     }
 
 
+def make_estimator(
+    options: EstimatorOptions, scanner: Scanner, version: ModelVersion | None = None
+) -> PreciseEstimator:
+    """An estimator without a start pose, with a ``version`` of its model if given."""
+    estimator = prepare_factory(options)(ScannerGeometry.of(scanner))
+    assert isinstance(estimator, PreciseEstimator)  # noqa: S101 - for the type checker
+    if version is not None:
+        estimator.use_model(version.model, version.seeds)
+    return estimator
+
+
 def errors_of_single_scans(
     options: EstimatorOptions,
     scanner: Scanner,
@@ -227,10 +238,7 @@ def errors_of_single_scans(
     version: ModelVersion | None = None,
 ) -> list[float | None]:
     """Errors in m of single scans from unknown poses, with a ``version`` of the model if given; None if not found."""
-    estimator = prepare_factory(options)(ScannerGeometry.of(scanner))
-    if version is not None:
-        assert isinstance(estimator, PreciseEstimator)  # noqa: S101 - for the type checker
-        estimator.use_model(version.model, version.seeds)
+    estimator = make_estimator(options, scanner, version)
     errors: list[float | None] = []
     for scan, pose in zip(scans, poses, strict=True):
         estimator.restart()

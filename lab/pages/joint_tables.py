@@ -8,6 +8,7 @@ from typing import Any
 from lab.accuracy import report
 from lab.experiments.results import markdown, number, read
 from lab.peers.experiment import table_with_others
+from lab.real_logs.experiment import wrong_share_of_tracking
 
 PRESETS = {"precise": "presage", "particle-filter": "particle filter, tuned"}
 # Labels in README, and the tasks of `presage experiment real` and of `presage bench accuracy`
@@ -45,9 +46,8 @@ def real_logs(folder: Path) -> str:
 
 def _correct_and_wrong(row: dict[str, Any]) -> str:
     correct = f"{row['tracked_share']:.1%}" if row["trials"] == 1 else f"{row['found']} of {row['trials']}"
-    if not row["claimed_share"]:
-        return f"{correct}; –"
-    return f"{correct}; {row['wrong_claims_share'] / row['claimed_share']:.1%}"
+    wrong = wrong_share_of_tracking(row)
+    return f"{correct}; –" if wrong is None else f"{correct}; {wrong:.1%}"
 
 
 def simulation(folder: Path) -> str:

@@ -303,10 +303,14 @@ def _format_settings(settings: ParameterValues) -> str:
     return ", ".join(f"{name} {value:.3g}" for name, value in settings)
 
 
+def wrong_share_of_tracking(row: dict[str, Any]) -> float | None:
+    """Share of the scans in state `tracking` whose pose is wrong; None if no scan is in that state."""
+    return row["wrong_claims_share"] / row["claimed_share"] if row["claimed_share"] else None
+
+
 def claims_of(row: dict[str, Any]) -> str:
     """Share of the scans in state `tracking`, and share of these whose pose is wrong."""
-    wrong = row["wrong_claims_share"] / row["claimed_share"] if row["claimed_share"] else 0.0
-    return f"{row['claimed_share']:.1%}, {wrong:.1%}"
+    return f"{row['claimed_share']:.1%}, {wrong_share_of_tracking(row) or 0.0:.1%}"
 
 
 def table(summary: dict[str, dict[str, Any]]) -> str:

@@ -59,13 +59,13 @@ def map_command(options: MapOptions, console: Console, progress: Console) -> Pat
     if stamps is None:  # not needed for a map, but for a drive
         stamps = np.arange(len(scans.ranges), dtype=np.float64)
     scans = replace(scans, stamps=stamps)
-    _check_number(len(scans), options)
+    _check_scan_count(len(scans), options)  # now, because the poses take a while
     if options.poses == "slam":
         scans = replace(scans, truth=_build_poses(scans, stamps, rough, former, options, console, progress))
     drive = drive_of(scans, options.log)
     if options.half:
         drive = split(drive)[0 if options.half == "first" else 1]
-    _check_number(len(drive.ranges), options)  # before anything is written
+    _check_scan_count(len(drive.ranges), options)  # of the half, before anything is written
     laser = Laser(drive.angles, drive.mount, drive.range_max)
     unseen = None if rough is None else rasterise(rough, options.cell)
     grid = grid_of_scans(drive.poses, drive.ranges, laser, options.cell, unseen)
@@ -109,7 +109,7 @@ def _check(options: MapOptions) -> None:
         raise UserError(f"{existing} exists already: choose another name with --out, or remove it")
 
 
-def _check_number(count: int, options: MapOptions) -> None:
+def _check_scan_count(count: int, options: MapOptions) -> None:
     """Raises UserError if so many scans are too few for a model."""
     least = drive_learning.MIN_SCANS
     if options.models is not None and count < least:

@@ -28,6 +28,7 @@ from services.estimator.precise.local_map import ChangeRate, LocalMap, LocalMapS
 from services.estimator.precise.motion_model import (
     MotionCandidate,
     decouple,
+    expected_motion,
     fuse,
     limit_to_map,
     predict_motion,
@@ -268,7 +269,7 @@ class PreciseEstimator:
         beams that the map explains at the first pose.
         """
         widest = _prior_of([each[-1] for each in motions])
-        predicted = np.array([each[-2].mean for each in motions])
+        predicted = np.array([expected_motion(each).mean for each in motions])
         poses, evidence = view.descend(predicted, widest)
         if _log_fit(view, view.surface_evidence(poses)) < self._last_log_fit - MAX_FIT_DROP:
             extra_starts = np.zeros((0, 3))
@@ -391,7 +392,7 @@ class PreciseEstimator:
         certain = doubt <= 1 - self.settings.tracking_probability
         if certain or 1 - self._probability_of_being_near(best) > 0.5 * doubt:
             return []
-        motion = candidates[-2] if len(candidates) > 1 else candidates[0]  # the last one is any possible motion
+        motion = expected_motion(candidates)
         found = search_near(view, motion.mean, motion.covariance, self.seeds, self.settings, self._rng)
         at_best = before.log_evidence + _prior_of([motion]).energy(best.pose[None])[0]
         return [

@@ -116,6 +116,14 @@ def predict_motion(
     return found if odom is None else [_add_drift(each, noise.slip * odom, float(pose[2])) for each in found]
 
 
+def expected_motion(candidates: list[MotionCandidate]) -> MotionCandidate:
+    """The most specific of the candidates: by odometry, or else by the command or the last velocity.
+
+    It comes last but one, before any possible motion. A match with the local map is the only candidate.
+    """
+    return candidates[-2] if len(candidates) > 1 else candidates[0]
+
+
 def smooth_velocity(previous: Array | None, current: Array, period: float) -> Array:
     """Averages the velocity (3,) exponentially over at least `SMOOTHING_TIME_S`.
 

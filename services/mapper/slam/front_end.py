@@ -158,9 +158,9 @@ class FrontEnd:
         # If odometry and registration agree even after many suspect scans, the surroundings have changed.
         confirmed = self._suspect_scans + 1 >= MAX_SUSPECT_SCANS and used_odometry and not _is_far(found, prior)
         if found is not None and (confirmed or not suspect):
-            doubtful = suspect or prior.difference(found.pose)[1] > MAX_SLIP**2
-            if not suspect:  # otherwise moving objects did not cause the contradiction
-                doubtful |= self._exceeds_recent_contradiction(contradiction)
+            # In a suspect scan, the contradiction is not due to moving objects.
+            unusual = not suspect and self._exceeds_recent_contradiction(contradiction)
+            doubtful = suspect or unusual or prior.difference(found.pose)[1] > MAX_SLIP**2
             return self._add_matched(scan, found, prior, deviation, period, doubtful=doubtful)
         self.unmatched += 1
         if used_odometry:
