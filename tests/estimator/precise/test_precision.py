@@ -64,14 +64,16 @@ def test_noise_is_no_error_of_the_map(noise, seed):
 
 @pytest.mark.parametrize("noise", [0.01, 0.02, 0.04])
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=3)
+@settings(max_examples=2)
 def test_error_of_the_map(noise, seed):
     """On average over maps, it is underestimated by at most 40 %, even if the noise is four times as large.
+
+    With such noise, the average over 20 maps was less than that for 4 % of the seeds.
 
     Part of it may be due to chance and is left out, the prior that there is no error counts as one key scan, and some
     segments on which errors count as equal lie in two squares.
     """
-    variances = [learned(WrongMap(ROOM, [seed, k]), noise, seed) ** 2 for k in range(20)]
+    variances = [learned(WrongMap(ROOM, [seed, k]), noise, seed) ** 2 for k in range(80)]
     assert 0.6 < np.sqrt(np.mean(variances)) / WrongMap.ERROR < 1
 
 
@@ -152,14 +154,20 @@ def learn_in_cells(precision, offset, count, rng, assumed=None):
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=5)
+@settings(max_examples=2)
 def test_place_in_the_cells_of_another_room(seed):
-    """After a long drive where surfaces are 15 mm behind the front of their cells, they are 5 mm behind it."""
-    rng, precision = np.random.default_rng(seed), Precision.before_first_scan(0.05)
-    learn_in_cells(precision, 0.015, 30, rng)
-    assert precision.offset == pytest.approx(0.015, abs=0.003)
-    learn_in_cells(precision, 0.005, 10, rng)
-    assert precision.offset == pytest.approx(0.005, abs=0.003)
+    """After long drives where surfaces are 15 mm behind the front of their cells, they are 5 mm behind it.
+
+    The offsets scatter by 0.8 mm from drive to drive.
+    """
+    rng, offsets = np.random.default_rng(seed), []
+    for _ in range(8):
+        precision = Precision.before_first_scan(0.05)
+        learn_in_cells(precision, 0.015, 30, rng)
+        before = precision.offset
+        learn_in_cells(precision, 0.005, 10, rng)
+        offsets.append((before, precision.offset))
+    assert np.mean(offsets, axis=0) == pytest.approx((0.015, 0.005), abs=0.002)
 
 
 @pytest.mark.parametrize("assumed", [0.005, 0.015, 0.03])
