@@ -167,7 +167,11 @@ class PreciseEstimator:
         match, explained = self._match_map(view, motions, period, with_odometry=odom is not None)
         # Local map
         if explained < self.settings.min_explained_share:
-            match = self._match_local_map(view, match)
+            in_local_frame = replace(
+                self.modes[0], pose=self._local_pose, noise_covariance=np.zeros((3, 3)), drift=np.zeros((3, 3))
+            )
+            local = self._predict_motion(in_local_frame, period, odom, observation.command)
+            match = self._match_local_map(view, match, local)
         if observation.time_increment and any(each.excess(match.poses[0]) == 0 for each in motions[0][:-1]):
             # Only if the match is one of the predicted motions: otherwise the robot may have been carried to another
             # place, and may have stood still during the scan.
@@ -281,22 +285,23 @@ class PreciseEstimator:
                 poses, evidence = wider_poses, wider_evidence
         return ScanMatch(motions, poses, evidence), float(view.surface_evidence(poses).explained[0])
 
-    def _match_local_map(self, view: View, match: ScanMatch) -> ScanMatch:
+    def _match_local_map(self, view: View, match: ScanMatch, motions: list[MotionCandidate]) -> ScanMatch:
         """Matches the scan to the map again, near the motion that scan matching to the local map gives.
 
-        Returns ``match`` unchanged if the local map gives no motion, or if the scan fits the map far better there.
+        ``motions`` are the predicted ones in the local frame. The pose in the map does not matter there: it may just
+        have been corrected, or be wrong. Returns ``match`` unchanged if the local map gives no motion, or if the scan
+        fits the map far better there.
         """
-        candidates = match.motions[0]
-        starts = np.array([*(each.mean for each in candidates), match.poses[0]])
-        found = self._local_map.match(starts, view.points, candidates[-1])
+        starts = np.array([*(each.mean for each in motions), self._local_map.to_local(match.poses[0])])
+        found = self._local_map.match(starts, view.points, motions[-1])
         if found is None:
             return match
         moved = self._local_map.candidate(found)
         # All hypotheses share the relative motion.
         step = se2.between(self.modes[0].pose, moved.mean)
-        motions = [replace(moved, mean=se2.compose(mode.pose, step)) for mode in self.modes]
-        poses, evidence = view.descend(np.array([each.mean for each in motions]), _prior_of(motions))
-        by_local_map = ScanMatch([[each] for each in motions], poses, evidence, found.pose)
+        moves = [replace(moved, mean=se2.compose(mode.pose, step)) for mode in self.modes]
+        poses, evidence = view.descend(np.array([each.mean for each in moves]), _prior_of(moves))
+        by_local_map = ScanMatch([[each] for each in moves], poses, evidence, found.pose)
         # The local map is wrong where people move all around the robot, the map where much has changed.
         both = np.stack([match.poses[0], poses[0]])
         map_evidence, local_evidence = _log_at_poses(

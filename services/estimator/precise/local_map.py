@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -198,18 +198,15 @@ class LocalMap:
     def match(self, starts: Array, points: Array, prior: MotionCandidate) -> Match | None:
         """Returns the pose at which a scan matches the key scans, or None if no pose matches.
 
-        ``starts`` (N, 3) and ``prior`` are poses in map, ``points`` (K, 2) m in the laser frame.
+        ``starts`` (N, 3) and ``prior`` are poses in the local frame, ``points`` (K, 2) m in the laser frame.
         """
         if not self.scans or len(points) < MIN_POINTS:
             return None
-        turn = se2.rotation(-float(self.frame[2]))
-        covariance = turn @ prior.covariance @ turn.T
-        local_prior = replace(prior, mean=self.to_local(prior.mean), covariance=covariance)
-        found = self._best_match(self.to_local(starts), points, local_prior)
+        found = self._best_match(starts, points, prior)
         if found is None or found.share < CLEAR_MATCHED_FRACTION:
-            turned = np.repeat(self.to_local(starts[:1]), len(EXTRA_HEADINGS_RAD), axis=0)
+            turned = np.repeat(starts[:1], len(EXTRA_HEADINGS_RAD), axis=0)
             turned[:, 2] = se2.wrap(turned[:, 2] + EXTRA_HEADINGS_RAD)
-            again = self._best_match(turned, points, local_prior)
+            again = self._best_match(turned, points, prior)
             if again is not None and (found is None or again.score > found.score):
                 found = again
         return None if found is None or found.share < MIN_MATCHED_FRACTION or found.degenerate else found

@@ -3,8 +3,8 @@
 The prior is a mixture of motions, here called candidates:
 
 - With odometry: dead reckoning with its noise.
-- Without odometry: the robot stands still, or it keeps its velocity (or follows the velocity command), within the
-  limits of its acceleration.
+- Without odometry, and with a small probability also with it, as wheels spin or are blocked: the robot stands still, or
+  it keeps its velocity (or follows the velocity command), within the limits of its acceleration.
 - Always, with a small probability: any motion the robot is capable of.
 
 The evidence of the scan selects the candidate. So the scans of a standing robot are averaged, and the belief of a
@@ -51,7 +51,7 @@ class MotionNoise:
     slip: float = 0.05  # scale error of odometry on each axis, the same for all motions (a guess)
     command_share: float = 0.2  # error of the commanded velocity, as a fraction of it
     standing: float = 1e-4  # m and rad per scan: motion of a robot that stands still
-    surprise: float = 0.02  # probability of any other motion (a guess)
+    surprise: float = 0.02  # probability (a guess) that odometry is wrong, and that of any other motion
 
 
 @dataclass(frozen=True)
@@ -91,29 +91,29 @@ def predict_motion(
     takes precedence over the velocity.
     """
     max_motion = np.array([noise.speed, noise.speed, noise.turn]) * period
-    rest = 1 - noise.surprise
     before = MotionCandidate("before", pose, covariance, 1.0, np.zeros((3, 3)) if drift is None else drift)
-    found = []
+    found = [_propagate("standing", before, np.zeros(3), np.full(3, noise.standing))]
+    limits = np.array([noise.acceleration, noise.acceleration, noise.turn_acceleration])
+    change = limits * period * max(period, SMOOTHING_TIME_S)
+    if command is not None:
+        change = change + noise.command_share * np.abs(command) * period
+        found.append(_propagate("commanded", before, command * period, change))
+    elif velocity is not None:
+        motion = limit_steps(velocity * period, MAX_MOTION_SIGMAS * max_motion)
+        deviation = np.sqrt(change**2 + _velocity_variance(pose, covariance, period))
+        found.append(_propagate("going on", before, motion, deviation))
+    probabilities = [(1 - noise.surprise) / len(found)] * len(found)
+    centre = np.zeros(3) if odom is None else odom
     if odom is not None:
         moved, turned = float(np.hypot(odom[0], odom[1])), abs(float(odom[2]))
         position = np.sqrt(noise.path_by_path * moved + noise.path_by_turn * turned) + noise.standing
         heading = np.sqrt(noise.turn_by_turn * turned + noise.turn_by_path * moved) + noise.standing
-        deviation = np.array([position, position, heading])
-        found.append(_propagate("odometry", before, odom, deviation, rest))
-    else:
-        found.append(_propagate("standing", before, np.zeros(3), np.full(3, noise.standing), rest / 2))
-        limits = np.array([noise.acceleration, noise.acceleration, noise.turn_acceleration])
-        change = limits * period * max(period, SMOOTHING_TIME_S)
-        if command is not None:
-            change = change + noise.command_share * np.abs(command) * period
-            found.append(_propagate("commanded", before, command * period, change, rest / 2))
-        elif velocity is not None:
-            motion = limit_steps(velocity * period, MAX_MOTION_SIGMAS * max_motion)
-            deviation = np.sqrt(change**2 + _velocity_variance(pose, covariance, period))
-            found.append(_propagate("going on", before, motion, deviation, rest / 2))
-    centre = odom if odom is not None else np.zeros(3)
-    found.append(_propagate("any motion", before, centre, max_motion + np.abs(centre), noise.surprise))
-    return found if odom is None else [_add_drift(each, noise.slip * odom, float(pose[2])) for each in found]
+        by_odometry = _propagate("odometry", before, odom, np.array([position, position, heading]))
+        found.append(_add_drift(by_odometry, noise.slip * odom, float(pose[2])))
+        probabilities = [noise.surprise * each for each in probabilities] + [(1 - noise.surprise) ** 2]
+    found.append(_propagate("any motion", before, centre, max_motion + np.abs(centre)))
+    probabilities.append(noise.surprise)
+    return [replace(each, probability=p) for each, p in zip(found, probabilities, strict=True)]
 
 
 def expected_motion(candidates: list[MotionCandidate]) -> MotionCandidate:
@@ -144,12 +144,10 @@ def _velocity_variance(pose: Array, covariance: Array, period: float) -> Array:
     return np.asarray(2 * weight * (1 + weight) * np.diagonal(turn @ covariance @ turn.T))
 
 
-def _propagate(
-    name: str, before: MotionCandidate, step: Array, deviation: Array, probability: float
-) -> MotionCandidate:
+def _propagate(name: str, before: MotionCandidate, step: Array, deviation: Array) -> MotionCandidate:
     by_pose, by_step = se2.compose_jacobians(before.mean, step)
     covariance = by_pose @ before.covariance @ by_pose.T + (by_step * deviation**2) @ by_step.T
-    return MotionCandidate(name, se2.compose(before.mean, step), covariance, probability, by_pose @ before.drift)
+    return MotionCandidate(name, se2.compose(before.mean, step), covariance, 1.0, by_pose @ before.drift)
 
 
 def _add_drift(candidate: MotionCandidate, lost: Array, yaw: float) -> MotionCandidate:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -155,6 +155,28 @@ def test_crowd_and_kidnapping():
         assert tasks.is_at(posterior.pose, here), k
     found = drive(made, scene, np.tile(there, (5, 1)), 45)
     assert np.hypot(*(found[-1].pose - there)[:2]) < 0.02
+
+
+def test_odometry_with_the_wrong_sign(driven):
+    """Where nothing was learned, recent scans show that the robot backs, although its odometry says it drives on."""
+    made, scene, path = copy.deepcopy(driven)
+    x = np.tile([11.5, 11.1, 10.7, 10.3, 10.7, 11.1], 3)  # at 1 m/s
+    there_and_back = np.column_stack([x, 2.5 + 0.3 * np.sin(x), 0.5 * np.sin(0.7 * x)])
+    odom = np.zeros(3)
+    for k, pose in enumerate(there_and_back):
+        ahead, *rest = se2.between(there_and_back[max(k - 1, 0)], pose)
+        odom = se2.compose(odom, np.array([abs(ahead), *rest]))
+        found = made.update(scene.observe(scene.clean(pose[None])[0], len(path) / RATE + 0.4 * k, odom))
+        assert np.hypot(*(found.pose - pose)[:2]) < 0.05, k
+
+
+def test_motion_from_recent_scans_ignores_the_map(driven):
+    """After a pose that the map has pulled aside, recent scans still show how the robot moves."""
+    made, scene, path = copy.deepcopy(driven)
+    made.modes = [replace(mode, pose=mode.pose + np.array([0.0, 0.25, 0.05])) for mode in made.modes]
+    found = drive(made, scene, path[-1:], len(path))[0]
+    assert np.hypot(*(found.pose - path[-1])[:2]) < 0.1
+    assert not made._change_rate.remembered
 
 
 @given(st.integers(0, 10_000))

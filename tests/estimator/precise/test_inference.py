@@ -17,7 +17,14 @@ from services.estimator.precise.gauss_newton import MAX_STEP, Prior, View
 from services.estimator.precise.global_seeds import Seeds, thin_places
 from services.estimator.precise.hypotheses import Mode, constraining_beams, select_distinct, weigh
 from services.estimator.precise.likelihood import Likelihood
-from services.estimator.precise.motion_model import MotionCandidate, MotionNoise, fuse, predict_motion, widen_unobserved
+from services.estimator.precise.motion_model import (
+    MotionCandidate,
+    MotionNoise,
+    expected_motion,
+    fuse,
+    predict_motion,
+    widen_unobserved,
+)
 from services.estimator.precise.search import NEAR_SCHEDULE_M
 from services.estimator.shared.generative_models import Expected, RayCaster
 from tests.estimator.models import ROOM
@@ -212,8 +219,13 @@ def test_motion_priors():
     assert [np.trace(c.covariance[:2, :2]) for c in (standing, going, wide)] == sorted(
         np.trace(c.covariance[:2, :2]) for c in (standing, going, wide)
     )
-    odom, _ = predict_motion(noise, TRUTH, P, 0.1, odom=np.array([0.1, 0, 0.2]), velocity=np.ones(3))
-    assert odom.mean == pytest.approx(se2.compose(TRUTH, [0.1, 0, 0.2]))
+    step = np.array([0.1, 0, 0.2])
+    with_odometry = predict_motion(noise, TRUTH, P, 0.1, odom=step, velocity=np.ones(3))
+    assert [c.name for c in with_odometry] == ["standing", "going on", "odometry", "any motion"]
+    assert sum(c.probability for c in with_odometry) == pytest.approx(1)
+    odom = expected_motion(with_odometry)
+    assert odom.probability > 0.95  # it is rarely wrong
+    assert odom.mean == pytest.approx(se2.compose(TRUTH, step))
     commanded = predict_motion(noise, TRUTH, P, 0.1, command=np.array([0.5, 0, 0]), velocity=np.ones(3))[1]
     assert commanded.name == "commanded"
     assert commanded.mean == pytest.approx(se2.compose(TRUTH, [0.05, 0, 0]))
@@ -227,7 +239,7 @@ def test_drift():
     def drifted(steps):
         pose, P, drift = TRUTH, np.zeros((3, 3)), None
         for step in steps:
-            moved = predict_motion(noise, pose, P, 0.1, odom=np.array(step), drift=drift)[0]
+            moved = expected_motion(predict_motion(noise, pose, P, 0.1, odom=np.array(step), drift=drift))
             pose, P, drift = moved.mean, moved.covariance, moved.drift
         return se2.rotation(-TRUTH[2]) @ P @ se2.rotation(-TRUTH[2]).T
 

@@ -37,6 +37,12 @@ def view(scene, pose):
     return View(RayCaster(HALL), Likelihood(), np.zeros(3), seen.angles, seen.ranges, seen.range_max)
 
 
+def match_near(made, pose, points):
+    """The match of ``points``, starting at ``pose`` (3,) in map."""
+    local = made.to_local(np.asarray(pose))
+    return made.match(local[None], points, MotionCandidate("any", local, STEP, 1.0))
+
+
 def local_map(scene, *poses, frame=(0.0, 0.0, 0.0)):
     """A local map whose frame lies at ``frame`` in map, with a key scan at each of the poses in map."""
     made = LocalMap(np.array(scene.scanner.mount), frame=np.array(frame))
@@ -58,7 +64,7 @@ def test_match_in_any_frame(offset, frame, seed):
     scene = Scene.of(ROOM, 361, seed)
     there = se2.compose(HERE, offset)
     made = local_map(scene, HERE, frame=frame)
-    match = made.match(HERE[None], view(scene, there).points, MotionCandidate("any", HERE, STEP, 1.0))
+    match = match_near(made, HERE, view(scene, there).points)
     assert match is not None
     assert not match.degenerate
     assert match.share > 0.7
@@ -73,7 +79,7 @@ def test_covariance_turns_with_the_frame():
     found = []
     for yaw in (0.0, 1.2):
         made = local_map(scene, HERE, frame=(1.0, 2.0, yaw))
-        match = made.match(HERE[None], points, MotionCandidate("any", HERE, STEP, 1.0))
+        match = match_near(made, HERE, points)
         found.append(made.candidate(match).covariance)
     assert found[0] == pytest.approx(found[1], rel=0.1, abs=3e-7)
 
@@ -82,21 +88,19 @@ def test_covariance_turns_with_the_frame():
 def test_scan_from_elsewhere(there):
     scene = Scene.of(HALL, 361, 1)
     made = local_map(scene, (3.0, 2.0, 0.0))
-    assert made.match(HERE[None], view(scene, there).points, MotionCandidate("any", HERE, STEP, 1.0)) is None
+    assert match_near(made, HERE, view(scene, there).points) is None
 
 
 def test_featureless_hall():
     bare = World(name="bare", boundary=[(0, 0), (60, 0), (60, 2), (0, 2)])
     scene, here = Scene.of(bare, 361, 1), np.array([30.0, 1.0, 0.0])
     made = local_map(scene, here)
-    assert made.match(here[None], view(scene, here).points, MotionCandidate("any", here, STEP, 1.0)) is None
+    assert match_near(made, here, view(scene, here).points) is None
 
 
 def test_too_few_points():
-    made = LocalMap(np.zeros(3))
-    any_motion = MotionCandidate("any", np.zeros(3), STEP, 1.0)
-    assert made.match(np.zeros((1, 3)), np.ones((100, 2)), any_motion) is None
-    assert local_map(Scene.of(ROOM, 361, 1), HERE).match(HERE[None], np.zeros((3, 2)), any_motion) is None
+    assert match_near(LocalMap(np.zeros(3)), np.zeros(3), np.ones((100, 2))) is None
+    assert match_near(local_map(Scene.of(ROOM, 361, 1), HERE), HERE, np.zeros((3, 2))) is None
 
 
 def changed(scan, beams, factor):
