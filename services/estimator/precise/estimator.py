@@ -167,11 +167,7 @@ class PreciseEstimator:
         match, explained = self._match_map(view, motions, period, with_odometry=odom is not None)
         # Local map
         if explained < self.settings.min_explained_share:
-            in_local_frame = replace(
-                self.modes[0], pose=self._local_pose, noise_covariance=np.zeros((3, 3)), drift=np.zeros((3, 3))
-            )
-            local = self._predict_motion(in_local_frame, period, odom, observation.command)
-            match = self._match_local_map(view, match, local)
+            match = self._match_local_map(view, match, self._predict_local_motion(period, odom, observation.command))
         if observation.time_increment and any(each.excess(match.poses[0]) == 0 for each in motions[0][:-1]):
             # Only if the match is one of the predicted motions: otherwise the robot may have been carried to another
             # place, and may have stood still during the scan.
@@ -263,6 +259,11 @@ class PreciseEstimator:
         return predict_motion(
             self.settings.motion, mode.pose, mode.noise_covariance, period, odom, command, mode.velocity, mode.drift
         )
+
+    def _predict_local_motion(self, period: float, odom: Array | None, command: Array | None) -> list[MotionCandidate]:
+        """Predicts the motions in the local frame, where the last pose is known far better than in the map."""
+        last = replace(self.modes[0], pose=self._local_pose, noise_covariance=np.zeros((3, 3)), drift=np.zeros((3, 3)))
+        return self._predict_motion(last, period, odom, command)
 
     def _match_map(
         self, view: View, motions: list[list[MotionCandidate]], period: float, *, with_odometry: bool
