@@ -63,7 +63,8 @@ def test_standby_controller(process, bus, heard):
 
     # When it runs again, the older instance becomes active, and the newer one ends.
     first.send(signal.SIGCONT)
-    assert second.wait(TIMEOUT_S) == 2
+    assert wait_until(lambda: not second.running, TIMEOUT_S), first.output + second.output
+    assert second.wait() == 2
     assert "was started before this one and is active, so this one ends" in second.output
     assert wait_until(lambda: list(bus.alive_instances().get("controller", [])) != [], TIMEOUT_S)
     wait_for_message(states, Status, lambda s: s.state == "reached", 120)
