@@ -24,13 +24,13 @@ from services.estimator.precise.hypotheses import (
     weigh,
 )
 from services.estimator.precise.likelihood import Likelihood
-from services.estimator.precise.local_map import ChangeRate, LocalMap, LocalMapScan, LocalScan
+from services.estimator.precise.local_map import ChangeRate, LocalMap, LocalMapScan, LocalScan, count_changes
 from services.estimator.precise.motion_model import (
     MotionCandidate,
     decouple,
     expected_motion,
     fuse,
-    limit_to_map,
+    limit_covariance,
     predict_motion,
     reachable_poses,
     widen_unobserved,
@@ -68,7 +68,7 @@ LOCAL_MISMATCH_PROBABILITY = 1e-6
 MAX_FIT_DROP = 20.0
 # Smaller errors of the map, divided by the scanner's noise, cannot be told from the noise of one scan (a guess).
 SIGNIFICANT_MAP_ERROR = 0.25
-# Of the beams at surfaces that the map lacks, at most this fraction ends at one of its surfaces by chance. The map
+# A beam at a surface that the map lacks ends at one of the map's by chance with at most this probability. The map
 # explained less than 5 to 9 % of the scan at nine of ten wrong poses in the buildings used for development.
 EXPLAINED_BY_CHANCE = 0.1
 UNKNOWN_SIGMA_M = 100.0  # published where the map is unknown
@@ -81,7 +81,8 @@ TARGET_BEAMS = 2000  # a scan with at least twice as many is thinned, because th
 class ScanMatch:
     """The poses at which a scan fits the map, near the predicted pose of each hypothesis."""
 
-    motions: list[list[MotionCandidate]]  # for each hypothesis, since the last scan; the last one is the widest
+    # For each hypothesis the ways it may have moved, the widest at the end; a single one if the local map shows it.
+    motions: list[list[MotionCandidate]]
     poses: Array  # (N, 3), one per hypothesis
     evidence: Evidence  # at these poses
     local_pose: Array | None = None  # (3,) in the local frame, if the motion comes from the local map
@@ -125,7 +126,7 @@ class PreciseEstimator:
         self._start: tuple[Array, Array] | None = None  # pose and covariance, until the first search
         if pose is not None:
             self._start = start_belief(pose, START_COVARIANCE if covariance is None else covariance)
-        self._was_tracking = False
+        self._has_tracked = False
         self._unknown_place = UnknownPlace()
         self._local_map = LocalMap(self.mount)
         self._change_rate = ChangeRate()
@@ -135,13 +136,13 @@ class PreciseEstimator:
         # The last scan
         self._stamp: float | None = None
         self._odom: Array | None = None
-        self._last_log_fit = 0.0  # nats, see `_log_fit`
+        self._last_log_fit = 0.0  # nats, see `_log_fit`; at the best hypothesis before the scan was weighed
         self._last: LocalScan | None = None
 
         # The present scan
         self._scan: tuple[View, Observation] | None = None
         self._local_pose = np.zeros(3)  # in the frame of the local map
-        self._old_beams = np.zeros(0, np.bool_)  # (B,) no new evidence, as their surfaces were seen before
+        self._ignored_beams = np.zeros(0, np.bool_)  # (B,) no evidence, see `LocalMapScan.ignored`
         self._log_change = 0.0  # nats, log probability of the changes since the last scan
 
     def use_model(self, model: GenerativeModel, seeds: Seeds) -> None:
@@ -164,9 +165,9 @@ class PreciseEstimator:
         period, odom = self._period(observation.stamp), self._odometry_since_last_scan(observation)
         motions = [self._predict_motion(mode, period, odom, observation.command) for mode in self.modes]
         # Optimisation
-        match, explained = self._match_map(view, motions, period, with_odometry=odom is not None)
+        match = self._match_map(view, motions, period, with_odometry=odom is not None)
         # Local map
-        if explained < self.settings.min_explained_share:
+        if view.surface_evidence(match.poses).explained[0] < self.settings.min_explained_share:
             match = self._match_local_map(view, match, self._predict_local_motion(period, odom, observation.command))
         if observation.time_increment and any(each.excess(match.poses[0]) == 0 for each in motions[0][:-1]):
             # Only if the match is one of the predicted motions: otherwise the robot may have been carried to another
@@ -205,7 +206,10 @@ class PreciseEstimator:
         return self._finish_scan(view, observation)
 
     def predict(self, poses: Array, angles: Array) -> Predicted:
-        """Predicts scans (see PoseEstimator); sigma combines the scanner's noise and the error the model states."""
+        """Predicts scans (see PoseEstimator).
+
+        Sigma combines the configured noise of the scanner and the error that the model states, not what was learned.
+        """
         expected = self.model.expect(se2.compose(poses, self.mount), angles)
         return self._predicted(expected.moved_back(self._precision.offset))
 
@@ -267,11 +271,10 @@ class PreciseEstimator:
 
     def _match_map(
         self, view: View, motions: list[list[MotionCandidate]], period: float, *, with_odometry: bool
-    ) -> tuple[ScanMatch, float]:
+    ) -> ScanMatch:
         """Matches the scan to the map near the predicted pose of each hypothesis.
 
-        If the map predicts it much worse than the last scan, searches a wider area. Also returns the fraction of the
-        beams that the map explains at the first pose.
+        If the map predicts it much worse than the last scan, searches a wider area.
         """
         widest = _prior_of([each[-1] for each in motions])
         predicted = np.array([expected_motion(each).mean for each in motions])
@@ -284,14 +287,14 @@ class PreciseEstimator:
             before, after = view.surface_evidence(np.stack([poses[0], wider_poses[0]])).log_likelihood
             if after > before:
                 poses, evidence = wider_poses, wider_evidence
-        return ScanMatch(motions, poses, evidence), float(view.surface_evidence(poses).explained[0])
+        return ScanMatch(motions, poses, evidence)
 
     def _match_local_map(self, view: View, match: ScanMatch, motions: list[MotionCandidate]) -> ScanMatch:
         """Matches the scan to the map again, near the motion that scan matching to the local map gives.
 
-        ``motions`` are the predicted ones in the local frame. The pose in the map does not matter there: it may just
-        have been corrected, or be wrong. Returns ``match`` unchanged if the local map gives no motion, or if the scan
-        fits the map far better there.
+        ``motions`` are predicted in the local frame, so that an error of the pose in the map does not bias them; the
+        pose that fits the map is only a further start. Returns ``match`` unchanged if the local map gives no motion, or
+        if the scan fits the map far better there.
         """
         starts = np.array([*(each.mean for each in motions), self._local_map.to_local(match.poses[0])])
         found = self._local_map.match(starts, view.points, motions[-1])
@@ -340,24 +343,28 @@ class PreciseEstimator:
         unobserved = self._remove_unobserved(view, mode, pose, evidence, k)
         # Where the map explains few beams, all of them may do so by chance, which is no information about the pose.
         evidence.scale(k, _fraction_not_by_chance(explained))
-        # A match with the local map is the only candidate, and gives the motion in the unobserved directions, too.
-        unknown_motion = len(unobserved) > 0 and len(candidates) > 1
+        # A match with the local map gives the motion in the unobserved directions, too.
+        unknown_motion = len(unobserved) > 0 and match.local_pose is None
         if unknown_motion and self._odometry_since_last_scan(observation) is None:
-            *candidates, widest = (
+            candidates = [
                 widen_unobserved(self.settings.motion, each, unobserved, mode.unobserved_scans, period)
-                for each in (*candidates, widest)
-            )
+                for each in candidates
+            ]
+            widest = candidates[-1]
         fused = [
             fuse(
-                limit_to_map(decouple(each, unobserved), self.seeds.spread), pose, evidence.xi[k], evidence.curvature[k]
+                limit_covariance(decouple(each, unobserved), self.seeds.spread),
+                pose,
+                evidence.xi[k],
+                evidence.curvature[k],
             )
             for each in candidates
         ]
-        best = min(fused, key=lambda each: each.surprise)
+        best = min(fused, key=lambda each: each.negative_log_evidence)
         updated = update_mode(mode, best, evidence, k, period, unobserved=unknown_motion)
         if observation.stamp is not None and self._stamp is not None and observation.stamp < self._stamp:
             return updated
-        return replace(updated, log_evidence=mode.log_evidence - widest.excess(best.mean))
+        return replace(updated, log_evidence=updated.log_evidence - widest.excess(best.mean))
 
     def _remove_unobserved(self, view: View, mode: Mode, pose: Array, evidence: Evidence, k: int) -> Array:
         """Returns the unit vectors (K, 3) of x, y, yaw that a scan at ``pose`` (3,) does not observe.
@@ -390,8 +397,8 @@ class PreciseEstimator:
         """Other hypotheses within the motion prior that fit the scan, if it made the ``best`` one far more certain.
 
         The pose was uncertain before this scan, and a descent from one pose finds only the nearest match. An
-        alternative loses evidence if its motion is less probable than that of the best match; it never gains any. As in
-        `_fuse`, one of which the robot is hardly capable, according to the ``widest`` candidate, counts against it.
+        alternative loses evidence if its motion is less probable than that of the best match; it never gains any. So
+        does a motion of which the robot is hardly capable, according to the ``widest`` candidate.
         """
         before = self.modes[0]
         doubt = 1 - self._probability_of_being_near(before)
@@ -419,21 +426,21 @@ class PreciseEstimator:
         poses = np.array([mode.pose for mode in modes])
         states = view.surface_evidence(poses)
         self._last_log_fit = _log_fit(view, states)
-        seen, appeared = self._local_map.find_old_beams(local, view, states.weights[0] > 0.5)
+        seen, appeared = self._local_map.find_seen_and_appeared(local, view, states.weights[0] > 0.5)
         small = view.surfaces.small
-        old = seen | appeared | small
+        ignored = seen | appeared | small
 
         # Changes are equally probable at all hypotheses. If there are suddenly more of them, a search is due soon.
-        log_count = 0.0
+        log_probability = 0.0  # of the number of changes
         if self._last:
-            changes = self._local_map.count_changes(self._last, LocalScan(local, view))
-            log_count = self._change_rate.log_probability(changes, period)
+            changes = count_changes(self._last, LocalScan(local, view))
+            log_probability = self._change_rate.log_probability(changes, period)
             self._change_rate.learn(changes, period)
-        log_change = log_count + _log_unmapped(view, ~appeared | seen | small)
-        if log_count < np.log(SUDDEN_CHANGE_PROBABILITY):
+        log_change = log_probability + _log_unmapped_surfaces(view, ~appeared | small)
+        if log_probability < np.log(SUDDEN_CHANGE_PROBABILITY):
             self._search_interval = 1
 
-        present, surroundings = _log_at_poses(view, poses, old, np.array([mode.surroundings for mode in modes]))
+        present, surroundings = _log_at_poses(view, poses, ignored, np.array([mode.surroundings for mode in modes]))
         modes = [
             replace(
                 mode,
@@ -443,15 +450,19 @@ class PreciseEstimator:
             )
             for k, mode in enumerate(modes)
         ]
-        self._local_pose, self._old_beams, self._log_change = local, old, log_change
+        self._local_pose, self._ignored_beams, self._log_change = local, ignored, log_change
 
-        kidnapping = max(mode.log_evidence for mode in self.modes) + float(np.log(self.settings.unknown_probability))
-        self._unknown_place.allow_kidnapping(kidnapping, self.settings.unmapped_share)
+        log_kidnapping = max(mode.log_evidence for mode in self.modes) + float(
+            np.log(self.settings.unknown_probability)
+        )
+        self._unknown_place.allow_kidnapping(log_kidnapping, self.settings.unmapped_share)
         # Alternatives found for this scan come last in `modes`, and have no counterpart in `self.modes`.
         pairs = zip(self.modes, modes, strict=False)
         self._unknown_place.allow_mismatch(max(self._log_mismatch(before, after) for before, after in pairs))
         # Either the surroundings have changed, or the robot was carried to another place and all surfaces are new.
-        self._unknown_place.present = max(_log_unmapped(view, old) + log_change, _log_unmapped(view, small))
+        self._unknown_place.present = max(
+            _log_unmapped_surfaces(view, ignored) + log_change, _log_unmapped_surfaces(view, small)
+        )
         self._set_hypotheses(modes)
         if not np.array_equal(self.modes[0].pose, modes[0].pose):  # another hypothesis is best now
             self._local_map.place(local, self.modes[0].pose)
@@ -482,7 +493,7 @@ class PreciseEstimator:
             self._precision.learn_changes(view, best.pose)
             self._precision.learn_map_error(view, best.pose)
         self._unknown_place.add_key_scan()
-        key = LocalMapScan(self._local_pose, view, self._old_beams, mapped, self._log_change, log_unknown)
+        key = LocalMapScan(self._local_pose, view, self._ignored_beams, mapped, self._log_change, log_unknown)
         self._local_map.add(key, best.pose, best.noise_covariance)
         self.modes = [
             replace(mode, log_evidence=mode.log_weight, present=0.0, surroundings=mode.present_surroundings)
@@ -546,18 +557,19 @@ class PreciseEstimator:
         if self._precision.scans:  # the map's errors were learned in one room, but the robot may be in another
             view = replace(view, map_error=max(view.map_error, self._precision.map_error_elsewhere))
         found = search_everywhere(view, self.seeds, self.settings)
-        log_unmapped = _log_reference(view, view.surfaces.small) + _log_unmapped(view, view.surfaces.small)
-        return [mode for mode in found if mode.present > log_unmapped + 1] or found[:1]
+        small = view.surfaces.small
+        log_at_unknown_place = _log_reference(view, small) + _log_unmapped_surfaces(view, small)
+        return [mode for mode in found if mode.present > log_at_unknown_place + 1] or found[:1]
 
     def _start_with(self, view: View, found: list[Mode], unknown: float, all_changed: float = 0.0) -> bool:
         """Starts with the hypotheses ``found``, and the probability ``unknown`` that the robot is at none.
 
-        With the probability ``all_changed``, no surface is as the map shows it. Returns whether the best hypothesis is
-        more probable than that.
+        With the probability ``all_changed``, no surface is as the map shows it. Returns whether the scan fits the best
+        hypothesis better than that.
         """
         self._restart_local_map(view)
         self._unknown_place.restart(unknown, self.settings.unmapped_share)
-        reference = _log_reference(view, self._old_beams)
+        reference = _log_reference(view, self._ignored_beams)
         log_all_changed = self._unknown_place.present + float(np.log(all_changed)) if all_changed else -np.inf
         self._set_hypotheses([replace(mode, present=max(mode.present - reference, log_all_changed)) for mode in found])
         return found[0].present - reference > log_all_changed
@@ -565,8 +577,8 @@ class PreciseEstimator:
     def _restart_local_map(self, view: View) -> None:
         """Starts a new local map at the present scan."""
         self._local_map.clear()
-        self._local_pose, self._old_beams, self._log_change = np.zeros(3), view.surfaces.small, 0.0
-        self._unknown_place.present = _log_unmapped(view, self._old_beams)
+        self._local_pose, self._ignored_beams, self._log_change = np.zeros(3), view.surfaces.small, 0.0
+        self._unknown_place.present = _log_unmapped_surfaces(view, self._ignored_beams)
 
     def _add_hypotheses(self, found: list[Mode], view: View) -> None:
         """Adds hypotheses: the robot may have been there since one of the key scans, or was carried there just now."""
@@ -590,7 +602,7 @@ class PreciseEstimator:
         self._add_key_scan(view)
 
     def _log_stayed(self, found: list[Mode], view: View) -> tuple[Array, Array]:
-        """Evidence (N,) in nats that the robot has been at each of the hypotheses since some key scan, the best one.
+        """Evidence (N,) in nats that the robot has been at each hypothesis since the key scan for which it is largest.
 
         Also returns the probabilities (N, 3) of the surroundings of the present scan in that case.
         """
@@ -602,9 +614,9 @@ class PreciseEstimator:
             stayed = np.vstack([stayed, np.full(len(found), key.log_unknown)])
             surroundings = np.vstack([surroundings, first])
             at_key = se2.compose(poses, se2.between(self._local_pose, key.pose))
-            gain, surroundings = _log_at_poses(key.view, at_key, key.seen, surroundings)
+            gain, surroundings = _log_at_poses(key.view, at_key, key.ignored, surroundings)
             stayed += gain + key.log_change
-        gain, surroundings = _log_at_poses(view, poses, self._old_beams, surroundings)
+        gain, surroundings = _log_at_poses(view, poses, self._ignored_beams, surroundings)
         stayed += gain + self._log_change
         best, each = stayed.argmax(axis=0), np.arange(len(found))
         return stayed[best, each], surroundings[best, each]
@@ -625,7 +637,7 @@ class PreciseEstimator:
             self._predicted(view.expected(poses[0])) if same_beams else self.predict(poses[0][None], observation.angles)
         )
         posterior = self._posterior(view, poses, predicted, self._probability())
-        self._was_tracking |= posterior.state == "tracking"
+        self._has_tracked |= posterior.state == "tracking"
         return posterior
 
     def _predicted(self, expected: Expected) -> Predicted:
@@ -674,7 +686,7 @@ class PreciseEstimator:
             tracked_alone = known * self._probability_of_being_near(self.modes[0]) >= self.settings.tracking_probability
             if tracked_alone or self.modes[1].weight * known > self.settings.ambiguous_weight:
                 return "ambiguous"
-        return "lost" if self._was_tracking else "localising"
+        return "lost" if self._has_tracked else "localising"
 
 
 def _fraction_not_by_chance(explained: float) -> float:
@@ -699,7 +711,7 @@ def _log_fit(view: View, states: SurfaceEvidence) -> float:
     return float(states.log_likelihood[0] - view.surfaces.known_log_density.sum())
 
 
-def _log_unmapped(view: View, skip: npt.NDArray[np.bool_]) -> float:
+def _log_unmapped_surfaces(view: View, skip: npt.NDArray[np.bool_]) -> float:
     """Log likelihood in nats, minus `_log_reference`, if the map shows none of the surfaces."""
     return float((view.surfaces.log_density - view.surfaces.known_log_density)[~skip].sum())
 
@@ -712,7 +724,7 @@ def _log_at_poses(view: View, poses: Array, skip: npt.NDArray[np.bool_], surroun
     previous key scan. Also returns those at this scan.
     """
     mapped = view.surface_evidence(poses, skip=skip).log_likelihood - _log_reference(view, skip)
-    unmapped = np.full_like(mapped, _log_unmapped(view, skip))
+    unmapped = np.full_like(mapped, _log_unmapped_surfaces(view, skip))
     with np.errstate(divide="ignore"):
         logs = np.log(surroundings @ NEXT_SURROUNDINGS) + np.stack([mapped, unmapped, unmapped], axis=-1)
     total = np.logaddexp.reduce(logs, axis=-1)

@@ -47,13 +47,15 @@ class Mode:
     curvature: Array  # (3, 3) Gauss-Newton Hessian of accuracy
     explained: float = 0.0  # fraction of the last scan's beams that end at surfaces of the map
     log_evidence: float = 0.0  # nats, of the key scans and the prior; unnormalised
-    present: float = 0.0  # nats, log likelihood of the present scan
+    # nats, log likelihood of the present scan; relative to that of known surfaces once the estimator has adopted it
+    present: float = 0.0
     surroundings: Array = field(default_factory=lambda: FIRST_SURROUNDINGS)  # (3,) probabilities at the last key scan
     present_surroundings: Array = field(default_factory=lambda: FIRST_SURROUNDINGS)  # (3,) at the present scan
     velocity: Array | None = None  # (3,) in base_link; None while unknown
     drift: Array = field(default_factory=lambda: np.zeros((3, 3)))  # covariance of the pose with the drift
     weight: float = 1.0
-    unobserved_scans: int = 0  # number of consecutive scans without information along some direction
+    # number of consecutive scans at which neither the map nor the local map showed the motion along some direction
+    unobserved_scans: int = 0
 
     @property
     def log_weight(self) -> float:
@@ -70,17 +72,20 @@ class UnknownPlace:
     """The hypothesis that the robot is at none of the other ones; evidence in nats, unnormalised as for a `Mode`."""
 
     log_evidence: float = 0.0  # of the key scans and the prior
-    log_unmapped: float = 0.0  # the same for places that are not on the map, which remain after a search of all of it
+    log_off_map: float = 0.0  # the same for places that are not on the map, which remain after a search of all of it
     present: float = 0.0  # log likelihood of the present scan
     weight: float = 1.0  # probability
 
     def restart(self, probability: float, unmapped: float) -> None:
-        """Sets the ``probability`` that the robot is at no hypothesis; ``unmapped`` is that it is off the map then."""
-        self.log_evidence = self.log_unmapped = float(np.log(probability * unmapped))
+        """Starts with the ``probability`` that the robot is at no hypothesis, of which ``unmapped`` is off the map.
+
+        Only that part remains: a search has made hypotheses of the places on the map.
+        """
+        self.log_evidence = self.log_off_map = float(np.log(probability * unmapped))
 
     def allow_kidnapping(self, log_probability: float, unmapped: float) -> None:
         """Allows for a kidnapping; with probability ``unmapped`` it was to a place that is not on the map."""
-        self.log_unmapped = max(self.log_unmapped, log_probability + float(np.log(unmapped)))
+        self.log_off_map = max(self.log_off_map, log_probability + float(np.log(unmapped)))
         self.log_evidence = max(self.log_evidence, log_probability)
 
     def allow_mismatch(self, log_probability: float) -> None:
@@ -90,12 +95,12 @@ class UnknownPlace:
     def add_key_scan(self) -> None:
         """Adds the evidence of the present scan, which becomes a key scan."""
         self.log_evidence += self.present
-        self.log_unmapped += self.present
+        self.log_off_map += self.present
         self.present = 0.0
 
     def exclude_mapped_places(self) -> None:
         """Removes the places on the map, after a search of the whole map has made hypotheses of them."""
-        self.log_evidence = self.log_unmapped
+        self.log_evidence = self.log_off_map
 
 
 def principal_directions(curvature: Array) -> tuple[Array, float]:
@@ -171,7 +176,8 @@ def update_mode(mode: Mode, fused: FusedMotion, evidence: Evidence, k: int, peri
 
     The scan's information reduces the noise covariance. The model's errors are alike from scan to scan, so their
     standard deviations are averaged instead of their variances, weighted by each scan's information. ``unobserved`` is
-    true if the scan has no information along some direction. The scan corrects the pose, but not the drift.
+    true if neither the scan nor the local map shows the motion along some direction. The scan corrects the pose, but
+    not the drift.
     """
     inverse = np.linalg.inv(fused.information)
     prior_information = fused.information - evidence.curvature[k]

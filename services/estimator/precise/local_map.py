@@ -28,20 +28,20 @@ NEIGHBOURS, NEIGHBOUR_RADIUS_M = 10, 0.3  # points from which the normal of a su
 PARTNER_RADII_M = (0.6, 0.6, 0.4, 0.4, 0.2, 0.2, 0.1, 0.1, 0.1, 0.1)
 CAUCHY_SCALE_M = 0.02  # of the Cauchy weight of a point by its distance from the line
 MATCHED_RADIUS_M = 0.08  # a point is matched if it is this near to one of the local map
-# A point is on a surface seen before if it is this near to a point of the local map (far away, neighbouring beams are
-# so far apart), and this near to the line through it, with three standard deviations of the noise added in quadrature.
-# A wider tolerance across surfaces takes much of another room for this one. Through a point with too few neighbours
-# there is no line, and the first distance alone counts.
-SEEN_RADIUS_M, SEEN_ACROSS_M = 0.15, 0.05
+# A point is on a surface seen before if it is near a point of the local map, as far away neighbouring beams are apart,
+SEEN_RADIUS_M = 0.15
+# and near the line through it, if it has enough neighbours for a line. Three standard deviations of the noise are added
+# in quadrature. A wider tolerance takes much of another room for this one.
+SEEN_ACROSS_M = 0.05
 MIN_POINTS = 20  # of a scan that must have a partner in the local map
 MAX_SQUARED_DISTANCE = 4.0  # squared standard deviations of the result from the prior
 CHANGE_MEMORY_S = 30.0  # after which a change of the surroundings counts by 1 / e (a guess)
-PASSED_M = 0.3  # behind a surface, from where a beam counts as having passed through it
+PASSED_M = 0.3  # a beam that is longer by this than the distance to a surface has passed through it
 MIN_MATCHED_FRACTION = 0.5  # of a scan's points, else there is no match
 CLEAR_MATCHED_FRACTION = 0.8  # if fewer match, matching is repeated from `EXTRA_HEADINGS_RAD`
 EXTRA_HEADINGS_RAD = np.array([-0.3, -0.15, 0.15, 0.3])
 DRIFT_PER_SCAN = np.array([0.02, 0.02, 0.005])  # m, m, rad: standard deviation that each key scan contributes
-MIN_INFORMATION_RATIO = 0.02  # a direction is unobserved if its information, divided by that across it, is less
+MIN_MATCH_INFORMATION_RATIO = 0.02  # a direction is unobserved if its information, divided by that across it, is less
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Match:
 
     pose: Array  # (3,) base_link in the local frame
     covariance: Array  # (3, 3) of x, y, yaw, relative to the key scans
-    share: float  # fraction of the scan's points that match
+    matched_fraction: float  # of the scan's points
     score: float  # mean weight of the scan's points, higher for closer matches
     degenerate: bool  # the points have almost no information along some direction
 
@@ -62,12 +62,19 @@ class LocalScan:
     pose: Array  # (3,) base_link in the local frame
     view: View
 
+    @property
+    def points(self) -> Array:
+        """End points (K, 2) of the beams that returned, m in the local frame."""
+        return se2.transform(se2.compose(self.pose, self.view.mount), self.view.points)
+
 
 @dataclass(frozen=True)
 class LocalMapScan(LocalScan):
     """A key scan of the local map."""
 
-    seen: npt.NDArray[np.bool_]  # (B,) beams that are no new evidence, as they end at surfaces seen before
+    # (B,) beams that are no evidence: they end at surfaces seen before, at ones that have just appeared (which count as
+    # a change), or at ones with fewer than MIN_BEAMS beams
+    ignored: npt.NDArray[np.bool_]
     mapped: npt.NDArray[np.bool_]  # (B,) beams that end at surfaces of the map
     log_change: float  # nats, log probability of what had changed since the scan before
     log_unknown: float  # nats, evidence before this scan that the robot is at none of the hypotheses
@@ -78,8 +85,8 @@ class ChangeRate:
     """Rate at which surfaces in view vanish or appear, learned while driving.
 
     The rate has a gamma distribution, so the number of changes in a given time has a negative binomial distribution.
-    The shape is Jeffreys' 0.5 plus the remembered changes. The duration is always `CHANGE_MEMORY_S`, at first for an
-    assumed time without a change, later for the time remembered. Periods must be much shorter than that.
+    Its shape is Jeffreys' 0.5 plus the remembered changes, its rate parameter always `CHANGE_MEMORY_S`, as if there had
+    been that long a time without a change before the first scan. Periods must be much shorter.
     """
 
     remembered: float = 0.0  # changes, forgotten exponentially
@@ -108,7 +115,8 @@ class LocalMap:
     mount: Array  # (3,) laser in base_link
     scans: deque[LocalMapScan] = field(default_factory=lambda: deque(maxlen=MAX_SCANS))
     frame: Array = field(default_factory=lambda: np.zeros(3))  # (3,) local frame in map
-    covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))  # of the pose at the last key scan
+    # (3, 3) of the pose in map at the last key scan, with the drift that this scan contributes
+    covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
     _tree: cKDTree | None = None
     _unmapped: cKDTree | None = None  # of the points that are not on surfaces of the map
     _points: Array = field(default_factory=lambda: np.zeros((0, 2)))
@@ -138,20 +146,20 @@ class LocalMap:
         self.covariance = covariance + np.diag(DRIFT_PER_SCAN**2)
         self._tree = self._unmapped = None
 
-    def find_old_beams(
+    def find_seen_and_appeared(
         self, local: Array, view: View, mapped: npt.NDArray[np.bool_]
     ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-        """Masks (B,) of the beams of a scan at ``local`` (3,) that are no new evidence.
+        """Masks (B,) of two kinds of beams of a scan at ``local`` (3,).
 
         - Seen before: they end at surfaces of the key scans. Beams without return also count as seen once there are key
-          scans. A beam that does not end at a surface of the map (``mapped`` (B,) is false) must be near such a beam of
-          a key scan, because one near a surface of the map is on another surface.
+          scans. A beam that does not end at a surface of the map (``mapped`` (B,) is false) only counts as seen near a
+          point of a key scan that does not either.
         - Appeared: they end where a key scan saw free space, so the surface came since then, wherever the robot is.
         """
         seen, appeared = np.zeros(len(view.ranges), np.bool_), np.zeros(len(view.ranges), np.bool_)
         if not self.scans or not len(self._tree_of_points().data):
             return seen, appeared
-        placed = se2.transform(se2.compose(local, self.mount), view.points)
+        placed = LocalScan(local, view).points
         noise = view.likelihood.deviation(view.ranges[view.returned])
         near = self._is_on_surface(placed, np.hypot(SEEN_ACROSS_M, 3 * noise))
         free = np.zeros(len(near), np.bool_)
@@ -164,8 +172,8 @@ class LocalMap:
         seen[view.returned] = near
         return seen, appeared
 
-    def _is_on_surface(self, points: Array, tolerance: Array | float) -> npt.NDArray[np.bool_]:
-        """Mask (K,) of local points (K, 2) in m within ``tolerance`` m of the line through a point of a key scan."""
+    def _is_on_surface(self, points: Array, tolerance: Array) -> npt.NDArray[np.bool_]:
+        """Mask (K,) of local points (K, 2) m within ``tolerance`` (K,) m of the line through a point of a key scan."""
         normals = self._normals_of_points()
         distance, nearest = self._tree_of_points().query(points, distance_upper_bound=SEEN_RADIUS_M)
         near = np.isfinite(distance)
@@ -178,22 +186,8 @@ class LocalMap:
         """Mask (K,) of local points (K, 2) in m that a beam of a key scan passed."""
         free = np.zeros(len(points), np.bool_)
         for key in self.scans if len(points) else ():
-            ranges, beam, inside = _beams_towards(key.view, se2.compose(key.pose, self.mount), points)
-            free |= inside & (key.view.nearest_of_neighbours[beam] > ranges + SEEN_RADIUS_M)
+            free |= _passed(key, points, SEEN_RADIUS_M)
         return free
-
-    def count_changes(self, last: LocalScan, now: LocalScan) -> int:
-        """Number of surfaces of which most beams vanished or appeared between two scans."""
-        return self._count_passed(last, now) + self._count_passed(now, last)
-
-    def _count_passed(self, seen: LocalScan, by: LocalScan) -> int:
-        """Number of surfaces in the scan ``seen``, through most of whose points beams of the scan ``by`` pass."""
-        points = se2.transform(se2.compose(seen.pose, self.mount), seen.view.points)
-        ranges, beam, inside = _beams_towards(by.view, se2.compose(by.pose, self.mount), points)
-        passed = inside & (by.view.nearest_of_neighbours[beam] > ranges + PASSED_M)
-        surface = np.cumsum(seen.view.surfaces.starts)[seen.view.returned]
-        beams, passed_beams = np.bincount(surface), np.bincount(surface, passed)
-        return int(((passed_beams >= MIN_BEAMS) & (passed_beams > 0.5 * beams)).sum())
 
     def match(self, starts: Array, points: Array, prior: MotionCandidate) -> Match | None:
         """Returns the pose at which a scan matches the key scans, or None if no pose matches.
@@ -203,19 +197,19 @@ class LocalMap:
         if not self.scans or len(points) < MIN_POINTS:
             return None
         found = self._best_match(starts, points, prior)
-        if found is None or found.share < CLEAR_MATCHED_FRACTION:
+        if found is None or found.matched_fraction < CLEAR_MATCHED_FRACTION:
             turned = np.repeat(starts[:1], len(EXTRA_HEADINGS_RAD), axis=0)
             turned[:, 2] = se2.wrap(turned[:, 2] + EXTRA_HEADINGS_RAD)
             again = self._best_match(turned, points, prior)
             if again is not None and (found is None or again.score > found.score):
                 found = again
-        return None if found is None or found.share < MIN_MATCHED_FRACTION or found.degenerate else found
+        return None if found is None or found.matched_fraction < MIN_MATCHED_FRACTION or found.degenerate else found
 
     def candidate(self, match: Match) -> MotionCandidate:
         """The pose in map that a match gives."""
         turn = se2.rotation(float(self.frame[2]))
         covariance = self.covariance + turn @ match.covariance @ turn.T
-        return MotionCandidate("recent scans", se2.compose(self.frame, match.pose), covariance, 1.0)
+        return MotionCandidate(se2.compose(self.frame, match.pose), covariance, 1.0)
 
     def _best_match(self, starts: Array, points: Array, prior: MotionCandidate) -> Match | None:
         information = np.asarray(np.linalg.inv(prior.covariance), float)
@@ -228,19 +222,16 @@ class LocalMap:
     def _tree_of_points(self) -> cKDTree:
         """Index of the points of all scans; kept until the scans change."""
         if self._tree is None:
-            placed = [se2.transform(se2.compose(each.pose, self.mount), each.view.points) for each in self.scans]
-            self._points, self._normals = _average_in_cells(np.concatenate(placed)), None
+            self._points = _average_in_cells(np.concatenate([each.points for each in self.scans]))
+            self._normals = None
             self._tree = cKDTree(self._points)
         return self._tree
 
     def _tree_of_unmapped_points(self) -> cKDTree:
         """Index of the points of all scans that are not on surfaces of the map; kept until the scans change."""
         if self._unmapped is None:
-            placed = [
-                se2.transform(se2.compose(each.pose, self.mount), each.view.points[~each.mapped[each.view.returned]])
-                for each in self.scans
-            ]
-            self._unmapped = cKDTree(np.concatenate(placed))
+            unmapped = [each.points[~each.mapped[each.view.returned]] for each in self.scans]
+            self._unmapped = cKDTree(np.concatenate(unmapped))
         return self._unmapped
 
     def _normals_of_points(self) -> Array:
@@ -262,7 +253,7 @@ class LocalMap:
         Returns None if too few points have a partner.
         """
         tree, normals = self._tree_of_points(), self._normals_of_points()
-        pose, H = np.array(start), np.eye(3)
+        pose = np.array(start)
         for radius in PARTNER_RADII_M:
             placed = se2.transform(se2.compose(pose, self.mount), points)
             distance, partner = tree.query(placed, distance_upper_bound=radius)
@@ -290,6 +281,19 @@ class LocalMap:
         return Match(pose, covariance, float((distance < MATCHED_RADIUS_M).mean()), float(score), _is_degenerate(H))
 
 
+def count_changes(last: LocalScan, now: LocalScan) -> int:
+    """Number of surfaces of which most beams vanished or appeared between two scans."""
+    return _count_passed(last, now) + _count_passed(now, last)
+
+
+def _count_passed(seen: LocalScan, by: LocalScan) -> int:
+    """Number of surfaces in the scan ``seen`` of which more than half of the points are passed by beams of ``by``."""
+    passed = _passed(by, seen.points, PASSED_M)
+    surface = np.cumsum(seen.view.surfaces.starts)[seen.view.returned]
+    beams, passed_beams = np.bincount(surface), np.bincount(surface, passed)
+    return int(((passed_beams >= MIN_BEAMS) & (passed_beams > 0.5 * beams)).sum())
+
+
 def is_key_pose(last: Array, pose: Array) -> bool:
     """Whether ``pose`` (3,) is so far from that of the ``last`` (3,) key scan that a key scan is due there."""
     motion = se2.between(last, pose)
@@ -309,7 +313,13 @@ def _average_in_cells(points: Array) -> Array:
 
 def _is_degenerate(H: Array) -> bool:
     low, high = np.linalg.eigvalsh(position_information(H))
-    return bool(low < MIN_INFORMATION_RATIO * high)
+    return bool(low < MIN_MATCH_INFORMATION_RATIO * high)
+
+
+def _passed(scan: LocalScan, points: Array, distance: float) -> npt.NDArray[np.bool_]:
+    """Mask (K,) of the local points (K, 2) m that beams of the scan pass by more than ``distance`` m."""
+    ranges, beam, inside = _beams_towards(scan.view, se2.compose(scan.pose, scan.view.mount), points)
+    return np.asarray(inside & (scan.view.nearest_of_neighbours[beam] > ranges + distance))
 
 
 def _beams_towards(

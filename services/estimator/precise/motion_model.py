@@ -4,8 +4,8 @@ The prior is a mixture of motions, here called candidates:
 
 - With odometry: dead reckoning with its noise.
 - Without odometry, and with a small probability also with it, as wheels spin or are blocked: the robot stands still, or
-  it keeps its velocity (or follows the velocity command), within the limits of its acceleration.
-- Always, with a small probability: any motion the robot is capable of.
+  it keeps its velocity (or follows the velocity command), but for its acceleration.
+- Always, with a small probability: any motion, with that at full speed as its standard deviation.
 
 The evidence of the scan selects the candidate. So the scans of a standing robot are averaged, and the belief of a
 moving robot does not lag.
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 
 SMOOTHING_TIME_S = 1 / 15  # the velocity is averaged over at least this time, however high the scan rate is
-MAX_MOTION_SIGMAS = 3.0  # standard deviations (a common bound): faster motion is not attributed to the robot
-MAX_EXTRA_STEP = 5 * MAX_STEP  # m, m, rad beyond that: the reach of the last steps of a descent
+MAX_MOTION_SIGMAS = 3.0  # standard deviations (a common bound): motion beyond is hardly attributed to the robot
+MAX_EXTRA_STEP = 5 * MAX_STEP  # m, m, rad beyond `MAX_MOTION_SIGMAS`: the reach of the last steps of a descent
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,6 @@ class MotionNoise:
 class MotionCandidate:
     """One way the robot may have moved, as a Gaussian over its present pose."""
 
-    name: str
     mean: Array  # (3,)
     covariance: Array  # (3, 3) in map
     probability: float
@@ -70,7 +69,7 @@ class MotionCandidate:
         return float(off @ np.linalg.solve(self.covariance, off))
 
     def excess(self, pose: Array) -> float:
-        """Nats by which ``pose`` (3,), d standard deviations off, is less probable than 3 off: half (d² - 9), or 0."""
+        """Returns max(0, (d² - 9) / 2) nats, where d is the Mahalanobis distance of ``pose`` (3,) from the mean."""
         return 0.5 * max(0.0, self.squared_distance(pose) - MAX_MOTION_SIGMAS**2)
 
 
@@ -90,34 +89,34 @@ def predict_motion(
     in base_link. ``command`` and ``velocity`` (3,) are in m/s, m/s, rad/s in base_link; without odometry a command
     takes precedence over the velocity.
     """
-    max_motion = np.array([noise.speed, noise.speed, noise.turn]) * period
-    before = MotionCandidate("before", pose, covariance, 1.0, np.zeros((3, 3)) if drift is None else drift)
-    found = [_propagate("standing", before, np.zeros(3), np.full(3, noise.standing))]
-    limits = np.array([noise.acceleration, noise.acceleration, noise.turn_acceleration])
-    change = limits * period * max(period, SMOOTHING_TIME_S)
+    full_speed = np.array([noise.speed, noise.speed, noise.turn]) * period
+    before = MotionCandidate(pose, covariance, 1.0, np.zeros((3, 3)) if drift is None else drift)
+    found = [_propagate(before, np.zeros(3), np.full(3, noise.standing))]  # standing still
+    acceleration = np.array([noise.acceleration, noise.acceleration, noise.turn_acceleration])
+    change = acceleration * period * max(period, SMOOTHING_TIME_S)
     if command is not None:
         change = change + noise.command_share * np.abs(command) * period
-        found.append(_propagate("commanded", before, command * period, change))
+        found.append(_propagate(before, command * period, change))
     elif velocity is not None:
-        motion = limit_steps(velocity * period, MAX_MOTION_SIGMAS * max_motion)
+        motion = limit_steps(velocity * period, MAX_MOTION_SIGMAS * full_speed)
         deviation = np.sqrt(change**2 + _velocity_variance(pose, covariance, period))
-        found.append(_propagate("going on", before, motion, deviation))
+        found.append(_propagate(before, motion, deviation))
     probabilities = [(1 - noise.surprise) / len(found)] * len(found)
     centre = np.zeros(3) if odom is None else odom
     if odom is not None:
         moved, turned = float(np.hypot(odom[0], odom[1])), abs(float(odom[2]))
         position = np.sqrt(noise.path_by_path * moved + noise.path_by_turn * turned) + noise.standing
         heading = np.sqrt(noise.turn_by_turn * turned + noise.turn_by_path * moved) + noise.standing
-        by_odometry = _propagate("odometry", before, odom, np.array([position, position, heading]))
+        by_odometry = _propagate(before, odom, np.array([position, position, heading]))
         found.append(_add_drift(by_odometry, noise.slip * odom, float(pose[2])))
         probabilities = [noise.surprise * each for each in probabilities] + [(1 - noise.surprise) ** 2]
-    found.append(_propagate("any motion", before, centre, max_motion + np.abs(centre)))
+    found.append(_propagate(before, centre, full_speed + np.abs(centre)))
     probabilities.append(noise.surprise)
     return [replace(each, probability=p) for each, p in zip(found, probabilities, strict=True)]
 
 
 def expected_motion(candidates: list[MotionCandidate]) -> MotionCandidate:
-    """The most specific of the candidates: by odometry, or else by the command or the last velocity.
+    """The most specific of the candidates: by odometry, else the command, else the last velocity, else standing still.
 
     It comes last but one, before any possible motion. A match with the local map is the only candidate.
     """
@@ -144,10 +143,10 @@ def _velocity_variance(pose: Array, covariance: Array, period: float) -> Array:
     return np.asarray(2 * weight * (1 + weight) * np.diagonal(turn @ covariance @ turn.T))
 
 
-def _propagate(name: str, before: MotionCandidate, step: Array, deviation: Array) -> MotionCandidate:
+def _propagate(before: MotionCandidate, step: Array, deviation: Array) -> MotionCandidate:
     by_pose, by_step = se2.compose_jacobians(before.mean, step)
     covariance = by_pose @ before.covariance @ by_pose.T + (by_step * deviation**2) @ by_step.T
-    return MotionCandidate(name, se2.compose(before.mean, step), covariance, 1.0, by_pose @ before.drift)
+    return MotionCandidate(se2.compose(before.mean, step), covariance, 1.0, by_pose @ before.drift)
 
 
 def _add_drift(candidate: MotionCandidate, lost: Array, yaw: float) -> MotionCandidate:
@@ -162,7 +161,8 @@ def widen_unobserved(
 ) -> MotionCandidate:
     """Adds the motion at full speed along ``directions`` (K, 3), which the last ``scans`` scans did not observe.
 
-    The directions are unit vectors of x, y, yaw. The standard deviation grows in proportion to time.
+    The directions are unit vectors of x, y, yaw. The standard deviation grows in proportion to the number n of scans:
+    (n + 1)² - n² = 2 n + 1.
     """
     motion = directions.T @ directions * np.array([noise.speed, noise.speed, noise.turn]) * period
     return replace(candidate, covariance=candidate.covariance + (2 * scans + 1) * motion @ motion.T)
@@ -171,15 +171,15 @@ def widen_unobserved(
 def decouple(candidate: MotionCandidate, directions: Array) -> MotionCandidate:
     """Removes the correlation of the position along ``directions`` (K, 3) with the rest of the pose.
 
-    Each scan shows these unobserved unit vectors tilted by the ripple of its walls. With the correlation, the
-    difference between two tilts would pass for information along them.
+    Errors of the map tilt these unobserved unit vectors, differently in each scan. With the correlation, the difference
+    between two tilts would pass for information along them.
     """
     along = directions.T @ directions
     across = np.eye(3) - along
     return replace(candidate, covariance=along @ candidate.covariance @ along + across @ candidate.covariance @ across)
 
 
-def limit_to_map(candidate: MotionCandidate, unknown: Array) -> MotionCandidate:
+def limit_covariance(candidate: MotionCandidate, unknown: Array) -> MotionCandidate:
     """Limits the variances to those of a completely unknown pose, ``unknown`` (3, 3)."""
     excess = np.sqrt(np.diag(candidate.covariance) / np.diag(unknown))
     if (excess <= 1).all():
@@ -209,7 +209,7 @@ class FusedMotion:
     mean: Array  # (3,)
     information: Array  # (3, 3) H + P^-1
     complexity: float  # nats, Kullback-Leibler divergence of the posterior from the prior
-    surprise: float  # nats, -ln(prior probability times evidence), without the scan's constant
+    negative_log_evidence: float  # nats, with that of the candidate's prior probability; without the scan's constant
 
 
 def fuse(candidate: MotionCandidate, peak: Array, slope: Array, curvature: Array) -> FusedMotion:
@@ -231,11 +231,11 @@ def fuse(candidate: MotionCandidate, peak: Array, slope: Array, curvature: Array
     regularised = curvature + 1e-9 * np.trace(curvature) * np.eye(3) + 1e-9 * np.eye(3)
     misfit = float(pull @ np.linalg.solve(regularised, pull) - pull @ step)
     logdet = float(np.linalg.slogdet(total)[1] - np.linalg.slogdet(information)[1])
-    surprise = 0.5 * misfit + 0.5 * logdet - np.log(candidate.probability)
+    negative_log_evidence = 0.5 * misfit + 0.5 * logdet - np.log(candidate.probability)
     plausible = MAX_MOTION_SIGMAS * np.sqrt(np.diag(candidate.covariance))
     step = limit_steps(step, np.minimum(np.abs(off) + MAX_STEP, plausible + MAX_EXTRA_STEP))
     posterior = np.linalg.inv(total)
     kl = 0.5 * (float(np.trace(information @ posterior)) - 3 + float(step @ information @ step) + logdet)
     mean = candidate.mean + step
     mean[2] = se2.wrap(mean[2])
-    return FusedMotion(candidate, mean, total, kl, float(surprise))
+    return FusedMotion(candidate, mean, total, kl, float(negative_log_evidence))

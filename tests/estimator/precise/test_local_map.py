@@ -22,6 +22,7 @@ from services.estimator.precise.local_map import (
     LocalMapScan,
     LocalScan,
     _beams_towards,
+    count_changes,
 )
 from services.estimator.precise.motion_model import MotionCandidate
 from services.estimator.shared.generative_models import RayCaster
@@ -34,13 +35,14 @@ STEP = np.diag([0.2, 0.2, 0.3]) ** 2
 
 def view(scene, pose):
     seen = scene.observe(scene.clean(np.array(pose)[None])[0], 0.0)
-    return View(RayCaster(HALL), Likelihood(), np.zeros(3), seen.angles, seen.ranges, seen.range_max)
+    mount = np.array(scene.scanner.mount)
+    return View(RayCaster(HALL), Likelihood(), mount, seen.angles, seen.ranges, seen.range_max)
 
 
 def match_near(made, pose, points):
     """The match of ``points``, starting at ``pose`` (3,) in map."""
     local = made.to_local(np.asarray(pose))
-    return made.match(local[None], points, MotionCandidate("any", local, STEP, 1.0))
+    return made.match(local[None], points, MotionCandidate(local, STEP, 1.0))
 
 
 def local_map(scene, *poses, frame=(0.0, 0.0, 0.0)):
@@ -67,7 +69,7 @@ def test_match_in_any_frame(offset, frame, seed):
     match = match_near(made, HERE, view(scene, there).points)
     assert match is not None
     assert not match.degenerate
-    assert match.share > 0.7
+    assert match.matched_fraction > 0.7
     off = se2.between(there, made.candidate(match).mean)
     assert np.hypot(off[0], off[1]) < 0.02
     assert abs(off[2]) < 0.01
@@ -114,21 +116,23 @@ def test_seen_surfaces():
     scene = Scene.of(ROOM, 361, 1)
     scan = view(scene, HERE)
     mapped = np.ones(len(scan.ranges), np.bool_)
-    nothing, arrived = LocalMap(np.array(scene.scanner.mount)).find_old_beams(HERE, scan, mapped)
+    nothing, arrived = LocalMap(np.array(scene.scanner.mount)).find_seen_and_appeared(HERE, scan, mapped)
     assert not nothing.any()
     assert not arrived.any()
     made = local_map(scene, HERE)
     here = made.to_local(HERE)
     assert made.is_key_scan_due(made.to_local(HERE + np.array([1.01 * MIN_DISTANCE_M, 0.0, 0.0])))
     assert not made.is_key_scan_due(here)
-    assert made.find_old_beams(here, view(scene, HERE), mapped)[0].all()
-    seen, arrived = made.find_old_beams(here, changed(scan, slice(100, 150), 0.5), mapped)  # a person
+    assert made.find_seen_and_appeared(here, view(scene, HERE), mapped)[0].all()
+    seen, arrived = made.find_seen_and_appeared(here, changed(scan, slice(100, 150), 0.5), mapped)  # a person
     assert np.flatnonzero(~seen).tolist() == np.flatnonzero(arrived).tolist() == list(range(100, 150))
-    seen, arrived = made.find_old_beams(here, changed(scan, slice(100, 150), 1.5), mapped)  # a door was opened
+    seen, arrived = made.find_seen_and_appeared(here, changed(scan, slice(100, 150), 1.5), mapped)  # a door was opened
     assert np.flatnonzero(~seen).tolist() == list(range(100, 150))
     assert not arrived.any()
     behind = replace(scan, ranges=scan.ranges + 0.14)  # another room, whose walls are near those of this one
-    assert made.find_old_beams(here, behind, mapped)[0].mean() < 0.5  # only beams that meet walls at a shallow angle
+    assert (
+        made.find_seen_and_appeared(here, behind, mapped)[0].mean() < 0.5
+    )  # only beams that meet walls at a shallow angle
 
 
 def test_surface_in_place_of_another():
@@ -138,19 +142,19 @@ def test_surface_in_place_of_another():
     here, nothing = made.to_local(HERE), np.zeros(len(scan.ranges), np.bool_)
     mapped = ~nothing
     mapped[100:150] = False
-    seen, arrived = made.find_old_beams(here, scan, mapped)
+    seen, arrived = made.find_seen_and_appeared(here, scan, mapped)
     assert np.flatnonzero(~seen).tolist() == list(range(100, 150))
     assert not arrived.any()
     made.add(LocalMapScan(here, scan, nothing, mapped, 0.0, 0.0), HERE, np.diag([1e-4, 1e-4, 1e-5]))
-    assert made.find_old_beams(here, view(scene, HERE), mapped)[0].all()
+    assert made.find_seen_and_appeared(here, view(scene, HERE), mapped)[0].all()
 
 
 def test_changes_between_scans():
     scene = Scene.of(ROOM, 361, 1)
-    made, first, now = LocalMap(np.array(scene.scanner.mount)), view(scene, HERE), view(scene, HERE)
+    first, now = view(scene, HERE), view(scene, HERE)
 
     def changes(pose, scan):
-        return made.count_changes(LocalScan(HERE, first), LocalScan(pose, scan))
+        return count_changes(LocalScan(HERE, first), LocalScan(pose, scan))
 
     assert changes(HERE, now) == 0
     for factor in (0.5, 2.0):  # something appears, vanishes
