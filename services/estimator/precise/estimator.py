@@ -201,7 +201,7 @@ class PreciseEstimator:
         view, observation = self._scan
         start, is_first = self._start, not self._precision.scans
         self._search_for_hypotheses(view)
-        if is_first and self._probability() >= self.settings.tracking_probability:
+        if is_first and self._is_tracked():
             view = self._search_with_map_error(view, start)
         return self._finish_scan(view, observation)
 
@@ -489,7 +489,7 @@ class PreciseEstimator:
         """Makes the present scan a key scan: keeps its evidence, and adds its surfaces to the local map."""
         best, log_unknown = self.modes[0], self._unknown_place.log_evidence
         mapped = view.surface_evidence(best.pose[None]).weights[0] > 0.5
-        if self._probability() >= self.settings.tracking_probability:
+        if self._is_tracked():
             self._precision.learn_changes(view, best.pose)
             self._precision.learn_map_error(view, best.pose)
         self._unknown_place.add_key_scan()
@@ -503,7 +503,7 @@ class PreciseEstimator:
     def _may_be_elsewhere(self) -> bool:
         """Whether the pose is uncertain, or another place could fit the scans much better."""
         best = self.modes[0]
-        if self._probability() < self.settings.tracking_probability:
+        if not self._is_tracked():
             return True
         # Prior against another place: the volume of all poses, divided by that of the poses at one place.
         information = best.curvature + np.linalg.inv(self.seeds.spread)
@@ -513,7 +513,7 @@ class PreciseEstimator:
 
     def _is_search_due(self) -> bool:
         """Whether to search now: at each key scan while not tracking, otherwise at growing intervals."""
-        if self._probability() < self.settings.tracking_probability and self._is_key_scan_due():
+        if not self._is_tracked() and self._is_key_scan_due():
             return True
         return self._scans_since_search >= self._search_interval
 
@@ -636,7 +636,7 @@ class PreciseEstimator:
         predicted = (
             self._predicted(view.expected(poses[0])) if same_beams else self.predict(poses[0][None], observation.angles)
         )
-        posterior = self._posterior(view, poses, predicted, self._probability())
+        posterior = self._posterior(view, poses, predicted)
         self._has_tracked |= posterior.state == "tracking"
         return posterior
 
@@ -645,7 +645,7 @@ class PreciseEstimator:
         sigma = np.where(unknown, UNKNOWN_SIGMA_M, np.hypot(expected.scale, self.likelihood.deviation(expected.ranges)))
         return Predicted(np.where(unknown, np.inf, expected.ranges), sigma)
 
-    def _posterior(self, view: View, poses: list[Array], predicted: Predicted, probability: float) -> Posterior:
+    def _posterior(self, view: View, poses: list[Array], predicted: Predicted) -> Posterior:
         """The posterior, with the hypotheses at their ``poses`` at the stamp of the scan."""
         best = self.modes[0]
         error = EstimateError.from_scan(view, best.pose, self._covariance(best), best.explained)
@@ -656,7 +656,7 @@ class PreciseEstimator:
         )
         elsewhere = 1 - best.weight * (1 - self._unknown_place.weight)
         return Posterior(
-            state=self._state(probability),
+            state=self._state(),
             hypotheses=hypotheses,
             accuracy=best.accuracy,
             complexity=best.complexity,
@@ -664,7 +664,7 @@ class PreciseEstimator:
             curvature=best.curvature,
             predicted=predicted.ranges[0],
             sigma=predicted.sigma[0],
-            probability=probability,
+            probability=self._probability(),
             protection=error.protection_level(elsewhere),
         )
 
@@ -678,8 +678,12 @@ class PreciseEstimator:
         at_best = best.weight * (1 - self._unknown_place.weight)
         return at_best * self._probability_of_being_near(best)
 
-    def _state(self, probability: float) -> State:
-        if probability >= self.settings.tracking_probability:
+    def _is_tracked(self) -> bool:
+        """Whether the best hypothesis is so probable that the state is `tracking`."""
+        return self._probability() >= self.settings.tracking_probability
+
+    def _state(self) -> State:
+        if self._is_tracked():
             return "tracking"
         known = 1 - self._unknown_place.weight
         if len(self.modes) > 1:

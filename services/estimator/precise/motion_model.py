@@ -190,9 +190,9 @@ def limit_covariance(candidate: MotionCandidate, unknown: Array) -> MotionCandid
 
 
 def reachable_poses(noise: MotionNoise, pose: Array, period: float, basin: float) -> Array:
-    """Poses (K, 3) that the robot may have reached without odometry, as further starts of a descent.
+    """Further starts (K, 3) of a descent without odometry: standing or driving forwards at full speed, and turning.
 
-    Returns none if the robot cannot leave the basin of attraction of a descent, ``basin`` m or rad.
+    Returns none if the robot cannot leave the basin of attraction of one descent, ``basin`` m or rad.
     """
     if noise.speed * period < basin and noise.turn * period < basin:
         return np.zeros((0, 3))
