@@ -199,7 +199,7 @@ class _HelpFormatter(argparse.RawDescriptionHelpFormatter):
 
 def _read_file(cls: type[ServiceSettings], path: Path) -> dict[str, Any]:
     """Reads one service's settings: top-level keys apply to all services, the section of a service only to it."""
-    data = _load_mapping(path)
+    data = read_settings_file(path)
     known = cls.model_fields.keys() - cls.private
     shared = {k: v for k, v in data.items() if not isinstance(v, dict) and k in known}
     return {**shared, **read_section(path, cls.service)}
@@ -207,7 +207,7 @@ def _read_file(cls: type[ServiceSettings], path: Path) -> dict[str, Any]:
 
 def read_section(path: Path, name: str) -> dict[str, Any]:
     """The section ``name`` of a settings file, empty if there is none; raises UserError if the file is invalid."""
-    section = _load_mapping(path).get(name) or {}
+    section = read_settings_file(path).get(name) or {}
     if not isinstance(section, dict):
         raise UserError(f"{path}: {name}: expected a mapping of settings")
     return section
@@ -225,7 +225,8 @@ def load_section(cls: type[M], path: Path | None, name: str, **options: object) 
         raise UserError(f"{path or 'options'}: {first_fault(error)} (section {name})") from None
 
 
-def _load_mapping(path: Path) -> dict[str, Any]:
+def read_settings_file(path: Path) -> dict[str, Any]:
+    """All keys of a settings file; raises UserError if it is invalid."""
     try:
         data = parse_yaml(path.read_text(encoding="utf-8")) or {}
     except OSError as error:

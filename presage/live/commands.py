@@ -243,7 +243,9 @@ def relocalise(link: Link, pose: Pose | None, console: Console, *, heading_known
         reply = bus.query(LOCALISE, LocaliseRequest(pose=pose, heading_known=heading_known, map_id=floor), Reply)
     if not reply.ok:
         raise UserError(f"refused: {reply.reason}")
-    console.print("localising again " + (f"from {_place(pose, floor)}" if pose else "from the initial pose"))
+    heading = f", {np.rad2deg(pose.yaw):g} deg" if pose and heading_known else ""
+    start = f"{_place(pose, floor)}{heading}" if pose else "the initial pose, or anywhere if none was given"
+    console.print(f"localising again from {start}")
 
 
 def save_map(link: Link, name: str, console: Console) -> None:

@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 
 from common.robot.scanner import SCANNERS
+from presage.terminal.settings_file import check_keys
 
 # Rich assumes 80 columns when the output is not a terminal, which would wrap tables and long lines.
 console = Console(width=None if sys.stdout.isatty() else 150)
@@ -35,7 +36,10 @@ ScannerName = Annotated[
 ]
 MountText = Annotated[str, typer.Option("--mount", help="Pose of the laser in base_link, x,y[,yaw_deg], in m and deg.")]
 Config = Annotated[
-    Path | None, typer.Option(help="YAML file of settings that have no option of their own (docs/settings.yaml).")
+    Path | None,
+    typer.Option(
+        help="YAML file of settings that have no option of their own (docs/settings.yaml).", callback=check_keys
+    ),
 ]
 Seed = Annotated[int | None, typer.Option(min=0, max=2**31, help="Random seed. Defaults to 0.")]
 Json = Annotated[Path | None, typer.Option("--json", help="Also write the results to this JSON file.")]

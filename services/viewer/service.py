@@ -96,9 +96,10 @@ class ViewerService(Service):
         else:
             print(where, flush=True)
         if not options.on_loopback and not options.token:
-            self.log.warning(
-                "anyone who reaches this machine can see the page", advice="set PRESAGE_VIEWER_TOKEN to require a token"
-            )
+            warning = "anyone who reaches this machine can see the page"
+            if options.allow_control:
+                warning = "anyone who reaches this machine can see the page and drive the robot"
+            self.log.warning(warning, advice="set PRESAGE_VIEWER_TOKEN to require a token")
 
     def close(self) -> None:
         """Stops the web server and closes the open recording."""

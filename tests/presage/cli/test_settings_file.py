@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 import yaml
 
+from common.errors import UserError
 from common.runtime.config import load_section, load_settings
 from presage.learning.options import TrainSettings
 from presage.logs.options import LogSettings
+from presage.terminal.settings_file import check_keys
 from services.bridge_ros2.settings import BridgeRos2Settings
 from services.controller.settings import ControllerSettings
 from services.estimator.settings import EstimatorSettings
@@ -36,3 +40,23 @@ def test_settings_of_services(cls):
 def test_settings_of_commands(name, cls):
     assert load_section(cls, FILE, name) == cls()
     assert cls.model_fields.keys() == yaml.safe_load(FILE.read_text())[name].keys()
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("max_sped: 0.3\n", "max_sped: unknown key; did you mean max_speed?"),
+        ("simulatr: {beams: 1}\n", "simulatr: unknown key; did you mean simulator?"),
+        ("image: map.pgm\nresolution: 0.05\n", "image: unknown key"),
+    ],
+)
+def test_misspelt_keys(tmp_path, text, problem):
+    file = tmp_path / "my.yaml"
+    file.write_text(text)
+    with pytest.raises(UserError, match=re.escape(problem)):
+        check_keys(file)
+
+
+def test_all_keys_are_known():
+    assert check_keys(FILE) == FILE
+    assert check_keys(None) is None
