@@ -15,9 +15,10 @@ def check_keys(path: Path | None) -> Path | None:
     """Returns ``path``. Raises UserError if the file has a key at its top that no service and no command reads.
 
     A service reads its own section and the keys that it knows, so it cannot tell a misspelt key from one of another.
+    A missing file is left to the command that reads it.
     """
-    if path is None:
-        return None
+    if path is None or not path.is_file():
+        return path
     # Imported here because most commands run without a settings file.
     from common.router.router import RouterSettings
     from services.bridge_ros2.settings import BridgeRos2Settings
