@@ -9,7 +9,7 @@ import numpy as np
 from common.geometry import se2
 from common.messages.definitions import Health, TopicHealth
 from common.messages.requests import ConfigReply
-from common.messages.topics import CMD_VEL, SCAN, TOPICS, TRUTH, expected_rate, topic_of
+from common.messages.topics import CMD_VEL, PREDICTION, SCAN, TOPICS, TRUTH, expected_rate, topic_of
 from common.robot.scan_geometry import Sweep
 from common.runtime.protocol_check import describe_version_differences, same_protocol
 from common.runtime.service_monitor import SUBSTITUTES, start_command
@@ -20,6 +20,7 @@ from presage.diagnosis.health_board import MIN_RATE_SHARE
 MAX_CLOCK_DIFFERENCE_S = 0.5  # as long as the time-outs of the robot
 MAX_DROPPED_SHARE = 0.1  # of the received messages; a service that drops more cannot keep up
 MAY_SKIP_MESSAGES = {"viewer"}  # it shows only the newest messages
+MAY_RUN_SEVERAL_TIMES = {"recorder", "viewer"}  # as they only listen
 
 
 def evaluate_observation(observation: BusObservation, own_config: ConfigReply) -> Iterator[Finding]:
@@ -43,6 +44,8 @@ def _presence(observation: BusObservation) -> Iterator[Finding]:
         yield Finding("no_such_robot", False, what, observation.robot, "name the robot with --robot")
     for service in services:
         where, name = _where(observation, service.name), f"{service.name} of {observation.robot!r}"
+        if _substitute(observation, service.name):
+            continue
         if service.state == "absent":
             advice = f"start it with: {start_command(service.name, observation.robot, observation.connect)}"
             needed = service.name in observation.monitor.missing(observation.seconds)
@@ -56,9 +59,15 @@ def _presence(observation: BusObservation) -> Iterator[Finding]:
             yield Finding("missing", True, f"{name}: alive", service.name)
 
 
+def _substitute(observation: BusObservation, service: str) -> str:
+    """Name of the service that runs in the place of one that does not run, or an empty text."""
+    present, name = observation.monitor.present, SUBSTITUTES.get(service, "")
+    return name if present(name, observation.seconds) and not present(service, observation.seconds) else ""
+
+
 def _duplicates(observation: BusObservation) -> Iterator[Finding]:
     for service, replies in observation.replies.items():
-        if len(replies) > 1:
+        if len(replies) > 1 and service not in MAY_RUN_SEVERAL_TIMES:
             youngest = min(replies, key=lambda reply: reply.uptime)
             hosts = ", ".join(f"{reply.host or 'unknown host'} for {reply.uptime:.0f} s" for reply in replies)
             what = f"{service} of {observation.robot!r} runs {len(replies)} times: on {hosts}"
@@ -99,18 +108,20 @@ def _clocks(observation: BusObservation) -> Iterator[Finding]:
 
 def _rates(observation: BusObservation) -> Iterator[Finding]:
     # A real robot's scanner may have any rate, and there is no ground truth.
-    real_robot = observation.monitor.present(SUBSTITUTES["simulator"], observation.seconds)
+    real_robot = bool(_substitute(observation, "simulator"))
+    mapping = bool(_substitute(observation, "estimator"))  # a mapper publishes beliefs, but predicts no scans
     period = observation.scan.scan_time if observation.scan is not None else 0.0
     if real_robot and not period and (scans := observation.arrivals[SCAN.key(observation.robot)]):
         period = observation.seconds / scans  # some drivers do not fill in scan_time
     for topic in TOPICS:
-        if not topic.rate or topic.per_service or (real_robot and topic is TRUTH):
+        if not topic.rate or topic.per_service or (real_robot and topic is TRUTH) or (mapping and topic is PREDICTION):
             continue
         key = topic.key(observation.robot)
         rate = observation.arrivals[key] / observation.seconds
         expected = expected_rate(topic, period)
         ok = rate > 0 and rate >= MIN_RATE_SHARE * expected
-        advice = f"published by the {topic.publisher}: is it alive, paused, or are its inputs missing? See its log"
+        publisher = _substitute(observation, topic.publisher) or topic.publisher
+        advice = f"published by the {publisher}: is it alive, paused, or are its inputs missing? See its log"
         if topic is CMD_VEL and rate > 1.5 * expected:
             ok, advice = False, "there may be several controllers: stop all but one"
         yield Finding("rate", ok, f"{topic.name}: {rate:.1f} of {expected:.3g} Hz", key, "" if ok else advice)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from common.messages.definitions import Health, Pose, Scan, TopicHealth
-from common.messages.topics import BELIEF, CMD_VEL, SCAN, TOPICS, TRUTH
+from common.messages.topics import BELIEF, CMD_VEL, PREDICTION, SCAN, TOPICS, TRUTH
 from common.runtime.protocol_check import build_config_reply
 from common.runtime.service_monitor import REPORT_TIMEOUT_S, RESULT_TIMEOUT_S, ServiceMonitor
 from presage.diagnosis.bus_observation import BusObservation, check_endpoint
@@ -113,6 +113,25 @@ def test_real_robot():
     assert not problems(seen)
     seen.arrivals[BELIEF.key("robot")] = 3
     assert problems(seen) == {"rate"}
+    seen.arrivals[SCAN.key("robot")] = 0
+    advice = {finding.advice for finding in findings(seen, "rate") if finding.ok is False}
+    assert any("published by the bridge_ros2" in each for each in advice)
+    assert not any("simulator" in finding.what for finding in findings(seen, "missing"))
+
+
+def test_mapping():
+    """A mapper takes the estimator's place, and predicts no scans."""
+    seen = observed(["simulator", "mapper", "controller"], reporting=["mapper", *NAMES])
+    seen.arrivals[PREDICTION.key("robot")] = 0
+    assert not problems(seen)
+    assert not any("estimator" in finding.what for finding in findings(seen, "missing"))
+
+
+def test_doubled_services():
+    for name, codes in (("controller", {"doubled"}), ("recorder", set())):
+        seen = observed([*NAMES, name], reporting=[*NAMES, name])
+        seen.replies[name] = 2 * seen.replies[name]
+        assert problems(seen) == codes
 
 
 @pytest.mark.parametrize(
