@@ -59,6 +59,7 @@ class ScanFeed:
             "replaying",
             sum(self.recording.counts()[key] for key in self.topics),
             console,
+            unit="messages",
         )
         for raw in raws:
             self._process(raw, answered_stamps)

@@ -54,7 +54,13 @@ def _without_numbers(text: str) -> str:
 
 
 def progress(
-    items: Iterable[Item], what: str, total: int, console: Console, *, interval_s: float = LINE_INTERVAL_S
+    items: Iterable[Item],
+    what: str,
+    total: int,
+    console: Console,
+    *,
+    unit: str = "scans",
+    interval_s: float = LINE_INTERVAL_S,
 ) -> Generator[Item]:
     """Yields the items and shows the progress; on other outputs than a terminal, one line every ``interval_s``.
 
@@ -71,6 +77,7 @@ def progress(
         now_s = time.monotonic()
         if done and now_s - last_line_s >= interval_s:
             left = (now_s - start_s) / done * max(0, total - done)
-            console.print(f"{what}: {done} of {total} scans, about {left:.0f} s left", highlight=False, soft_wrap=True)
+            line = f"{what}: {done} of {total} {unit}, about {left:.0f} s left"
+            console.print(line, highlight=False, soft_wrap=True)
             last_line_s = now_s
         yield item
