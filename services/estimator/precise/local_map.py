@@ -28,10 +28,11 @@ NEIGHBOURS, NEIGHBOUR_RADIUS_M = 10, 0.3  # points from which the normal of a su
 PARTNER_RADII_M = (0.6, 0.6, 0.4, 0.4, 0.2, 0.2, 0.1, 0.1, 0.1, 0.1)
 CAUCHY_SCALE_M = 0.02  # of the Cauchy weight of a point by its distance from the line
 MATCHED_RADIUS_M = 0.08  # a point is matched if it is this near to one of the local map
-# A point is on a surface seen before if it is near a point of the local map, as far away neighbouring beams are apart,
+# A point is on a surface seen before if it is this near to a point of the local map, since neighbouring beams are so
+# far apart on a distant surface, ...
 SEEN_RADIUS_M = 0.15
-# and near the line through it, if it has enough neighbours for a line. Three standard deviations of the noise are added
-# in quadrature. A wider tolerance takes much of another room for this one.
+# ... and this near to the line through that point, if there are enough neighbours for a line. Three standard deviations
+# of the noise are added in quadrature. A wider tolerance takes much of another room for this one.
 SEEN_ACROSS_M = 0.05
 MIN_POINTS = 20  # of a scan that must have a partner in the local map
 MAX_SQUARED_DISTANCE = 4.0  # squared standard deviations of the result from the prior

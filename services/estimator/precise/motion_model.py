@@ -86,8 +86,8 @@ def predict_motion(
     """Returns the candidates after ``period`` s, from the last posterior (3,), (3, 3); the last one is the widest.
 
     ``drift`` (3, 3) is the posterior's covariance with the drift; 0 by default. ``odom`` (3,) is the motion since then
-    in base_link. ``command`` and ``velocity`` (3,) are in m/s, m/s, rad/s in base_link; without odometry a command
-    takes precedence over the velocity.
+    in base_link. ``command`` and ``velocity`` (3,) are in m/s, m/s, rad/s in base_link; a command takes precedence over
+    the velocity.
     """
     full_speed = np.array([noise.speed, noise.speed, noise.turn]) * period
     before = MotionCandidate(pose, covariance, 1.0, np.zeros((3, 3)) if drift is None else drift)
