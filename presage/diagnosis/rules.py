@@ -20,7 +20,7 @@ from presage.diagnosis.health_board import MIN_RATE_SHARE
 MAX_CLOCK_DIFFERENCE_S = 0.5  # as long as the time-outs of the robot
 MAX_DROPPED_SHARE = 0.1  # of the received messages; a service that drops more cannot keep up
 MAY_SKIP_MESSAGES = {"viewer"}  # it shows only the newest messages
-MAY_RUN_SEVERAL_TIMES = {"recorder", "viewer"}  # as they only listen
+MAY_RUN_SEVERAL_TIMES = {"recorder", "viewer"}  # of the other services, only one instance is active (`Service.single`)
 
 
 def evaluate_observation(observation: BusObservation, own_config: ConfigReply) -> Iterator[Finding]:

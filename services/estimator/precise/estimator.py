@@ -128,7 +128,7 @@ class PreciseEstimator:
             self._start = start_belief(pose, START_COVARIANCE if covariance is None else covariance)
         self._has_tracked = False
         self._unknown_place = UnknownPlace()
-        self._local_map = LocalMap(self.mount)
+        self._local_map = LocalMap()
         self._change_rate = ChangeRate()
         self._precision = Precision.before_first_scan(self._map_cell)
         self._scans_since_search, self._search_interval = 0, 1
@@ -297,7 +297,7 @@ class PreciseEstimator:
         if the scan fits the map far better there.
         """
         starts = np.array([*(each.mean for each in motions), self._local_map.to_local(match.poses[0])])
-        found = self._local_map.match(starts, view.points, motions[-1])
+        found = self._local_map.match(starts, view, motions[-1])
         if found is None:
             return match
         moved = self._local_map.candidate(found)

@@ -113,7 +113,6 @@ class ChangeRate:
 class LocalMap:
     """The last key scans in a local frame. Localisation in the map moves this frame, and all scans with it."""
 
-    mount: Array  # (3,) laser in base_link
     scans: deque[LocalMapScan] = field(default_factory=lambda: deque(maxlen=MAX_SCANS))
     frame: Array = field(default_factory=lambda: np.zeros(3))  # (3,) local frame in map
     # (3, 3) of the pose in map at the last key scan, with the drift that this scan contributes
@@ -190,18 +189,18 @@ class LocalMap:
             free |= _passed(key, points, SEEN_RADIUS_M)
         return free
 
-    def match(self, starts: Array, points: Array, prior: MotionCandidate) -> Match | None:
+    def match(self, starts: Array, view: View, prior: MotionCandidate) -> Match | None:
         """Returns the pose at which a scan matches the key scans, or None if no pose matches.
 
-        ``starts`` (N, 3) and ``prior`` are poses in the local frame, ``points`` (K, 2) m in the laser frame.
+        ``starts`` (N, 3) and ``prior`` are poses in the local frame.
         """
-        if not self.scans or len(points) < MIN_POINTS:
+        if not self.scans or len(view.points) < MIN_POINTS:
             return None
-        found = self._best_match(starts, points, prior)
+        found = self._best_match(starts, view, prior)
         if found is None or found.matched_fraction < CLEAR_MATCHED_FRACTION:
             turned = np.repeat(starts[:1], len(EXTRA_HEADINGS_RAD), axis=0)
             turned[:, 2] = se2.wrap(turned[:, 2] + EXTRA_HEADINGS_RAD)
-            again = self._best_match(turned, points, prior)
+            again = self._best_match(turned, view, prior)
             if again is not None and (found is None or again.score > found.score):
                 found = again
         return None if found is None or found.matched_fraction < MIN_MATCHED_FRACTION or found.degenerate else found
@@ -212,9 +211,9 @@ class LocalMap:
         covariance = self.covariance + turn @ match.covariance @ turn.T
         return MotionCandidate(se2.compose(self.frame, match.pose), covariance, 1.0)
 
-    def _best_match(self, starts: Array, points: Array, prior: MotionCandidate) -> Match | None:
+    def _best_match(self, starts: Array, view: View, prior: MotionCandidate) -> Match | None:
         information = np.asarray(np.linalg.inv(prior.covariance), float)
-        found = [self._register(start, points, prior.mean, information) for start in starts]
+        found = [self._register(start, view, prior.mean, information) for start in starts]
         plausible = [
             each for each in found if each is not None and prior.squared_distance(each.pose) < MAX_SQUARED_DISTANCE
         ]
@@ -248,15 +247,15 @@ class LocalMap:
             self._normals = np.asarray(vectors[:, :, 0] * (exists.sum(axis=1) > 2)[:, None])
         return self._normals
 
-    def _register(self, start: Array, points: Array, mean: Array, information: Array) -> Match | None:
-        """Registers points (K, 2) m in the laser frame by iteratively reweighted Gauss-Newton, with a Gaussian prior.
+    def _register(self, start: Array, view: View, mean: Array, information: Array) -> Match | None:
+        """Registers a scan by iteratively reweighted Gauss-Newton, with a Gaussian prior.
 
         Returns None if too few points have a partner.
         """
         tree, normals = self._tree_of_points(), self._normals_of_points()
         pose = np.array(start)
         for radius in PARTNER_RADII_M:
-            placed = se2.transform(se2.compose(pose, self.mount), points)
+            placed = LocalScan(pose, view).points
             distance, partner = tree.query(placed, distance_upper_bound=radius)
             paired = np.isfinite(distance)
             if paired.sum() < MIN_POINTS:
@@ -274,7 +273,7 @@ class LocalMap:
             )
             pose = pose + step
             pose[2] = se2.wrap(pose[2])
-        placed = se2.transform(se2.compose(pose, self.mount), points)
+        placed = LocalScan(pose, view).points
         distance, partner = tree.query(placed)
         error = np.einsum("ni,ni->n", normals[partner], placed - self._points[partner])
         score = ((distance < 2 * MATCHED_RADIUS_M) / (1 + (error / CAUCHY_SCALE_M) ** 2)).mean()

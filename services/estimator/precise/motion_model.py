@@ -91,28 +91,29 @@ def predict_motion(
     """
     full_speed = np.array([noise.speed, noise.speed, noise.turn]) * period
     before = MotionCandidate(pose, covariance, 1.0, np.zeros((3, 3)) if drift is None else drift)
-    found = [_propagate(before, np.zeros(3), np.full(3, noise.standing))]  # standing still
+    likely = 1 - noise.surprise
+    probability = likely if odom is None else likely * noise.surprise  # of the motions that odometry does not give
+    if command is not None or velocity is not None:
+        probability /= 2
+    found = [_propagate(before, np.zeros(3), np.full(3, noise.standing), probability)]  # standing still
     acceleration = np.array([noise.acceleration, noise.acceleration, noise.turn_acceleration])
     change = acceleration * period * max(period, SMOOTHING_TIME_S)
     if command is not None:
         change = change + noise.command_share * np.abs(command) * period
-        found.append(_propagate(before, command * period, change))
+        found.append(_propagate(before, command * period, change, probability))
     elif velocity is not None:
         motion = limit_steps(velocity * period, MAX_MOTION_SIGMAS * full_speed)
         deviation = np.sqrt(change**2 + _velocity_variance(pose, covariance, period))
-        found.append(_propagate(before, motion, deviation))
-    probabilities = [(1 - noise.surprise) / len(found)] * len(found)
-    centre = np.zeros(3) if odom is None else odom
+        found.append(_propagate(before, motion, deviation, probability))
     if odom is not None:
         moved, turned = float(np.hypot(odom[0], odom[1])), abs(float(odom[2]))
         position = np.sqrt(noise.path_by_path * moved + noise.path_by_turn * turned) + noise.standing
         heading = np.sqrt(noise.turn_by_turn * turned + noise.turn_by_path * moved) + noise.standing
-        by_odometry = _propagate(before, odom, np.array([position, position, heading]))
+        by_odometry = _propagate(before, odom, np.array([position, position, heading]), likely**2)
         found.append(_add_drift(by_odometry, noise.slip * odom, float(pose[2])))
-        probabilities = [noise.surprise * each for each in probabilities] + [(1 - noise.surprise) ** 2]
-    found.append(_propagate(before, centre, full_speed + np.abs(centre)))
-    probabilities.append(noise.surprise)
-    return [replace(each, probability=p) for each, p in zip(found, probabilities, strict=True)]
+    centre = np.zeros(3) if odom is None else odom
+    found.append(_propagate(before, centre, full_speed + np.abs(centre), noise.surprise))  # any motion
+    return found
 
 
 def expected_motion(candidates: list[MotionCandidate]) -> MotionCandidate:
@@ -143,10 +144,10 @@ def _velocity_variance(pose: Array, covariance: Array, period: float) -> Array:
     return np.asarray(2 * weight * (1 + weight) * np.diagonal(turn @ covariance @ turn.T))
 
 
-def _propagate(before: MotionCandidate, step: Array, deviation: Array) -> MotionCandidate:
+def _propagate(before: MotionCandidate, step: Array, deviation: Array, probability: float) -> MotionCandidate:
     by_pose, by_step = se2.compose_jacobians(before.mean, step)
     covariance = by_pose @ before.covariance @ by_pose.T + (by_step * deviation**2) @ by_step.T
-    return MotionCandidate(se2.compose(before.mean, step), covariance, 1.0, by_pose @ before.drift)
+    return MotionCandidate(se2.compose(before.mean, step), covariance, probability, by_pose @ before.drift)
 
 
 def _add_drift(candidate: MotionCandidate, lost: Array, yaw: float) -> MotionCandidate:
