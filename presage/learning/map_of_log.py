@@ -105,8 +105,8 @@ def _check(options: MapOptions) -> None:
     files = [options.out.with_suffix(suffix) for suffix in (".yaml", ".pgm", ".tum", ".png")]
     if options.models is not None:
         files.append(weights.path_of(options.models, options.out.stem))
-    if existing := next((path for path in files if path.exists()), None):
-        raise UserError(f"{existing} exists already: choose another name with --out, or remove it")
+    if existing := [str(path) for path in files if path.exists()]:
+        raise UserError(f"exists already: {', '.join(existing)}; choose another name with --out, or remove")
 
 
 def _check_scan_count(count: int, options: MapOptions) -> None:

@@ -48,6 +48,7 @@ class Learner:
         self._closed = False
         self._running: Future[EncodedVersion | None] | None = None
         self._stamps = np.zeros(0)  # (N,) of the key scans from which a version is being learned
+        self.rejected_total = 0  # versions that predicted held-out key scans no better than the model in use
 
     def add(self, posterior: Posterior, observation: Observation, present: GenerativeModel) -> None:
         """Adds a scan, and starts learning if enough key scans are new; ``present`` is the model in use."""
@@ -64,7 +65,9 @@ class Learner:
         if self._running is None or not self._running.done():
             return None
         done, self._running = self._running, None
-        if (learned := done.result()) is not None:
+        if (learned := done.result()) is None:
+            self.rejected_total += 1
+        else:
             self.keys.set_learned(self._stamps, learned.version.key_poses)
         return learned
 

@@ -57,6 +57,7 @@ from services.estimator.model_card import ModelInUse, model_in_use, save_learned
 from services.estimator.paper.perception import Descent
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.learning import weights
+from services.estimator.precise.learning.key_scans import MIN_KEY_SCANS
 from services.estimator.precise.learning.live_learning import mean_error
 from services.estimator.prediction_query import answer_prediction
 from services.estimator.settings import EstimatorSettings
@@ -145,6 +146,13 @@ class EstimatorService(Service):
             self.log.info("loading the world", world=settings.world)
             self.models = SharedModels(settings)
         self.model = self.models.describe(None)
+        if isinstance(self.model, ModelInUse) and self.model.world.name != self.models.world.name:
+            self.log.warning(
+                "the model was learned in another world, which is the map now",
+                model=settings.model,
+                learned_in=self.model.world.name,
+                world=settings.world,
+            )
         self.log.info("estimator", name=settings.estimator, world=settings.world, prior=settings.prior)
 
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
@@ -214,7 +222,15 @@ class EstimatorService(Service):
 
     def _use_learned_version(self, learner: Learner, estimator: PreciseEstimator, stamp_ns: int) -> None:
         """Switches to a newly learned version of the model, if there is one, and publishes it."""
-        if (learned := learner.take()) is None:
+        learned = learner.take()
+        if learner.rejected_total > self.counters["versions_rejected"]:
+            self.counters["versions_rejected"] = learner.rejected_total
+            self.log.info(
+                "a new version predicts new scans no better, so the model stays",
+                version=self.field_version,
+                key_scans=len(learner.keys),
+            )
+        if learned is None:
             return
         estimator.use_model(learned.version.model, learned.version.seeds)
         self._learned, self.field_version = learned, self.field_version + 1
@@ -249,10 +265,23 @@ class EstimatorService(Service):
 
     def _save_model(self, name: str) -> SaveModelReply:
         if self._learned is None or self.geometry is None or isinstance(self.model, str):
-            raise UserError("nothing was learned yet: start with `presage up --learn`, and drive for a minute")
+            raise UserError(self._why_nothing_was_learned())
         path = save_learned(self.settings.saved_models, name, self.model, self._learned.version, self.geometry)
         self.log.info("model saved", file=str(path), version=self.field_version)
         return SaveModelReply(file=str(path), version=self.field_version)
+
+    def _why_nothing_was_learned(self) -> str:
+        if self._learner is None:
+            return "nothing was learned: start with `presage up --learn`, and drive for a minute"
+        if rejected := self._learner.rejected_total:
+            return (
+                f"nothing was learned yet: {rejected} new versions predicted new scans no better than the model in "
+                "use, which is as good as the scans"
+            )
+        return (
+            f"nothing was learned yet: {len(self._learner.keys)} key scans, and a version needs {MIN_KEY_SCANS} and "
+            "half a minute of computing: drive on"
+        )
 
     def close(self) -> None:
         """Ends the process that learns."""

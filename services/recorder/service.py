@@ -9,14 +9,15 @@ from typing import ClassVar
 from common.bus.inbox import OTHERS, Sample
 from common.errors import UserError
 from common.messages.requests import RecordReply, RecordRequest, Reply, Request
-from common.messages.topics import RECORDING, TOPICS, Query, Topic
+from common.messages.topics import HEALTH, RECORDING, TOPICS, Query, Topic
 from common.runtime.service import Service
 from services.recorder.files.message_counts import MAX_COUNT
 from services.recorder.recording import OpenRecording, warn_about_unfinished
 from services.recorder.session_description import DescriptionCollector, DescriptionReply
 from services.recorder.settings import RecorderSettings
 
-LINK_WARNING_DELAY_S = 3.0  # the recorder may start before the router, but warns if this lasts longer
+# The recorder may start before the router and the other services, but warns if this lasts longer.
+LINK_WARNING_DELAY_S, SERVICE_WARNING_DELAY_S = 3.0, 10.0
 INBOX_CAPACITY = 20_000  # messages that wait to be written
 
 
@@ -43,8 +44,9 @@ class RecorderService(Service):
         self._written: Counter[str] = Counter()  # by key, in completed recordings
         self._missing: Counter[str] = Counter()  # by key, in completed recordings
         self._flush_at = 0.0
-        self._warn_at: float | None = None  # when to warn that the router is not reached; None once it was reached
-        self._no_link_note = ""  # the warning, while the router is not reached
+        self._opened_at = 0.0
+        self._may_be_silent = True  # until a service or a message of another was noticed
+        self._silence = ""  # why no messages arrive, as far as is known
 
     def open(self) -> None:
         """Begins to record, unless idle, and starts to collect the services' descriptions."""
@@ -54,8 +56,8 @@ class RecorderService(Service):
         if not options.idle:
             self._begin(numbered=False)
         self._update_note()
-        self._flush_at = time.monotonic() + options.flush
-        self._warn_at = time.monotonic() + LINK_WARNING_DELAY_S if options.link().connect else None
+        self._opened_at = time.monotonic()
+        self._flush_at = self._opened_at + options.flush
         self.descriptions = DescriptionCollector(self.loop.bus, self.name, self.log, weights=options.weights)
 
     def on_sample(self, sample: Sample) -> None:
@@ -146,7 +148,7 @@ class RecorderService(Service):
         """Writes new descriptions, checks the link and flushes the file."""
         self._flush_at = time.monotonic() + self.options.flush
         self._write_descriptions()
-        self._check_link()
+        self._warn_if_silent()
         if self.recording is not None:
             self.recording.writer.flush()
 
@@ -169,25 +171,45 @@ class RecorderService(Service):
                 self._end()
             descriptions.join()
 
-    def _check_link(self) -> None:
-        """Warns once if the router is not reached, and logs when it is reached after that."""
-        if self._warn_at is None or time.monotonic() < self._warn_at:
+    def _warn_if_silent(self) -> None:
+        """Warns once if the router is not reached or the robot has no services, and logs when that has changed."""
+        if not self._may_be_silent:
             return
-        linked = self.loop.bus.linked()
-        if not linked and not self._no_link_note:
-            self._no_link_note = f"nothing answers at {', '.join(self.options.link().connect)}"
-            advice = "start a session with `presage up`, or name its endpoint with --connect"
-            self.log.warning(self._no_link_note, advice=advice)
-        elif linked:
-            if self._no_link_note:
-                self.log.info("connected to the router")
-            self._warn_at, self._no_link_note = None, ""
+        silence, advice = self._find_silence()
+        if silence == self._silence:
+            return
+        if silence:
+            self.log.warning(silence, advice=advice)
+        else:
+            self.log.info("messages can arrive now", robot=self.options.robot)
+        self._silence = silence
         self._update_note()
+
+    def _find_silence(self) -> tuple[str, str]:
+        """Why no messages arrive, and what to do; both empty if they do, or if it is too early to tell."""
+        open_for, connect = time.monotonic() - self._opened_at, self.options.link().connect
+        if self._has_messages_of_others() or (self.descriptions is not None and self.descriptions.present):
+            self._may_be_silent = False
+            return "", ""
+        if connect and not self.loop.bus.linked():
+            if open_for < LINK_WARNING_DELAY_S:
+                return "", ""
+            return (
+                f"nothing answers at {', '.join(connect)}",
+                "start a session with `presage up`, or name its endpoint with --connect",
+            )
+        if open_for < SERVICE_WARNING_DELAY_S:
+            return "", ""
+        return f"no service of robot {self.options.robot} is running", "start one, or name another robot with --robot"
+
+    def _has_messages_of_others(self) -> bool:
+        own = HEALTH.key(self.options.robot, self.name)
+        return self.recording is not None and any(key != own for key in self.recording.message_counts.written)
 
     def _update_note(self) -> None:
         """Sets the note in the health message."""
         self.idle = self.recording is None
-        self.note = self._no_link_note or ("not recording until a request starts it" if self.idle else "")
+        self.note = self._silence or ("not recording until a request starts it" if self.idle else "")
 
     def _write_descriptions(self) -> None:
         if self.descriptions is None:

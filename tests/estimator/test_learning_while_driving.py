@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+from structlog.testing import capture_logs
 
 from common.bus.bus import wait_until
 from common.bus.inbox import Inbox
@@ -21,7 +24,7 @@ from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.key_scans import KeyScanCollector
 from services.estimator.service import EstimatorService
 from services.estimator.settings import EstimatorSettings
-from tests.conftest import WAIT_TIMEOUT_S, received_messages
+from tests.conftest import ROOT, WAIT_TIMEOUT_S, received_messages
 from tests.estimator.test_service import StoringService
 
 PERIOD_S, STEP_M, BEAMS = 0.5, 0.25, 120
@@ -160,3 +163,31 @@ def test_parts():
 def test_only_precise_learns():
     with pytest.raises(UserError, match="only estimator precise learns"):
         EstimatorService(EstimatorSettings(estimator="particle-filter", learn="refine")).open()
+
+
+def test_rejected_versions_are_reported():
+    """If the map is as good as the scans, no version is better, and the user learns why there is nothing to save."""
+    service = EstimatorService(EstimatorSettings(learn="refine"))
+    service.open()
+    with pytest.raises(UserError, match="nothing was learned: start with `presage up --learn`"):
+        service.on_request(SAVE_MODEL, SaveModelRequest(name="monday"))
+    learner = SimpleNamespace(keys=range(12), rejected_total=0, take=lambda: None)
+    service._learner = learner
+    with pytest.raises(UserError, match="12 key scans, and a version needs 50"):
+        service.on_request(SAVE_MODEL, SaveModelRequest(name="monday"))
+    learner.rejected_total = 2
+    with capture_logs() as lines:
+        for stamp_ns in (1, 2):
+            service._use_learned_version(learner, None, stamp_ns)
+    assert [line["event"] for line in lines] == ["a new version predicts new scans no better, so the model stays"]
+    assert service.counters["versions_rejected"] == 2
+    with pytest.raises(UserError, match="2 new versions predicted new scans no better"):
+        service.on_request(SAVE_MODEL, SaveModelRequest(name="monday"))
+
+
+@pytest.mark.parametrize(("world", "warnings"), [("office", 1), ("corridor", 0)])
+def test_model_of_another_world_is_reported(world, warnings):
+    service = EstimatorService(EstimatorSettings(world=world, model=str(ROOT / "models/corridor-precise.safetensors")))
+    with capture_logs() as lines:
+        service.open()
+    assert sum("learned in another world" in line["event"] for line in lines) == warnings

@@ -115,7 +115,7 @@ IMPATIENT = """
 import sys
 from services.recorder import service
 from services.recorder.__main__ import RecorderSettings, main, build_service
-service.LINK_WARNING_DELAY_S = 0.1
+service.LINK_WARNING_DELAY_S = service.SERVICE_WARNING_DELAY_S = 0.1
 sys.argv[0] = "recorder"
 main(RecorderSettings, build_service)
 """
@@ -129,8 +129,10 @@ def test_warning_without_router(processes, tmp_path, free_port):
     running.wait_for(f"nothing answers at {endpoint}")
     running.wait_for("start a session with `presage up`")
     processes.start("common.router", "--listen", endpoint)
-    running.wait_for("connected to the router")
-    assert running.output.count("nothing answers") == 1
+    running.wait_for("no service of robot robot is running")
+    processes.start("services.simulator", "--beams", "16", env={"PRESAGE_CONNECT": endpoint})
+    running.wait_for("messages can arrive now")
+    assert running.output.count("nothing answers") == running.output.count("no service") == 1
     assert running.stop() == 0
 
 

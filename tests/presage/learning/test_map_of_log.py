@@ -97,7 +97,8 @@ def test_what_cannot_be_is_said(log, tmp_path):
     with pytest.raises(UserError, match="no poses 'none'"):
         map_command(MapOptions(log, tmp_path / "a.yaml", poses="none"), QUIET, QUIET)
     (tmp_path / "a.pgm").write_bytes(b"mine")
-    with pytest.raises(UserError, match=r"a\.pgm exists already"):
+    (tmp_path / "a.png").write_bytes(b"mine")
+    with pytest.raises(UserError, match=r"exists already: .*a\.pgm, .*a\.png;"):
         map_command(MapOptions(log, tmp_path / "a.yaml", reading=HERE, poses="reference"), QUIET, QUIET)
     bare = tmp_path / "bare.npz"
     real_drive.save(bare, real_drive.drive(20), reference=False)
