@@ -113,6 +113,7 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	$(BIN)/presage bench mapping-faults --worlds 2 --seed 990 --seconds 60 --json $(RESULTS)/mapping-faults.json
 	$(BIN)/presage bench refinement --worlds 3 --seed 3447 --seconds 300 --out $(RESULTS)/refinement --json $(RESULTS)/refinement.json
 	$(BIN)/presage bench visits --worlds 0 --visits 6 --scans 100 --seed 4711 --out $(RESULTS)/visits --json $(RESULTS)/visits-office.json
+	$(BIN)/presage bench map --size 2000 --json $(RESULTS)/large-map.json
 	$(BIN)/presage bench training --out $(RESULTS)/training --json $(RESULTS)/training.json
 	$(BIN)/python -m lab.benchmarks.live_changes --worlds office,3482,3483 --seed 3482 --json $(RESULTS)/live-changes.json
 	$(BIN)/python -m lab.benchmarks.live_refinement --worlds office,3447,3448 --seed 3447 --json $(RESULTS)/live-refinement.json

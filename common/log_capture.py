@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TextIO
 
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+PYBULLET = re.compile(r"pybullet build time: .*")  # printed to stderr when it is imported
 ZENOH = re.compile(r"\d{4}-\d\d-\d\dT\S+\s+(?P<level>[A-Z]+)\s.*?(?P<logger>zenoh[\w:]*):\s+(?P<text>.*)")
 
 
@@ -27,13 +28,14 @@ class CapturedLine:
 def parse_line(raw: str, stream: str) -> CapturedLine | None:
     """Parses a line: zenoh's lines state level and module; others are warnings on stderr and information on stdout.
 
-    Returns None for an empty line.
+    pybullet's version is information, too. Returns None for an empty line.
     """
     text = COLOUR.sub("", raw).rstrip()
     if (found := ZENOH.fullmatch(text)) is not None:
         level = found["level"].lower()
         return CapturedLine({"warn": "warning", "trace": "debug"}.get(level, level), found["logger"], found["text"])
-    return CapturedLine("warning" if stream == "stderr" else "info", stream, text) if text else None
+    is_warning = stream == "stderr" and not PYBULLET.fullmatch(text)
+    return CapturedLine("warning" if is_warning else "info", stream, text) if text else None
 
 
 def capture(handle: Callable[[CapturedLine], None]) -> TextIO:
@@ -47,12 +49,14 @@ def capture(handle: Callable[[CapturedLine], None]) -> TextIO:
     original = {"stdout": os.dup(1), "stderr": os.dup(2)}
     threads = [_redirect(number, name, handle) for number, name in ((1, "stdout"), (2, "stderr"))]
     # `print` keeps its destination: it is used for text that the user requested (--help, the page's link).
-    sys.stdout = os.fdopen(os.dup(original["stdout"]), "w", buffering=1, encoding="utf-8", errors="replace")
+    sys.stdout = printed = os.fdopen(os.dup(original["stdout"]), "w", buffering=1, encoding="utf-8", errors="replace")
 
     def release() -> None:
         sys.stderr.flush()
         os.dup2(original["stdout"], 1)
         os.dup2(original["stderr"], 2)
+        sys.stdout = sys.__stdout__
+        printed.close()
         for thread in threads:  # they end when the last writer closes the pipe; a child process may keep it open
             thread.join(timeout=1.0)
 

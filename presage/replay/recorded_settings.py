@@ -5,15 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
 from common.errors import UserError, first_fault
-from common.messages.definitions import Scan
-from common.messages.topics import SCAN
 from common.runtime.config import ServiceSettings
 from common.versions import versions
 from services.controller.settings import ControllerSettings
@@ -89,17 +87,6 @@ def estimator_settings(
     weights_file = _extract_weights(recording, folder, model) or _find_weights(recording, values, model)
     values |= {"models": str(weights_file.parent), "model": "learned"}
     return RecordedSettings(values)
-
-
-def check_recorded_mount(recording: Recording, settings: EstimatorSettings) -> None:
-    """Raises UserError if the recording's mount is only assumed and the weights were trained with another mount."""
-    from presage.logs.scan_files import mount_assumed  # slow import of numba
-    from services.estimator.factory import ScannerGeometry
-    from services.estimator.service import SharedModels
-
-    if mount_assumed(recording):
-        scan = next(message for _, message, _ in recording.messages(SCAN) if isinstance(message, Scan))
-        SharedModels(settings).factory(replace(ScannerGeometry.of_scan(scan), mount_assumed=True))
 
 
 def world_file(recording: Recording, folder: Path) -> Path | None:

@@ -37,7 +37,6 @@ class MessagePairs:
     position_m: list[float] = field(default_factory=list)  # differences between beliefs
     heading_rad: list[float] = field(default_factory=list)
     tracking: list[bool] = field(default_factory=list)  # whether both beliefs are in state tracking
-    new_tracking: int = 0  # number of new beliefs in state tracking
     max_speed_difference: float = 0.0  # m/s or rad/s, between commands
     # Messages without their counterpart, by stamp: (whether new, message).
     _unpaired: dict[int, deque[tuple[bool, Stamped]]] = field(default_factory=lambda: defaultdict(deque))
@@ -48,7 +47,6 @@ class MessagePairs:
 
     def add_new(self, message: Stamped) -> None:
         """Adds a new message."""
-        self.new_tracking += isinstance(message, Belief) and message.state == "tracking"
         self._match(message, new=True)
 
     def unmatched(self) -> Counter[str]:
@@ -106,7 +104,6 @@ class MessagePairs:
 class ReplayOutcome:
     """Result of running services on recorded inputs."""
 
-    imported: bool = field(default=False, kw_only=True)  # from a log, so without recorded beliefs to compare
     lockstep: bool  # the session and the replay ran in lockstep, so that equality is required
     tolerance_reason: str = ""  # why results may differ by the tolerance; empty if they must be identical
     beliefs: MessagePairs = field(default_factory=MessagePairs)
@@ -124,14 +121,11 @@ class ReplayOutcome:
     def agrees(self) -> bool:
         """Whether the results agree.
 
-        In lockstep they must be identical; otherwise they may differ by the tolerance while tracking. For an imported
-        log, every scan must have been answered.
+        In lockstep they must be identical; otherwise they may differ by the tolerance while tracking.
         """
         pairs, left = self.beliefs, self.beliefs.unmatched()["recorded"]
         if self.damaged:
             return False
-        if self.imported:
-            return self.sent > self.unanswered == 0
         if self.lockstep:
             commands_agree = self.commands.compared == self.commands.equal or not self.goals_placed
             return 0 < pairs.compared == pairs.equal and not left and commands_agree
@@ -143,8 +137,6 @@ class ReplayOutcome:
     def as_dict(self) -> dict[str, Any]:
         """The results as values that JSON can hold."""
         return {
-            "imported": self.imported,
-            "tracking": self.beliefs.new_tracking,
             "lockstep": self.lockstep,
             "tolerance_reason": self.tolerance_reason,
             "agrees": self.agrees,

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import sys
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +27,6 @@ from presage.replay.feed import ScanFeed
 from presage.replay.in_process import InProcessServices
 from presage.replay.recorded_settings import (
     SETTINGS,
-    RecordedSettings,
-    check_recorded_mount,
     estimator_settings,
     other_versions,
     recorded_settings,
@@ -81,12 +79,13 @@ def run_service_replay(options: ServiceReplayOptions, console: Console) -> Repla
     scans = recording.counts()[SCAN.key(robot)]
     if not scans:
         raise UserError(f"{options.file}: no scan in it")
-    if imported := "log" in recording.metadata:
-        if names != ("estimator",):
-            raise UserError(f"{options.file}: an imported log has no goals for a controller: use --with estimator")
-        options = replace(options, every_scan=True)  # a log contains no beliefs that could select scans
+    if "log" in recording.metadata:
+        raise UserError(
+            f"{options.file}: an imported log has no beliefs to compare with; run an estimator on it with: presage "
+            f"localize {options.file}"
+        )
     tolerance_reason = find_tolerance_reason(recording, options)
-    outcome = ReplayOutcome(not tolerance_reason, tolerance_reason, scans=scans, imported=imported)
+    outcome = ReplayOutcome(not tolerance_reason, tolerance_reason, scans=scans)
     with tempfile.TemporaryDirectory(prefix="presage-") as folder:
         services = build_services(recording, names, Path(folder), outcome.notes)
         outputs = {BELIEF, CMD_VEL} if "controller" in names else {BELIEF}
@@ -111,11 +110,6 @@ def build_services(recording: Recording, names: tuple[str, ...], folder: Path, n
     services: list[Service] = []
     for name in names:
         recorded = recorded_settings(recording, name)
-        if recorded is None and "log" in recording.metadata:
-            if (world := world_file(recording, folder)) is None:
-                raise UserError(f"{recording.path}: imported without a world: import it again with --world")
-            recorded = RecordedSettings({"world": str(world)})
-            notes.append("an imported log: the estimator runs with its default settings")
         if recorded is None:
             raise UserError(
                 f"{recording.path}: the {name}'s configuration was not recorded (it may not have been running); start "
@@ -126,11 +120,9 @@ def build_services(recording: Recording, names: tuple[str, ...], folder: Path, n
         if name == "estimator":
             if values.get("learn") == "refine":  # what it learned was recorded
                 values = {**values, "learn": "follow"}
-            unpacked = estimator_settings(recording, folder, values, weights="log" not in recording.metadata)
+            unpacked = estimator_settings(recording, folder, values)
             notes += unpacked.notes
-            settings = settings_with(EstimatorSettings, unpacked.values)
-            check_recorded_mount(recording, settings)
-            services.append(EstimatorService(settings))
+            services.append(EstimatorService(settings_with(EstimatorSettings, unpacked.values)))
         else:
             if values.get("world") and (world := world_file(recording, folder)) is not None:
                 values = {**values, "world": str(world)}
@@ -200,9 +192,6 @@ def describe(outcome: ReplayOutcome) -> list[str]:
 def _verdict(outcome: ReplayOutcome) -> str:
     if outcome.damaged:
         return f"[bold red]the recording is damaged ({outcome.damaged}): what comes after that was not compared[/]"
-    if outcome.imported:
-        tracking = f"{outcome.beliefs.new_tracking} beliefs of {outcome.sent} scans are in state tracking"
-        return f"{tracking}; the log has no beliefs to compare with (`presage rerun` stores the new ones)"
     if outcome.lockstep and outcome.agrees:
         return "[bold green]the session ran in lockstep, and the results are identical[/]"
     if outcome.lockstep:

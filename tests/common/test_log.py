@@ -90,6 +90,8 @@ def test_zenohs_lines_are_parsed():
     )
     assert parse_line(zenoh, "stdout") == CapturedLine("warning", "zenoh::net::runtime", "Unable to connect: refused")
     assert parse_line("thread 'x' panicked", "stderr") == CapturedLine("warning", "stderr", "thread 'x' panicked")
+    pybullet = "pybullet build time: Jan 29 2025 23:17:20"
+    assert parse_line(pybullet, "stderr") == CapturedLine("info", "stderr", pybullet)
     assert parse_line("  \n", "stdout") is None
 
 
