@@ -101,14 +101,14 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	mkdir -p $(RESULTS)
 	$(BIN)/presage bench accuracy --estimators all --seed 3211 --seeds 5 --trials 10 --minutes 0.2 --json $(RESULTS)/accuracy.json --figure $(RESULTS)/accuracy.png
 	$(BIN)/presage experiment --out $(RESULTS) all
-	$(BIN)/presage experiment --seed 3469 --out $(RESULTS) navigation --trials 30
-	$(BIN)/presage experiment --seed 3470 --out $(RESULTS) navigation --start unknown --trials 30
+	$(BIN)/presage experiment --seed 3498 --out $(RESULTS) navigation --trials 30
+	$(BIN)/presage experiment --seed 3499 --out $(RESULTS) navigation --start unknown --trials 30
 	$(BIN)/presage experiment --seed 3476 --out $(RESULTS) navigation --worlds office --people 10 --trials 50
 	$(BIN)/presage experiment --seed 3467 --out $(RESULTS) navigation --worlds hall --drives holonomic --max-range 4 --beams 271 --prior odometry --slip 0.05 --limit 60 --trials 50
 	$(BIN)/presage experiment --seed 3467 --out $(RESULTS) navigation --worlds hall --drives holonomic --max-range 4 --beams 271 --prior odometry --slip 0.05 --limit 60 --trials 50 --no-epistemic
 	$(BIN)/presage experiment --seed 3471 --out $(RESULTS) navigation --worlds twins --start unknown --trials 50
 	$(BIN)/presage experiment --seed 4300 --out $(RESULTS) navigation --worlds twins --start unknown --trials 50 --drives holonomic --no-epistemic
-	$(BIN)/presage experiment --seed 3475 --out $(RESULTS) docking --trials 64
+	$(BIN)/presage experiment --seed 3500 --out $(RESULTS) docking --trials 64
 	$(BIN)/presage experiment --seed 3485 --out $(RESULTS) exploration
 	$(BIN)/presage bench mapping-faults --worlds 2 --seed 990 --seconds 60 --json $(RESULTS)/mapping-faults.json
 	$(BIN)/presage bench refinement --worlds 3 --seed 3447 --seconds 300 --out $(RESULTS)/refinement --json $(RESULTS)/refinement.json
@@ -117,7 +117,7 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	$(BIN)/presage bench training --out $(RESULTS)/training --json $(RESULTS)/training.json
 	$(BIN)/python -m lab.benchmarks.live_changes --worlds office,3482,3483 --seed 3482 --json $(RESULTS)/live-changes.json
 	$(BIN)/python -m lab.benchmarks.live_refinement --worlds office,3447,3448 --seed 3447 --json $(RESULTS)/live-refinement.json
-	$(if $(PEERS),OMP_NUM_THREADS=1 $(BIN)/presage experiment --seed 3611 --out $(RESULTS) peers '$(PEERS)' --trials 100)
+	$(if $(PEERS),OMP_NUM_THREADS=1 $(BIN)/presage experiment --seed 3612 --out $(RESULTS) peers '$(PEERS)' --trials 100)
 	$(if $(LOGS),$(BIN)/presage map '$(LOGS)/fr079.npz' --mount 0,0,0 --poses reference --half second --no-learn -o $(RESULTS)/maps/second_half.yaml)
 	$(if $(LOGS),$(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/fr079.npz' --mount 0,0,0 --world $(RESULTS)/maps/second_half.yaml --exchange --every 200 --name fr079_exchanged)
 	$(if $(LOGS),$(BIN)/presage map '$(LOGS)/fr079.npz' --mount 0,0,0 --poses reference --half first --no-learn -o $(RESULTS)/maps/first_half.yaml)
@@ -125,11 +125,11 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	$(if $(LOGS),$(BIN)/presage map '$(LOGS)/uwb.npz' --mount 0,0,0 --poses reference --half first --no-learn -o $(RESULTS)/maps/uwb_first_half.yaml)
 	$(if $(LOGS),$(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/uwb.npz' --mount 0,0,0 --world $(RESULTS)/maps/uwb_first_half.yaml --every 10 --name uwb)
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity --worlds 3 --seed 3478 --model exact --seconds 10 --estimators precise,particle-filter,particle-filter-recovery
-	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-long-corridor --worlds 20 --seed 3462 --model exact --seconds 10 --cases long-corridor --estimators precise
-	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-noisy-map --worlds 20 --seed 3457 --model exact --seconds 40 --cases noisy-map
-	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-50 --worlds 20 --seed 3479 --model exact --cases moved-50 --estimators precise,particle-filter,particle-filter-recovery
-	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-100 --worlds 20 --seed 3460 --model exact --seconds 10 --cases moved-100 --estimators precise
-	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-single-scan --worlds 20 --seed 3464 --model exact --cases single-scan-moved-50 --estimators precise
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-long-corridor --worlds 40 --seed 3486 --model exact --seconds 10 --cases long-corridor --estimators precise
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-noisy-map --worlds 20 --seed 3487 --model exact --seconds 40 --cases noisy-map
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-50 --worlds 20 --seed 3488 --model exact --cases moved-50 --estimators precise,particle-filter,particle-filter-recovery
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-100 --worlds 40 --seed 3489 --model exact --seconds 10 --cases moved-100 --estimators precise
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-single-scan --worlds 40 --seed 3490 --model exact --cases single-scan-moved-50 --estimators precise
 	for folder in $(RESULTS)/integrity*/; do cp $$folder/integrity.json docs/experiments/$$(basename $$folder).json || exit 1; done
 	cp $(RESULTS)/integrity/integrity.png $(RESULTS)/*.json $(RESULTS)/*.csv $(RESULTS)/*.png $(RESULTS)/*.pdf docs/experiments/
 	mv docs/experiments/accuracy.png docs/accuracy.png
