@@ -39,6 +39,8 @@ _PROBLEMS = {
     "too_long": "too many entries: at most {max_length} are allowed, not {actual_length}",
 }
 NAME_PATTERN = r"^[\w.-]+$"  # of names in files
+# What to say of text that does not match a pattern; a module that defines another pattern may add to it.
+PATTERN_PROBLEMS = {NAME_PATTERN: "only letters, digits, '.', '-' and '_' may be in a name, not {input}"}
 
 
 def first_fault(error: ValidationError) -> str:
@@ -54,8 +56,8 @@ def first_problem(error: ValidationError) -> str:
     value = f"{given}" if isinstance(given, (int, float)) else repr(str(given)[:40])
     if first["type"] in _PROBLEMS:
         return _PROBLEMS[first["type"]].format(input=value, **context)
-    if context.get("pattern") == NAME_PATTERN:
-        return f"only letters, digits, '.', '-' and '_' may be in a name, not {value}"
+    if problem := PATTERN_PROBLEMS.get(context.get("pattern", "")):
+        return problem.format(input=value)
     return str(first["msg"]).removeprefix("Value error, ")
 
 

@@ -38,7 +38,7 @@ class Estimator:
         scanner: Scanner | str | None = None,
         mount: Numbers | None = None,
         model: str | Path | GenerativeModel = "learned",
-        models: Path | None = None,
+        models: Path | str | None = None,
         likelihood: Likelihood | None = None,
         optimiser: Optimiser | None = None,
         sigma: float | None = None,
@@ -72,7 +72,7 @@ class Estimator:
             generative_model=None if isinstance(model, str | Path) else model,
             likelihood=likelihood,
             optimiser=optimiser,
-            models=models,
+            models=None if models is None else Path(models),
             sigma=sigma,
             seed=seed,
             initial_pose=None if initial_pose is None else np.asarray(initial_pose, float),
@@ -84,6 +84,8 @@ class Estimator:
             raise UserError(f"no scanner {scanner!r}: give a Scanner, or one of {', '.join(SCANNERS)}")
         self.scanner = SCANNERS[scanner] if isinstance(scanner, str) else scanner
         self._mount = None if mount is None else np.asarray(mount, float)
+        if self._mount is not None and self._mount.shape != (3,):
+            raise UserError(f"mount: give x, y in m and yaw in rad, not an array of shape {self._mount.shape}")
         self._geometry: ScannerGeometry | None = None  # of the scans
         self._core: PoseEstimator | None = None  # made for this geometry
         if self.scanner is not None:

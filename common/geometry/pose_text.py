@@ -6,12 +6,13 @@ import re
 
 import numpy as np
 
-from common.errors import UserError
+from common.errors import PATTERN_PROBLEMS, UserError
 from common.geometry.se2 import Array
 from common.limits import MAX_COORDINATE_M
 
 NUMBER_PATTERN = r"-?(\d{1,9}\.?\d*|\.\d+)"
 POSE_PATTERN = rf"^$|^{NUMBER_PATTERN},{NUMBER_PATTERN}(,{NUMBER_PATTERN})?$"  # in settings, empty text means no pose
+PATTERN_PROBLEMS[POSE_PATTERN] = "give x,y[,yaw_deg] in m and degrees, such as 0.2,0,180, not {input}"
 
 
 def parse_pose(text: str, option: str) -> Array:

@@ -79,3 +79,14 @@ def transform(pose: npt.ArrayLike, points: npt.ArrayLike) -> Array:
     """Transforms points (..., 2) in m from the frame with the given ``pose`` (3,) to its parent frame."""
     p = np.asarray(pose, float)
     return np.asarray(p[:2] + rotate(float(p[2]), points))
+
+
+def alignment(poses: Array, targets: Array) -> Array:
+    """Pose (3,) of the frame of ``poses`` from which their positions (N, 2) are nearest to those of ``targets``.
+
+    Least squares of the distances, in closed form (Horn 1987 in the plane); headings do not count.
+    """
+    mean, target_mean = poses[:, :2].mean(axis=0), targets[:, :2].mean(axis=0)
+    a, b = poses[:, :2] - mean, targets[:, :2] - target_mean
+    turn = float(np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum()))
+    return np.array([*(target_mean - rotate(turn, mean)), turn])

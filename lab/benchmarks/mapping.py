@@ -80,15 +80,7 @@ def trajectory_errors(poses: Array, truths: Array) -> Errors:
 
 def fitted(poses: Array, truths: Array) -> Array:
     """A trajectory (N, 3), moved and turned as a whole so that its positions are nearest to those of ``truths``."""
-    return se2.compose(alignment(poses, truths), poses)
-
-
-def alignment(poses: Array, truths: Array) -> Array:
-    """Pose (3,) of a trajectory's frame in map, from which its positions (N, 2) are nearest to those of ``truths``."""
-    mean, true_mean = poses[:, :2].mean(axis=0), truths[:, :2].mean(axis=0)
-    a, b = poses[:, :2] - mean, truths[:, :2] - true_mean
-    turn = float(np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum()))
-    return np.array([*(true_mean - se2.rotate(turn, mean)), turn])
+    return se2.compose(se2.alignment(poses, truths), poses)
 
 
 def _read_relations(file: Path) -> Array:

@@ -22,7 +22,6 @@ from common.geometry.se2 import Array
 from common.geometry.world import World
 from lab.accuracy.scenes import TWINS, Scene
 from lab.accuracy.tasks import is_at
-from lab.benchmarks.mapping import alignment
 from lab.experiments.results import markdown, millimetres, number
 from lab.integrity.buildings import make_building
 from lab.integrity.cases import BEAMS
@@ -163,7 +162,7 @@ def map_drive(disturbed: DisturbedDrive, odometry: bool) -> dict[str, Any]:
     poses, truth = built.poses[known], disturbed.truth[known]
     before = np.flatnonzero(known) < disturbed.undisturbed
     reference = before if before.any() else ~before  # the map may be the part after it
-    placed = se2.compose(alignment(poses[reference], truth[reference]), poses)
+    placed = se2.compose(se2.alignment(poses[reference], truth[reference]), poses)
     right = np.array([is_at(*pair) for pair in zip(placed, truth, strict=True)])
     errors = np.hypot(*(placed - truth)[right, :2].T)
     return {

@@ -17,7 +17,6 @@ from common.geometry.ros_map_writer import write_grid
 from common.geometry.se2 import Array
 from common.geometry.world import World, load_world
 from lab.accuracy.scenes import Scene
-from lab.benchmarks.mapping import alignment
 from lab.benchmarks.visits import PERIOD_S, building_of, drive_through_rooms, write_drive_log
 from lab.experiments.results import markdown, millimetres, number
 from lab.experiments.trials import run_trials
@@ -91,7 +90,7 @@ def refine_and_test(job: RefinementJob) -> dict[str, Any]:
         map_command(MapOptions(log, made, reading=reading, refine=file, models=out), QUIET, QUIET)
         taken = time.perf_counter() - begin
         placed, truths = _trajectory(made.with_suffix(".tum"), poses)
-        frame = alignment(placed, truths)
+        frame = se2.alignment(placed, truths)
         aligned = np.hypot(*(se2.compose(frame, placed) - truths)[:, :2].T)
         row = {
             "world": world.name,

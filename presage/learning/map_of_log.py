@@ -81,7 +81,8 @@ def map_command(options: MapOptions, console: Console, progress: Console) -> Pat
         # Where the drive saw nothing, the model learns from scans simulated in the rough map.
         samples = 0 if rough is None else enough_scans(rough)
         training = TrainDriveOptions(options.log, str(path), options.models, samples, rough=rough, former=former)
-        train_on_drive(training, drive, console)
+        weights_file = train_on_drive(training, drive, console)
+        console.print(f"next: presage up --world {path} --model {weights_file}", soft_wrap=True)
     return path
 
 

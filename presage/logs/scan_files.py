@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -50,7 +50,16 @@ class Scans:
     def __len__(self) -> int:
         return len(self.ranges)
 
-    def __getitem__(self, k: int) -> LaserScan:
+    @overload
+    def __getitem__(self, k: int) -> LaserScan: ...
+
+    @overload
+    def __getitem__(self, k: slice) -> list[LaserScan]: ...
+
+    def __getitem__(self, k: int | slice) -> LaserScan | list[LaserScan]:
+        return [self._scan(each) for each in range(len(self))[k]] if isinstance(k, slice) else self._scan(k)
+
+    def _scan(self, k: int) -> LaserScan:
         def row(values: Array | None) -> Array | None:
             return values[k] if values is not None and np.isfinite(values[k]).all() else None
 

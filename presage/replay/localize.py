@@ -173,7 +173,7 @@ def localize(options: LocalizeOptions, console: Console) -> list[dict[str, Any]]
         if options.mode == "global":
             raise UserError("--initial-pose is for mode track only: add --mode track, or leave it out")
         world = options.estimator_options.world
-        check_start(options.estimator_options, load_world(world) if isinstance(world, str) else world)
+        check_start(options.estimator_options.initial_pose, load_world(world) if isinstance(world, str) else world)
     laser, kind = options.frame == "laser", kind_of(options.file)
     estimator = prepare_estimator(options.estimator_options, console)
     with working(f"reading {options.file.name}", console):
@@ -318,10 +318,20 @@ def _summarise(scans: Scans, rows: list[dict[str, Any]], in_file: int, console: 
         return
     truth = scans.truth[: len(rows)]
     truth = se2.compose(truth, scans.geometry.mount) if laser else truth
-    error = np.hypot(*(np.array([[row["x"], row["y"]] for row in rows]) - truth[:, :2]).T)
-    error = error[np.isfinite(error)]
-    if len(error):
+    poses = np.array([[row["x"], row["y"], row["yaw"]] for row in rows])
+    known = np.isfinite(truth).all(axis=1)
+    poses, truth = poses[known], truth[known]
+    if not len(poses):
+        return
+    console.print(f"against {scans.truth_is}: {_errors(poses, truth)}")
+    frame = se2.alignment(truth, poses)
+    if len(poses) > 1:
         console.print(
-            f"against {scans.truth_is}: {np.median(error) * 1e3:.1f} mm median, "
-            f"{np.sqrt(np.mean(error**2)) * 1e3:.1f} mm RMS, {error.max() * 1e3:.1f} mm maximum"
+            f"with the reference moved by {frame[0]:.3f}, {frame[1]:.3f} m and {np.rad2deg(frame[2]):.2f} deg to fit: "
+            f"{_errors(poses, se2.compose(frame, truth))}"
         )
+
+
+def _errors(poses: Array, truth: Array) -> str:
+    error = np.hypot(*(poses - truth)[:, :2].T) * 1e3
+    return f"{np.median(error):.1f} mm median, {np.sqrt(np.mean(error**2)):.1f} mm RMS, {error.max():.1f} mm maximum"

@@ -144,7 +144,7 @@ def prepare_factory(options: EstimatorOptions) -> EstimatorFactory:
     if options.estimator not in get_args(EstimatorPreset):
         raise UserError(f"no estimator {options.estimator!r}: choose one of {', '.join(get_args(EstimatorPreset))}")
     world = options.loaded_world
-    check_start(options, world)
+    check_start(options.initial_pose, world)
     if options.estimator == "paper":
         return _prepare_paper(options, world)
     if options.estimator == "precise":
@@ -227,22 +227,22 @@ def field_path(options: EstimatorOptions, world: World) -> Path:
 
 def check_options(options: EstimatorOptions, world: World) -> None:
     """Raises UserError if a model is missing, as `prepare_factory` does, but without compiling anything."""
-    check_start(options, world)
+    check_start(options.initial_pose, world)
     if options.estimator == "precise" and options.model != "exact":
         weights.load(field_path(options, world))
     elif options.estimator == "paper":
         _paper_weights(options, world)
 
 
-def check_start(options: EstimatorOptions, world: World) -> None:
-    """Raises UserError if the initial pose is off the map.
+def check_start(pose: Array | None, world: World) -> None:
+    """Raises UserError if the initial ``pose`` (3,) or (2,) is off the map.
 
     A pose inside a wall is accepted, because the wall may have been moved.
     """
-    if options.initial_pose is None:
+    if pose is None:
         return
     x0, y0, x1, y1 = world.bounds
-    x, y = map(float, options.initial_pose[:2])
+    x, y = map(float, pose[:2])
     if not (x0 <= x <= x1 and y0 <= y <= y1):
         raise UserError(
             f"initial pose ({x:g}, {y:g}) is off the map: {world.name} goes from ({x0:g}, {y0:g}) to ({x1:g}, {y1:g})"

@@ -50,7 +50,13 @@ from common.messages.topics import (
 from common.robot.ranges import ranges_for_localisation
 from common.runtime.odometry_sync import OdometrySync, ScanWithOdometry
 from common.runtime.service import Service
-from services.estimator.factory import EstimatorFactory, EstimatorOptions, ScannerGeometry, prepare_factory
+from services.estimator.factory import (
+    EstimatorFactory,
+    EstimatorOptions,
+    ScannerGeometry,
+    check_start,
+    prepare_factory,
+)
 from services.estimator.field_exchange import FieldAssembler, split_into_messages
 from services.estimator.learner import EncodedVersion, Learner
 from services.estimator.model_card import ModelInUse, model_in_use, save_learned
@@ -183,6 +189,7 @@ class EstimatorService(Service):
             return super().on_request(query, request)
         assert self.models is not None  # noqa: S101 - set in open
         start = None if request.pose is None else self.models.world.to_map(request.pose.array(), request.map_id)
+        check_start(start, self.models.world)
         self.estimator.restart(start if start is None or request.heading_known else start[:2])
         if self._learner is not None:
             self._learner.keys.forget_unverified()

@@ -150,6 +150,9 @@ def test_localise_request(paper):
     for pose, expected in ((Pose(x=4.0, y=1.0), [4.0, 1.0]), (None, [9.0, 2.25])):
         assert paper.on_request(LOCALISE, LocaliseRequest(pose=pose)).ok
         assert paper.estimator.estimator.pose[:2].tolist() == expected
+    with pytest.raises(UserError, match=r"\(400, 1\) is off the map: corridor goes from"):
+        paper.on_request(LOCALISE, LocaliseRequest(pose=Pose(x=400.0, y=1.0)))
+    assert paper.estimator.estimator.pose[:2].tolist() == [9.0, 2.25]
 
 
 def test_goal_cancelled(paper):

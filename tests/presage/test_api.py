@@ -100,6 +100,8 @@ def test_mount_argument_replaces_the_scans(world, ranges):
     scan = presage.LaserScan(ranges, SCANNER.angles(), 25.0)  # the laser's own pose
     belief = presage.Estimator(world, mount=SCANNER.mount).update(scan)
     np.testing.assert_allclose(belief.pose, POSE, atol=0.02)
+    with pytest.raises(presage.UserError, match=r"mount: give x, y in m and yaw in rad, not an array of shape \(2,\)"):
+        presage.Estimator(world, mount=(0, 0))
 
 
 @pytest.mark.parametrize(

@@ -184,7 +184,7 @@ def test_read_only_disk_and_no_weights(tmp_path, free_port):
     found = read_findings(tmp_path)
     assert "Read-only file system" in find_fault(found, "not_writable", "recordings cannot be written to")["what"]
     assert find_fault(found, "disk", "MB free")["where"] == str(disk)
-    assert f"presage train --world {world}" in find_fault(found, "weights", "no field of world 'shed'")["what"]
+    assert f"presage train --world {world}" in find_fault(found, "weights", "no weights for world 'shed'")["what"]
 
 
 def words(text: str) -> str:

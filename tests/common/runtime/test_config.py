@@ -14,7 +14,8 @@ from common.bus.bus import DEFAULT_ENDPOINT, Link
 from common.errors import UserError
 from common.geometry.pose_text import POSE_PATTERN, parse_initial_pose, parse_pose
 from common.router.router import RouterSettings
-from common.runtime.config import ServiceSettings, load_settings, split_endpoints
+from common.runtime.config import ServiceSettings, load_section, load_settings, split_endpoints
+from presage.logs.options import LogSettings
 
 
 class Settings(ServiceSettings):
@@ -88,6 +89,8 @@ def test_invalid_poses(text):
     assert not re.match(POSE_PATTERN, text)
     with pytest.raises(UserError, match=r"--mount '.*': give x,y\[,yaw_deg\] in m and degrees"):
         parse_pose(text, "--mount")
+    with pytest.raises(UserError, match=r"mount: give x,y\[,yaw_deg\] in m and degrees, such as 0.2,0,180, not"):
+        load_section(LogSettings, None, "log", mount=text)
 
 
 def test_poses_beyond_the_limits():

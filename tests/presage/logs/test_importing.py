@@ -68,6 +68,7 @@ def test_recording_equals_log(tmp_path, name):
     reading = Reading(mount=MOUNT) if name == "npz" else Reading()
     out, facts = imported(file, reading=reading, world="corridor")
     log, recorded = read_scans(file, reading.mount), read_scans(out)
+    assert [scan.stamp for scan in log[1:3]] == [log[1].stamp, log[2].stamp]
     np.testing.assert_allclose(recorded.ranges, log.ranges, rtol=1e-6)
     np.testing.assert_allclose(recorded.geometry.angles, log.geometry.angles, atol=1e-6)
     np.testing.assert_allclose(recorded.geometry.mount, MOUNT, atol=1e-5)

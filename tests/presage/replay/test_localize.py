@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import shutil
 import signal
 from dataclasses import replace
@@ -125,11 +126,17 @@ def test_start_pose(tmp_path):
 def test_reference(tmp_path, capsys):
     reference = PATH.copy()
     reference[5:] = np.nan  # not known throughout
+    frame = np.array([3.0, -2.0, 3.0])  # of the reference, in map
     file = npz(tmp_path, mount=(0, 0, 0), reference=reference, initial_pose=None)
     np.testing.assert_array_equal(read_scans(file, np.zeros(3)).truth, reference)
     rows = localize(job(file, mode="track", frame="laser"), Console(width=150))
     assert errors(rows).max() < 0.02
     assert "against the file's reference: " in capsys.readouterr().out
+    turned = npz(tmp_path, mount=(0, 0, 0), reference=se2.between(frame, reference), initial_pose=None)
+    localize(job(turned, mode="track", frame="laser", initial_pose="4,1.5,57"), Console(width=150))
+    far, fitted = re.findall(r"([\d.]+) mm maximum", capsys.readouterr().out)
+    assert float(far) > 1000
+    assert float(fitted) < 20
 
 
 @pytest.mark.parametrize("estimator", ["particle-filter", "amcl-defaults"])

@@ -201,8 +201,9 @@ def find(folder: Path, world: World, world_argument: str) -> Path:
     path = path_of(folder, world.name)
     if not path.exists():
         raise UserError(
-            f"no field of world {world.name!r} in {folder}; train it with: {train_command(world_argument, folder)}; "
-            "or use --model exact, which casts rays in the world itself and needs no training"
+            f"no weights for world {world.name!r} in {folder}; train them with: "
+            f"{train_command(world_argument, folder)}; or give the file that holds them with --model "
+            "FILE.safetensors; or use --model exact, which casts rays in the world itself and needs no training"
         )
     if not same_walls(_load_card(path).world, world):
         raise UserError(
