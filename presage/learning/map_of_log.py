@@ -82,7 +82,7 @@ def map_command(options: MapOptions, console: Console, progress: Console) -> Pat
         samples = 0 if rough is None else enough_scans(rough)
         training = TrainDriveOptions(options.log, str(path), options.models, samples, rough=rough, former=former)
         weights_file = train_on_drive(training, drive, console)
-        console.print(f"next: presage up --world {path} --model {weights_file}", soft_wrap=True)
+        console.print(f"use them with --world {path} --model {weights_file}", soft_wrap=True)
     return path
 
 
