@@ -25,7 +25,7 @@ TASKS = {
     "tracking, no odometry": "tracking, no odometry",
 }
 MOVED = "half of the furniture moved"
-MOVED_FILTERS = {"no recovery": "particle-filter", "tuned": "particle-filter-recovery"}
+MOVED_FILTERS = {"start kept": "particle-filter", "recovery": "particle-filter-recovery"}
 
 
 def real_logs(folder: Path) -> str:
@@ -86,8 +86,8 @@ def _best_filter(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 def _integrity(row: dict[str, Any]) -> str:
     tracking, wrong = (100 * row[name]["count"] / row[name]["of"] for name in ("tracking", "wrong"))
-    low, high = (100 * bound for bound in row["wrong"]["interval_95"])
-    return f"{tracking:.1f} % `tracking`, of which {wrong:.1f} % wrong ({low:.3g} to {high:.3g} %)"
+    drives = f"{row['trials_wrong_longer']} of {row['trials']} drives"
+    return f"{tracking:.1f} % `tracking`, of which {wrong:.1f} % wrong; for more than 1 s in {drives}"
 
 
 TABLES = {
