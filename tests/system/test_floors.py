@@ -47,7 +47,8 @@ def test_goal_on_another_floor(process, presage):
     assert presage("teleport", "1", "2", "0", "--floor", "first")[0] == 0
     assert going.wait(60) == 0, going.output
     assert going.output.startswith("going to (2, 2) on floor 'first'\n")
-    assert going.output.endswith("reached: within 0.02 m of the goal\n")
+    # On a busy machine there may be too few scans at the goal to state that the pose is known as well.
+    assert going.output.splitlines()[-1].startswith("reached: within 0.02 m of the goal")
     assert going.output.count("\n") < 12
 
     status, output = presage("goal", "4", "3.5", "--floor", "first")
