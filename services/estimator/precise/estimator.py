@@ -66,6 +66,8 @@ LOCAL_MISMATCH_PROBABILITY = 1e-6
 # A scan that the map predicts worse than the last one by more than this, in nats, may be matched at a wrong pose (a
 # guess). Then a wider area is searched.
 MAX_FIT_DROP = 20.0
+# The probability that the map's errors are this large, before a key scan has shown them: guesses.
+ROUGH_MAP_PROBABILITY, ROUGH_MAP_ERROR_M = 1e-4, 0.03
 # Smaller errors of the map, divided by the scanner's noise, cannot be told from the noise of one scan (a guess).
 SIGNIFICANT_MAP_ERROR = 0.25
 # A beam at a surface that the map lacks ends at one of the map's by chance with at most this probability. The map
@@ -200,7 +202,7 @@ class PreciseEstimator:
             raise RuntimeError("there is no scan to search with: call track first")
         view, observation = self._scan
         start, is_first = self._start, not self._precision.scans
-        self._search_for_hypotheses(view)
+        view = self._search_for_hypotheses([view, _with_rough_map(view)] if is_first else [view])
         if is_first and self._is_tracked():
             view = self._search_with_map_error(view, start)
         return self._finish_scan(view, observation)
@@ -406,7 +408,7 @@ class PreciseEstimator:
         if certain or 1 - self._probability_of_being_near(best) > 0.5 * doubt:
             return []
         motion = expected_motion(candidates)
-        found = search_near(view, motion.mean, motion.covariance, self.seeds, self.settings, self._rng)
+        found = search_near([view], motion.mean, motion.covariance, self.seeds, self.settings, self._rng)
         at_best = before.log_evidence + _prior_of([motion]).energy(best.pose[None])[0]
         return [
             replace(
@@ -508,7 +510,7 @@ class PreciseEstimator:
         # Prior against another place: the volume of all poses, divided by that of the poses at one place.
         information = best.curvature + np.linalg.inv(self.seeds.spread)
         log_places = np.log(self.seeds.volume) + 0.5 * (np.linalg.slogdet(information)[1] - 3 * np.log(2 * np.pi))
-        unknown = max(self._unknown_place.log_evidence, *(key.log_unknown for key in self._local_map.scans))
+        unknown = max([self._unknown_place.log_evidence, *(key.log_unknown for key in self._local_map.scans)])
         return bool(best.log_weight <= unknown - log_places)
 
     def _is_search_due(self) -> bool:
@@ -520,20 +522,29 @@ class PreciseEstimator:
     def _is_key_scan_due(self) -> bool:
         return self._local_map.is_key_scan_due(self._local_pose)
 
-    def _search_for_hypotheses(self, view: View) -> None:
-        """Searches near the initial pose or in the whole map, and adds what is found to the hypotheses."""
+    def _search_for_hypotheses(self, views: list[View]) -> View:
+        """Searches near the initial pose or in the whole map, and adds what is found to the hypotheses.
+
+        ``views`` are the present scan with different errors of the map; returns the one that is most probable.
+        """
         self._scans_since_search, self._search_interval = 0, min(2 * self._search_interval, MAX_SEARCH_INTERVAL)
         if self._start is not None:
             start, self._start = self._start, None
-            found = search_near(view, *start, self.seeds, self.settings, self._rng)
-            if not self._start_with(
-                view, found, self.settings.unknown_probability, self.settings.all_changed_probability
-            ):
-                self._add_hypotheses(self._search_everywhere(view), view)
-        elif not self.modes:
-            self._start_with(view, self._search_everywhere(view), 1.0)
+            found = search_near(views, *start, self.seeds, self.settings, self._rng)
+            view = _most_probable(views, found[0].pose)
+            unknown, all_changed = self.settings.unknown_probability, self.settings.all_changed_probability
+            self._start_with(view, found, unknown, unknown * self.settings.unmapped_share, all_changed)
+            if not self._may_be_elsewhere():
+                return view
+        found = self._search_everywhere(views)
+        view = _most_probable(views, found[0].pose)
+        if self.modes:
+            self._add_hypotheses(found, view)
+            view = _most_probable(views, self.modes[0].pose)
+            self._add_key_scan(view)
         else:
-            self._add_hypotheses(self._search_everywhere(view), view)
+            self._start_with(view, found, self.settings.unmapped_share, self.settings.unmapped_share)
+        return view
 
     def _search_with_map_error(self, view: View, start: tuple[Array, Array] | None) -> View:
         """Searches again if the map's errors at the first scan are larger than assumed, or the offset differs.
@@ -549,30 +560,31 @@ class PreciseEstimator:
             return view
         view = replace(view, map_error=error, correlated_fraction=precision.correlated_fraction, map_offset=offset)
         self.modes, self._start = [], start
-        self._search_for_hypotheses(view)
-        return view
+        return self._search_for_hypotheses([view])
 
-    def _search_everywhere(self, view: View) -> list[Mode]:
+    def _search_everywhere(self, views: list[View]) -> list[Mode]:
         """The hypotheses in the whole map at which the scan is more probable than at an unknown place; at least one."""
         if self._precision.scans:  # the map's errors were learned in one room, but the robot may be in another
-            view = replace(view, map_error=max(view.map_error, self._precision.map_error_elsewhere))
-        found = search_everywhere(view, self.seeds, self.settings)
+            elsewhere = self._precision.map_error_elsewhere
+            views = [replace(view, map_error=max(view.map_error, elsewhere)) for view in views]
+        found, view = search_everywhere(views, self.seeds, self.settings), views[0]
         small = view.surfaces.small
         log_at_unknown_place = _log_reference(view, small) + _log_unmapped_surfaces(view, small)
         return [mode for mode in found if mode.present > log_at_unknown_place + 1] or found[:1]
 
-    def _start_with(self, view: View, found: list[Mode], unknown: float, all_changed: float = 0.0) -> bool:
+    def _start_with(
+        self, view: View, found: list[Mode], unknown: float, off_map: float, all_changed: float = 0.0
+    ) -> None:
         """Starts with the hypotheses ``found``, and the probability ``unknown`` that the robot is at none.
 
-        With the probability ``all_changed``, no surface is as the map shows it. Returns whether the scan fits the best
-        hypothesis better than that.
+        ``off_map`` is the probability that it is at a place that is not on the map. With the probability
+        ``all_changed``, no surface is as the map shows it.
         """
         self._restart_local_map(view)
-        self._unknown_place.restart(unknown, self.settings.unmapped_share)
+        self._unknown_place.restart(unknown, off_map)
         reference = _log_reference(view, self._ignored_beams)
         log_all_changed = self._unknown_place.present + float(np.log(all_changed)) if all_changed else -np.inf
         self._set_hypotheses([replace(mode, present=max(mode.present - reference, log_all_changed)) for mode in found])
-        return found[0].present - reference > log_all_changed
 
     def _restart_local_map(self, view: View) -> None:
         """Starts a new local map at the present scan."""
@@ -599,7 +611,6 @@ class PreciseEstimator:
                 self._restart_local_map(view)
         self._unknown_place.exclude_mapped_places()
         self._set_hypotheses([*self.modes, *added])
-        self._add_key_scan(view)
 
     def _log_stayed(self, found: list[Mode], view: View) -> tuple[Array, Array]:
         """Evidence (N,) in nats that the robot has been at each hypothesis since the key scan for which it is largest.
@@ -700,6 +711,21 @@ def _fraction_not_by_chance(explained: float) -> float:
     """
     real = max(0.0, explained - EXPLAINED_BY_CHANCE) / (1 - EXPLAINED_BY_CHANCE)
     return real / explained if real else 0.0
+
+
+def _with_rough_map(view: View) -> View:
+    """The view if the map's errors are larger than assumed."""
+    return replace(
+        view,
+        map_error=float(np.hypot(view.map_error, ROUGH_MAP_ERROR_M)),
+        correlated_fraction=1.0,
+        log_prior=float(np.log(ROUGH_MAP_PROBABILITY)),
+    )
+
+
+def _most_probable(views: list[View], pose: Array) -> View:
+    """The one of ``views``, the same scan with different errors of the map, that is most probable at ``pose`` (3,)."""
+    return max(views, key=lambda view: view.log_prior + view.surface_evidence(pose[None]).log_likelihood[0])
 
 
 def _log_reference(view: View, skip: npt.NDArray[np.bool_]) -> float:

@@ -104,6 +104,7 @@ class View:
     changed_fraction: float = 0.25  # fraction of the beams that hit no surface of the map
     map_cell: float = 0.0  # m, edge of the cells if the map is a grid
     map_offset: float = 0.0  # m, mean distance of the real surfaces behind those that the model predicts
+    log_prior: float = 0.0  # nats, of the probability that the map's error is this large
     _last: list[_PredictedScans] = field(default_factory=list, init=False, repr=False)
 
     def thinned(self, beams: int) -> View:

@@ -76,12 +76,9 @@ class UnknownPlace:
     present: float = 0.0  # log likelihood of the present scan
     weight: float = 1.0  # probability
 
-    def restart(self, probability: float, unmapped: float) -> None:
-        """Starts with the ``probability`` that the robot is at no hypothesis, of which ``unmapped`` is off the map.
-
-        Only that part remains: a search has made hypotheses of the places on the map.
-        """
-        self.log_evidence = self.log_off_map = float(np.log(probability * unmapped))
+    def restart(self, probability: float, off_map: float) -> None:
+        """Starts with the ``probability`` that the robot is at no hypothesis, ``off_map`` that it is off the map."""
+        self.log_evidence, self.log_off_map = float(np.log(probability)), float(np.log(off_map))
 
     def allow_kidnapping(self, log_probability: float, unmapped: float) -> None:
         """Allows for a kidnapping; with probability ``unmapped`` it was to a place that is not on the map."""

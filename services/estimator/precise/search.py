@@ -28,34 +28,46 @@ SEED_SIGMA_M = 0.15  # typical error of a range at the nearest seed; added in qu
 # Added in the same way, step by step: in a descent from a seed, where more would take moved furniture for the map's,
 # and from a pose that may be half a metre off.
 SEED_SCHEDULE_M = (MEDIUM_SIGMA_M, MEDIUM_SIGMA_M, 0.05, 0.05)
-NEAR_SCHEDULE_M = (COARSE_SIGMA_M, COARSE_SIGMA_M, MEDIUM_SIGMA_M, MEDIUM_SIGMA_M, *FOLLOWING_SCHEDULE_M)
+NEAR_SCHEDULE_M = (COARSE_SIGMA_M, COARSE_SIGMA_M, MEDIUM_SIGMA_M, MEDIUM_SIGMA_M)
 
 
-def search_everywhere(view: View, seeds: Seeds, settings: PreciseSettings) -> list[Mode]:
+def search_everywhere(views: list[View], seeds: Seeds, settings: PreciseSettings) -> list[Mode]:
     """Returns the hypotheses that fit best in the whole map, best first.
 
-    Descends from those of the best seeds that have the most evidence by surfaces: with few beams, and from the best
-    results with all beams.
+    ``views`` are the same scan with different errors of the map. Descends from those of the best seeds that have the
+    most evidence by surfaces: with few beams, and from the best results with all beams, for each view.
     """
+    view = views[0]
     starts = seeds.rank(view, round(settings.ranked_seeds * seeds.starts_factor))
     fit = view.thinned(SEED_BEAMS).surface_evidence(starts, SEED_SIGMA_M).log_likelihood
     starts = starts[np.argsort(-fit, kind="stable")[: round(settings.search_starts * seeds.starts_factor)]]
     few = view.thinned(settings.search_beams)
     poses, _ = few.descend(starts, None, SEED_SCHEDULE_M)
     fit = few.surface_evidence(poses, SEED_SCHEDULE_M[-1]).log_likelihood
-    poses, evidence = view.descend(poses[select_distinct(poses, -fit, settings.search_results)])
-    return _best_modes(view, poses, evidence, None, seeds, settings)
+    starts = poses[select_distinct(poses, -fit, settings.search_results)]
+    return _best_first([_best_modes(each, *each.descend(starts), None, seeds, settings) for each in views])
 
 
 def search_near(
-    view: View, pose: Array, covariance: Array, seeds: Seeds, settings: PreciseSettings, rng: np.random.Generator
+    views: list[View],
+    pose: Array,
+    covariance: Array,
+    seeds: Seeds,
+    settings: PreciseSettings,
+    rng: np.random.Generator,
 ) -> list[Mode]:
-    """Returns the hypotheses that fit best near ``pose`` (3,), which is known within ``covariance`` (3, 3)."""
+    """Returns the hypotheses that fit best near ``pose`` (3,), which is known within ``covariance`` (3, 3).
+
+    ``views`` are the same scan with different errors of the map.
+    """
     starts = rng.multivariate_normal(pose, covariance, settings.near_starts)
     starts[0] = pose
     prior = Prior.repeated(len(starts), pose, covariance)
-    poses, evidence = view.descend(starts, prior, NEAR_SCHEDULE_M)
-    return _best_modes(view, poses, evidence, prior, seeds, settings)
+    poses, _ = views[0].descend(starts, prior, NEAR_SCHEDULE_M)
+    fit = views[0].surface_evidence(poses, NEAR_SCHEDULE_M[-1]).log_likelihood - prior.energy(poses)
+    starts = poses[select_distinct(poses, -fit, settings.search_results)]
+    prior = Prior.repeated(len(starts), pose, covariance)
+    return _best_first([_best_modes(each, *each.descend(starts, prior), prior, seeds, settings) for each in views])
 
 
 def search_around(view: View, starts: Array, prior: Prior, extra_starts: Array) -> tuple[Array, Evidence]:
@@ -68,7 +80,7 @@ def search_around(view: View, starts: Array, prior: Prior, extra_starts: Array) 
     hypothesis = np.concatenate([np.arange(count), np.zeros(len(extra_starts), np.int64)])
     starts = np.concatenate([starts, extra_starts])
     repeated_prior = Prior(prior.mean[hypothesis], prior.information[hypothesis])
-    poses, evidence = view.descend(starts, repeated_prior, NEAR_SCHEDULE_M)
+    poses, evidence = view.descend(starts, repeated_prior, (*NEAR_SCHEDULE_M, *FOLLOWING_SCHEDULE_M))
     of_first = np.flatnonzero(hypothesis == 0)
     energy = evidence.accuracy[of_first] + repeated_prior.energy(poses)[of_first]
     keep = np.array([of_first[np.argmin(energy)], *range(1, count)])
@@ -88,8 +100,12 @@ def _best_modes(
             replace(
                 mode,
                 explained=float(surfaces.explained[k]),
-                log_evidence=mode.log_evidence + float(log_prior[k]),
+                log_evidence=view.log_prior + mode.log_evidence + float(log_prior[k]),
                 present=float(surfaces.log_likelihood[k]),
             )
         )
     return modes
+
+
+def _best_first(found: list[list[Mode]]) -> list[Mode]:
+    return sorted((mode for modes in found for mode in modes), key=lambda mode: -mode.log_weight)

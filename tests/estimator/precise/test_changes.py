@@ -63,6 +63,22 @@ class HalfLearned:
         return RayCaster(self.world).expect_behind(lasers, angles, ranges)
 
 
+class RoughMap(RayCaster):
+    """A map whose surfaces are misplaced by 3 cm (standard deviation), differently in each square metre."""
+
+    def __init__(self, world, seed):
+        super().__init__(world)
+        self.errors = 0.03 * np.random.default_rng(seed).standard_normal((40, 40))
+
+    def expect(self, lasers, angles):
+        expected = super().expect(lasers, angles)
+        directions = lasers[:, 2:] + angles
+        ranges = np.minimum(expected.ranges, 100.0)  # m, so that no index is infinite
+        x, y = lasers[:, :1] + ranges * np.cos(directions), lasers[:, 1:2] + ranges * np.sin(directions)
+        error = self.errors[y.astype(int) % 40, x.astype(int) % 40]
+        return Expected(expected.ranges + error * expected.slope, expected.scale, expected.jacobian)
+
+
 def estimator(mapped, real=None, model=None, keep=lambda places: places[:, 0] > -np.inf):
     """An estimator with a map, and a scene in the real world."""
     scene, model = Scene.of(real or mapped, BEAMS, 3), model or RayCaster(mapped)
@@ -236,6 +252,15 @@ def test_map_error_of_the_first_scan():
     assert np.mean(np.array(errors) < 25) > 0.8, errors
     assert np.median(errors) < 12, errors
     assert np.mean(errors) < 40, errors
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_unknown_start_in_a_rough_map(seed):
+    """At the first scan, the map may be less exact than the model states."""
+    made, scene = estimator(OFFICE, model=RoughMap(OFFICE, seed))
+    for truth in scene.poses(2):
+        made.restart()
+        assert tasks.is_at(drive(made, scene, truth[None])[0].pose, truth)
 
 
 def test_surfaces_in_the_cells_of_a_grid():
