@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import difflib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from pydantic import ValidationError
 
 
@@ -41,6 +44,14 @@ _PROBLEMS = {
 NAME_PATTERN = r"^[\w.-]+$"  # of names in files
 # What to say of text that does not match a pattern; a module that defines another pattern may add to it.
 PATTERN_PROBLEMS = {NAME_PATTERN: "only letters, digits, '.', '-' and '_' may be in a name, not {input}"}
+
+
+def unknown_key(key: str, known: Iterable[str]) -> str:
+    """What to say of a key that is none of the ``known`` ones: the most similar one, or else all."""
+    names = sorted(known)
+    similar = difflib.get_close_matches(key, names, 1)
+    hint = f"did you mean {similar[0]!r}?" if similar else f"the keys are {', '.join(names)}"
+    return f"unknown key {key!r}; {hint}"
 
 
 def first_fault(error: ValidationError) -> str:

@@ -105,6 +105,10 @@ class Liveliness:
         """Names of the services that are alive now, of this robot or of ``robot``."""
         return set(self.alive_instances(timeout, robot))
 
+    def robots(self, timeout: float = 1.0) -> list[str]:
+        """Names of the robots with live services."""
+        return sorted({key.split("/")[1] for key in self._tokens(alive_key("*"), timeout)})
+
     def alive_instances(
         self, timeout: float = 1.0, robot: str | None = None, *, standby: bool = False
     ) -> dict[str, list[str]]:

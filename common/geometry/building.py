@@ -68,13 +68,10 @@ def read_building(data: dict[str, Any]) -> BuildingFile:
     try:
         return BuildingFile.model_validate(data)
     except ValidationError as error:
-        key = error.errors(include_url=False)[0]["loc"][0]
-        if key in EXAMPLES:
-            raise UserError(f"{first_fault(error)}; an example is {EXAMPLES[key]}") from None
-        raise UserError(
-            f"{first_fault(error)}; the keys of a building are {', '.join(BuildingFile.model_fields)}, and walls and "
-            "obstacles belong in the files of its floors"
-        ) from None
+        hint = "walls and obstacles belong in the files of its floors"
+        for key in error.errors(include_url=False)[0]["loc"][:1]:  # none for an unknown key
+            hint = f"an example is {EXAMPLES[key]}" if key in EXAMPLES else hint
+        raise UserError(f"{first_fault(error)}; {hint}") from None
 
 
 def lay_out(building: BuildingFile, worlds: Mapping[str, World]) -> dict[str, Any]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import shapely
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from common.errors import NAME_PATTERN
+from common.errors import NAME_PATTERN, unknown_key
 from common.limits import Coordinate, PositiveDistance
 
 if TYPE_CHECKING:
@@ -26,6 +26,13 @@ class WorldPart(BaseModel):
     """Base of the parts of a world: immutable, and without unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _explain_unknown_key(cls, data: Any) -> Any:
+        if isinstance(data, dict) and (unknown := [key for key in data if key not in cls.model_fields]):
+            raise ValueError(unknown_key(str(unknown[0]), cls.model_fields))
+        return data
 
 
 class Box(WorldPart):

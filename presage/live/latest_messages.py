@@ -52,11 +52,22 @@ class LatestMessages:
 
 @contextmanager
 def session_bus(link: Link) -> Iterator[Bus]:
-    """Opens the bus of a running session; raises UserError if no router answers within `CONNECT_TIMEOUT_S`."""
+    """Opens the bus of a running session.
+
+    Raises UserError if no router answers within `CONNECT_TIMEOUT_S`. An error in the block is replaced by one that
+    names the running robots, if this robot is none of them.
+    """
     with open_bus(link, connect_timeout=CONNECT_TIMEOUT_S) as bus:
         if link.connect and not wait_until(bus.linked, CONNECT_TIMEOUT_S):
             raise UserError(
                 f"nothing answers at {', '.join(link.connect)}: start a session with `presage up`, "
                 "or give the endpoint of a running one with `presage --connect`"
             )
-        yield bus
+        try:
+            yield bus
+        except UserError:
+            if (robots := bus.robots()) and bus.robot not in robots:
+                raise UserError(
+                    f"no robot {bus.robot!r} is running: choose one of {', '.join(robots)} with `presage --robot NAME`"
+                ) from None
+            raise

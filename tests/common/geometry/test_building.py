@@ -171,7 +171,7 @@ def test_ros_maps_and_shipped_worlds_as_floors(tmp_path):
             {"floors": {"a": "ground.yaml", "b": "hall.yaml"}, "lifts": [{"a": [1, 5], "b": [2, 0]}]},
             "lift 1: (2, 0) is not in free space of floor 'b'",
         ),
-        ({"boundary": [[0, 0], [1, 0], [1, 1]]}, "boundary: unknown key; the keys of a building are name, floors, "),
+        ({"boundary": [[0, 0], [1, 0], [1, 1]]}, "unknown key 'boundary'; the keys are floors, lifts, "),
     ],
 )
 def test_invalid_buildings(tmp_path, more, message):

@@ -123,7 +123,12 @@ def test_name_defaults_to_that_of_the_file(tmp_path):
         ("{name: x, boundary: [[0, 0], [1, 0], [.nan, 1]]}", "finite"),
         ("{name: x, boundary: [[0, 0], [1, 0], [1, 1]], obstacles: [{}]}", "exactly one of"),
         ("{name: x, boundary: [[0, 0], [1, 0], [1, x]]}", "boundary, entry 3, entry 2: expected a number, not 'x'"),
-        ("{name: x, boundary: [[0, 0], [1, 0], [1, 1]], walls: 3}", "walls: unknown key"),
+        ("{name: x, boundary: [[0, 0], [1, 0], [1, 1]], walls: 3}", "unknown key 'walls'; the keys are boundary, "),
+        ("{boundary: [[0, 0], [1, 0], [1, 1]], obstacle: []}", "unknown key 'obstacle'; did you mean 'obstacles'?"),
+        (
+            "{boundary: [[0, 0], [1, 0], [1, 1]], obstacles: [{circle: {centre: [0, 0], radius: 1}}]}",
+            "obstacles, entry 1, circle: unknown key 'centre'; did you mean 'center'?",
+        ),
         ("{name: ../x, boundary: [[0, 0], [1, 0], [1, 1]]}", "name: only letters, digits"),
         ("3", "file"),
         ("{name: x, since: 2020-13-45}", "month"),
