@@ -1,4 +1,4 @@
-"""Tables that are made from several results or from a part of one: those of README.md, results.md and peers.md."""
+"""Tables that are made from several results or from a part of one, in README.md and docs."""
 
 from __future__ import annotations
 
@@ -90,7 +90,18 @@ def _integrity(row: dict[str, Any]) -> str:
     return f"{tracking:.1f} % `tracking`, of which {wrong:.1f} % wrong; for more than 1 s in {drives}"
 
 
+def measured_by(folder: Path) -> str:
+    """The version of presage and the seed of each stored result; peers' results are from elsewhere."""
+    lines = []
+    for path in sorted(folder.glob("*.json")):
+        result = read(path)
+        if "commit" in result:
+            lines.append([f"[{path.stem}]({folder.name}/{path.name})", result["commit"], str(result.get("seed", "–"))])
+    return markdown(["result", "commit", "seed"], lines)
+
+
 TABLES = {
+    "measured-by": measured_by,
     "readme-real": real_logs,
     "readme-simulation": simulation,
     "accuracy": accuracy,
