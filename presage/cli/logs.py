@@ -37,7 +37,7 @@ def localize(
     model: ModelName = "",
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Output file NAME.csv or NAME.json. Defaults to CSV on standard output."),
+        typer.Option("--out", "-o", help="Output file NAME.csv, .json or .tum. Defaults to CSV on standard output."),
     ] = None,
     mode: Annotated[
         str,

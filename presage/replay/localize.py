@@ -19,6 +19,7 @@ from common.errors import UserError
 from common.geometry import se2
 from common.geometry.pose_text import parse_initial_pose
 from common.geometry.se2 import Array
+from common.geometry.tum import write_tum
 from common.geometry.world import load_world
 from presage.estimator import Estimator
 from presage.interrupts import ignoring_interrupts
@@ -64,7 +65,7 @@ class LocalizeOptions:
     prior: Prior = "odometry"
     frame: Literal["base_link", "laser"] = "base_link"
     reading: Reading = Reading()  # noqa: RUF009 - frozen
-    out: Path | None = None  # CSV or JSON; defaults to CSV on standard output
+    out: Path | None = None  # CSV, JSON or TUM; defaults to CSV on standard output
     start: float | None = None  # s after the first scan; defaults to the first scan
     end: float | None = None  # s after the first scan, or if negative, from the last; defaults to the last scan
     every: int = 1  # use every N-th scan between these
@@ -90,8 +91,8 @@ class LocalizeOptions:
             raise UserError(f"no mode {mode!r}: choose global or track")
         if frame not in ("base_link", "laser"):
             raise UserError(f"no frame {frame!r}: choose base_link or laser")
-        if out is not None and out.suffix not in (".csv", ".json"):
-            raise UserError(f"{out}: the name of the result must end with .csv or .json")
+        if out is not None and out.suffix not in (".csv", ".json", ".tum"):
+            raise UserError(f"{out}: the name of the result must end with .csv, .json or .tum")
         prior: Prior = "odometry" if odometry else "motion"
         return cls(file, estimator_options, mode, independent_scans, prior, frame, reading, out, start, end, every)  # type: ignore[arg-type]
 
@@ -183,6 +184,8 @@ def localize(options: LocalizeOptions, console: Console) -> list[dict[str, Any]]
         all_scans = read_scans(options.file, mount, options.reading)
     all_scans.print_notes(console)
     scans = select_scans(options, all_scans).with_prior(options.prior)
+    if scans.stamps is None and options.out is not None and options.out.suffix == ".tum":
+        raise UserError(f"{options.file}: its scans have no stamps, which a trajectory needs: choose .csv or .json")
     start, count = _start(options, scans), len(scans)
     estimator.check(scans[0])
     rows: list[dict[str, Any]] = []
@@ -261,14 +264,18 @@ def _row(scans: Scans, k: int, timed: TimedBelief, *, laser: bool) -> dict[str, 
 
 @contextmanager
 def _output(options: LocalizeOptions, count: int) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """Yields the function that writes a row: at once for CSV; at the end for JSON, also after an interruption."""
-    if options.out is not None and options.out.suffix == ".json":
+    """Yields the function that writes a row: at once for CSV; else at the end, also after an interruption."""
+    if options.out is not None and options.out.suffix != ".csv":
         rows: list[dict[str, Any]] = []
         try:
             yield rows.append
         finally:
             with ignoring_interrupts():
-                _write_json(options, options.out, rows, complete=len(rows) == count)
+                if options.out.suffix == ".json":
+                    _write_json(options, options.out, rows, complete=len(rows) == count)
+                else:
+                    poses = np.array([[row["x"], row["y"], row["yaw"]] for row in rows]).reshape(-1, 3)
+                    write_tum(options.out, np.array([row["stamp"] for row in rows]), poses, options.frame)
         return
     stream = sys.stdout if options.out is None else options.out.open("w", newline="", encoding="utf-8")
     try:

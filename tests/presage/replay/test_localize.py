@@ -87,6 +87,16 @@ def test_json(tmp_path):
     assert data["rows"] == rows
 
 
+def test_tum(tmp_path):
+    out = tmp_path / "poses.tum"
+    rows = localize(job(npz(tmp_path), out=out), CONSOLE)
+    stamps, x, y, *_, sine, cosine = np.loadtxt(out).T
+    poses = np.column_stack([stamps, x, y, 2 * np.arctan2(sine, cosine)])
+    assert poses == pytest.approx(
+        np.array([[row[name] for name in ("stamp", "x", "y", "yaw")] for row in rows]), abs=1e-8
+    )
+
+
 def test_laser_frame(tmp_path):
     file = npz(tmp_path, mount=(0, 0, 0))  # PATH is the laser's
     assert errors(localize(job(file, frame="laser"), CONSOLE)).max() < 0.02
@@ -233,7 +243,7 @@ def test_selection_refusals(tmp_path):
         localize(job(file, start=0.2, mode="track"), CONSOLE)
 
 
-@pytest.mark.parametrize("suffix", ["csv", "json"])
+@pytest.mark.parametrize("suffix", ["csv", "json", "tum"])
 def test_interrupted_run_keeps_rows(tmp_path, capsys, monkeypatch, suffix):
     file, out, given = npz(tmp_path), tmp_path / f"poses.{suffix}", Scans.__getitem__
 
@@ -254,6 +264,9 @@ def test_interrupted_run_keeps_rows(tmp_path, capsys, monkeypatch, suffix):
         data = json.loads(out.read_text())
         assert not data["complete"]
         assert len(data["rows"]) == 4
+        return
+    if suffix == "tum":
+        assert len(np.loadtxt(out)) == 4
         return
     with out.open() as stream:
         assert len([float(row["update_ms"]) for row in csv.DictReader(stream)]) == 4
@@ -280,7 +293,7 @@ def test_option_refusals(tmp_path):
         ({"world": ""}, "--world"), ({"model": "best"}, "no model"), ({"initial_pose": "1"}, "initial-pose"),
         ({"initial_pose": "4,1.5"}, "add --mode track"),
         ({"initial_pose": "400,1.5", "mode": "track"}, r"\(400, 1.5\) is off the map: .* goes from"),
-        ({"out": tmp_path / "x.txt"}, "csv or .json"), ({"out": tmp_path / "no" / "x.csv"}, "cannot be written"),
+        ({"out": tmp_path / "x.txt"}, ".csv, .json or .tum"), ({"out": tmp_path / "no" / "x.csv"}, "cannot be written"),
     ):  # fmt: skip
         with pytest.raises(UserError, match=why):
             localize(job(file, **wrong), CONSOLE)
