@@ -83,7 +83,7 @@ def _headline(session: RecordedSession) -> str:
     if len(session.belief):
         estimator = f" by preset {session.estimator}" if session.estimator else ""
         parts.append(
-            f"localised after {summary.localised_after_scans} scans{estimator}"
+            f"localised at scan {summary.localised_after_scans}{estimator}"
             if summary.localised_after_scans is not None
             else f"not localised{estimator}"
         )

@@ -146,7 +146,7 @@ def _localise(messages: LatestMessages, stack: Stack, console: Console) -> bool:
                 energy = "" if belief.free_energy is None else f"F = {belief.free_energy:.0f} nats, "
                 line.update(f"localising: scan {belief.seq}, {energy}{error}")
                 if belief.state == "tracking":
-                    console.print(f"localised after {belief.seq + 1} scans, {error}")
+                    console.print(f"localised at scan {belief.seq + 1}, {error}")
                     return True
                 if belief.stamp_ns - first_stamp > LOCALISATION_TIMEOUT_S * 1e9:
                     break

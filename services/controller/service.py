@@ -218,7 +218,7 @@ class ControllerService(Service):
 
     def _answer(self, command: CmdVel, status: Status) -> None:
         if status.state != (self._last_answer[2].state if self._last_answer is not None else "idle"):
-            self.log.info(status.state, reason=status.reason)
+            self.log.info(status.state, **({"reason": status.reason} if status.reason else {}))
         self._last_answer = (command.stamp_ns, command, status)
         self._send(command, status)
         self._publish_plan(command.stamp_ns)
