@@ -12,6 +12,8 @@ from common.messages.definitions import CmdVel, Twist
 from common.runtime import safety
 
 if TYPE_CHECKING:
+    import numpy.typing as npt
+
     from common.geometry.se2 import Array
     from common.robot.robot import Robot
 
@@ -24,16 +26,22 @@ class VelocityCommand:
         self.velocity = np.zeros(3)  # (3,) m/s, m/s, rad/s in base_link
         self.stamp_ns: int | None = None  # of the latest belief or scan that was answered
         self._below_dead_band = np.zeros(3)  # desired velocities that were too low to command, summed over scans
+        self._period_s = 0.0  # between the last two commands that were not stops
+        self._stopped = False  # whether the last command was a stop
         self._before_pause: Array | None = None  # velocity before a pause of the simulation
         self._sent: deque[tuple[int, Array]] = deque(maxlen=100)  # stamps in ns and velocities of the last commands
 
     def limit(self, stamp_ns: int, desired: Array, points: Array) -> tuple[CmdVel, bool]:
         """Returns the command for a desired velocity (3,), and whether obstacle ``points`` (K, 2) m reduced it."""
         period_s = 0.0 if self.stamp_ns is None else max(0.0, (stamp_ns - self.stamp_ns) * 1e-9)
-        self.stamp_ns = stamp_ns
-        possible = self._in_pulses(safety.clip_twist(desired, self.robot))
+        if self._stopped:  # the robot stood meanwhile, so it accelerates from now on
+            period_s = min(period_s, self._period_s)
+        self.stamp_ns, self._period_s, self._stopped = stamp_ns, period_s, False
+        possible, too_low = self._in_pulses(safety.clip_twist(desired, self.robot))
         ramped = safety.ramp(self.velocity, possible, self.robot, period_s)
         self.velocity, limited_by_scan = safety.limit_velocity(ramped, points, self.robot)
+        moves = self._speeds(self.velocity) >= self._dead_bands  # the base ignores less, as while it accelerates
+        self._below_dead_band -= np.where(too_low & moves, self.velocity, 0.0)
         self._sent.append((stamp_ns, self.velocity))
         vx, vy, wz = map(float, self.velocity)
         return CmdVel(stamp_ns=stamp_ns, twist=Twist(vx=vx, vy=vy, wz=wz)), limited_by_scan
@@ -50,27 +58,35 @@ class VelocityCommand:
             end_ns = begin_ns
         return motion
 
-    def _in_pulses(self, desired: Array) -> Array:
+    @property
+    def _dead_bands(self) -> Array:
+        return np.array([self.robot.dead_band, self.robot.dead_band, self.robot.turn_dead_band])
+
+    def _speeds(self, velocity: Array) -> Array:
+        """The speed (3,) to compare with the dead band of each component: that along the path for vx and vy."""
+        return np.array([np.hypot(*velocity[:2])] * 2 + [abs(velocity[2])])
+
+    def _in_pulses(self, desired: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
         """The desired velocity (3,), or where that is below the base's dead band, pulses just above the dead band.
 
-        The sum of the pulses follows that of the desired velocities, as in a sigma-delta modulator.
+        The sum of the pulses follows that of the desired velocities, as in a sigma-delta modulator. Also returns where
+        the desired velocity is below the dead band (3,).
         """
-        limits = np.array([self.robot.dead_band, self.robot.dead_band, self.robot.turn_dead_band])
-        speed = np.array([np.hypot(*desired[:2])] * 2 + [abs(desired[2])])
-        too_low = (speed > 0) & (speed < limits)
-        self._below_dead_band = np.where(too_low, self._below_dead_band + desired, 0.0)
-        total = np.array([np.hypot(*self._below_dead_band[:2])] * 2 + [abs(self._below_dead_band[2])])
+        limits, speeds = self._dead_bands, self._speeds(desired)
+        too_low = (speeds > 0) & (speeds < limits)
+        total = np.where(too_low, self._below_dead_band + desired, 0.0)
+        # Never more than two pulses, which would otherwise add up where the robot may not move.
+        self._below_dead_band = total * np.minimum(1.0, 2 * limits / np.maximum(self._speeds(total), 1e-9))
+        sums = self._speeds(self._below_dead_band)
         # Slightly more than the dead band, because the base compares rounded numbers.
-        pulse = np.where(total >= limits, self._below_dead_band * 1.01 * limits / np.maximum(total, 1e-9), 0.0)
-        pulse = np.where(too_low, pulse, 0.0)
-        self._below_dead_band -= pulse
-        return np.where(too_low, pulse, desired)
+        pulse = np.where(sums >= limits, self._below_dead_band * 1.01 * limits / np.maximum(sums, 1e-9), 0.0)
+        return np.where(too_low, pulse, desired), too_low
 
     def stop(self, stamp_ns: int, *, paused: bool) -> CmdVel:
         """Returns the command to stop. If the simulation may be ``paused``, `resume` can undo it."""
         if paused:
             self._before_pause = self.velocity
-        self.velocity = np.zeros(3)
+        self.velocity, self._stopped = np.zeros(3), True
         self._sent.append((stamp_ns, self.velocity))
         return CmdVel(stamp_ns=stamp_ns, twist=Twist())
 
@@ -84,5 +100,5 @@ class VelocityCommand:
             return False
         if not 0 < stamp_ns - self.stamp_ns <= self.robot.command_age * 1e9:
             return False
-        self.velocity = before
+        self.velocity, self._stopped = before, False
         return True
