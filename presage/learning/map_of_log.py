@@ -165,8 +165,8 @@ def _build_trajectory(
     """Matches the scans with one another, and prints the result."""
     if len(scans) < MIN_SCANS_FOR_SLAM:
         raise UserError(f"{options.log}: {len(scans)} scans; a map needs at least {MIN_SCANS_FOR_SLAM}")
-    complete = scans.odom is not None and bool(np.isfinite(scans.odom).all())
-    odom = scans.odom if options.odometry and complete else None
+    odom = scans.odom if options.odometry else None
+    with_odometry = 0 if odom is None else int(np.isfinite(odom).all(axis=1).sum())
     drive = raw_drive(scans, stamps, odom)
     with Progress(*Progress.get_default_columns(), console=progress, transient=True) as bar:
         task = bar.add_task("mapping", total=1.0)
@@ -177,14 +177,20 @@ def _build_trajectory(
         built = build_trajectory(drive, report)
     console.print(
         f"{len(built.keys)} key scans, {len(built.closures)} loop closures, "
-        f"{built.unmatched} scans that matched nothing before; {'with' if odom is not None else 'without'} odometry",
+        f"{built.unmatched} scans that did not match those before; {_odometry_note(with_odometry, len(scans))}",
         soft_wrap=True,
     )
     unplaced = float(np.isnan(built.poses).any(axis=1).mean())
     if unplaced:
         console.print(
             f"{unplaced:.1%} of the scans are left out: they contradict what was seen just before, and were not found "
-            "elsewhere in the map; the robot was kidnapped, or its view was blocked",
+            "elsewhere in the map; the robot was carried away, or its view was blocked",
             soft_wrap=True,
         )
     return built
+
+
+def _odometry_note(known: int, count: int) -> str:
+    if not known:
+        return "without odometry"
+    return "with odometry" if known == count else f"with odometry for {known} of {count} scans"

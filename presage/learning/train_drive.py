@@ -111,7 +111,7 @@ def drive_of(scans: Scans, log: Path) -> ReferenceDrive:
     use = usable_scans(scans.stamps, scans.truth)
     if not is_surface(scans.ranges[use]).any():
         raise UserError(f"{log}: no beam of the scans with a reference pose hit a surface")
-    odom = None if scans.odom is None or not np.isfinite(scans.odom[use]).all() else scans.odom
+    odom = None if scans.odom is None or not np.isfinite(scans.odom[use]).all(axis=1).any() else scans.odom
     whole = ReferenceDrive(
         scans.stamps,
         scans.truth,

@@ -12,7 +12,7 @@ from services.controller.docking import LINE_LENGTH_M
 from services.controller.navigator import Navigator
 from services.controller.policies.planner import GeodesicPolicy
 from services.controller.velocity_command import VelocityCommand
-from tests.controller.driving import PERIOD_NS, box, drive, goal, room
+from tests.controller.driving import box, drive, goal, room
 
 HALL = room(10, 5)
 TOLERANCE, YAW_TOLERANCE = 0.003, np.deg2rad(0.5)

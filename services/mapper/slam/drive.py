@@ -26,4 +26,4 @@ class RawDrive:
     stamps: Array  # (N,) s
     ranges: Array  # (N, B) m
     laser: Laser
-    odom: Array | None = None  # (N, 3) base_link in odom
+    odom: Array | None = None  # (N, 3) base_link in odom; NaN where unknown

@@ -346,7 +346,8 @@ def track_drive(drive: RawDrive, report: Callable[[float], None] = lambda _done:
     """Tracks the scans of a drive; reports the share that is done."""
     front_end = FrontEnd(drive.laser)
     for k, (stamp, ranges) in enumerate(zip(drive.stamps, drive.ranges, strict=True)):
-        front_end.add(float(stamp), ranges, None if drive.odom is None else drive.odom[k])
+        known = drive.odom is not None and np.isfinite(drive.odom[k]).all()
+        front_end.add(float(stamp), ranges, drive.odom[k] if drive.odom is not None and known else None)
         report(k / len(drive.ranges))
     return front_end.track()
 

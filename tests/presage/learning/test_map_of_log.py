@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,10 +17,10 @@ from common.geometry.ros_map_writer import write_grid
 from common.geometry.world import load_world
 from lab.accuracy.motion_distortion import observations
 from lab.accuracy.scenes import Scene
-from presage.learning.map_of_log import MapOptions, map_command
+from presage.learning.map_of_log import MapOptions, _build_trajectory, map_command
 from presage.learning.train_drive import drive_of
 from presage.logs.log import Reading
-from presage.logs.scan_files import Scans
+from presage.logs.scan_files import Scans, read_scans
 from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.precise.learning import weights
 from services.estimator.shared.generative_models import RayCaster
@@ -142,6 +143,16 @@ def test_map_without_reference_poses(log, tmp_path, odometry):
     assert sorted((width, height)) == pytest.approx([6, 9], abs=1.0)
     assert len(np.loadtxt(tmp_path / "own.tum")) == 200
     assert (tmp_path / "own.png").exists()
+
+
+def test_odometry_that_begins_after_the_first_scan(log, tmp_path):
+    """As in many ROS bags. The other scans are mapped with odometry."""
+    scans = read_scans(log, reading=HERE)
+    scans.odom[:2] = np.nan
+    console = Console(record=True, width=500, file=io.StringIO())
+    built = _build_trajectory(scans, scans.stamps, MapOptions(log, tmp_path / "own.yaml"), console, QUIET)
+    assert "with odometry for 198 of 200 scans" in console.export_text()
+    assert np.isfinite(built.poses).all()
 
 
 def test_swept_scans():

@@ -178,7 +178,7 @@ def learn_shares(measured: Array, expected: Expected, range_max: float, start: L
 def learn_motion(stamps: Array, poses: Array, odom: Array | None) -> MotionNoise:
     """Fits the motion model to reference poses (N, 3) of consecutive scans at ``stamps`` (N,) s.
 
-    ``odom`` (N, 3) are the odometry poses of the same scans, if there are any.
+    ``odom`` (N, 3) are the odometry poses of the same scans, if there are any; NaN where unknown.
     """
     period = np.diff(stamps)
     steps = se2.between(poses[:-1], poses[1:])
@@ -203,7 +203,9 @@ def learn_motion(stamps: Array, poses: Array, odom: Array | None) -> MotionNoise
     )
     if odom is None:
         return learned
-    return _learn_odometry(learned, steps[regular], se2.between(odom[:-1], odom[1:])[regular])
+    odom_steps = se2.between(odom[:-1], odom[1:])
+    used = regular & np.isfinite(odom_steps).all(axis=1)
+    return _learn_odometry(learned, steps[used], odom_steps[used]) if used.any() else learned
 
 
 def _learn_odometry(noise: MotionNoise, steps: Array, odom_steps: Array) -> MotionNoise:
