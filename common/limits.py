@@ -14,6 +14,7 @@ MAX_COORDINATE_M = 10_000.0  # absolute value, from the frame's origin
 MAX_DISTANCE_M = 30_000.0  # more than the diagonal of the square of all valid positions
 MAX_ANGLE_RAD = 10_000.0  # about 1500 turns, because headings need not be wrapped
 MAX_SPEED = 1_000.0  # m/s or rad/s
+MAX_FIELD_SIDE = 4096  # cells along one side of a published cost field
 MAX_BEAMS = 32_768  # in a scan; the 2-D scanners with the finest resolution measure 25 200 points per turn
 
 Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE_M, le=MAX_COORDINATE_M, allow_inf_nan=False)]

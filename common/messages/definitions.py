@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 
 from common.errors import UserError
 from common.geometry.occupancy_grid import OccupancyGrid
-from common.limits import Angle, Distance, PositiveAngle, PositiveDistance
+from common.limits import MAX_FIELD_SIDE, Angle, Distance, PositiveAngle, PositiveDistance
 from common.messages.pose import Pose as Pose  # noqa: PLC0414 - most modules import it from here
 from common.messages.pose import Twist as Twist  # noqa: PLC0414
 from common.messages.wire import (
@@ -284,8 +284,8 @@ class Preference(Stamped):
     goal: Pose  # base_link in map
     origin: Pose  # lower left corner of the grid, in map; yaw 0
     resolution: PositiveDistance  # m, edge length of a cell
-    width: Annotated[int, Field(ge=1, le=4096)]  # cells along x
-    height: Annotated[int, Field(ge=1, le=4096)]  # cells along y
+    width: Annotated[int, Field(ge=1, le=MAX_FIELD_SIDE)]  # cells along x
+    height: Annotated[int, Field(ge=1, le=MAX_FIELD_SIDE)]  # cells along y
     distance: Costs  # (height * width,) m, path to the goal, row by row along x; +inf: unreachable
     frame_id: Name = "map"
 

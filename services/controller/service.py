@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import time
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from common.geometry.world import load_world
+from common.limits import MAX_FIELD_SIDE
 from common.messages.definitions import Belief, CmdVel, Drive, Goal, Map, Plan, Pose, Preference, Scan, Stamped, Status
 from common.messages.requests import PredictReply, PredictRequest, Reply
 from common.messages.topics import (
@@ -41,21 +43,29 @@ PREDICTED_BEAMS = 61  # beams of a predicted scan: enough to tell places apart, 
 FIELD_PERIOD_NS = 5_000_000_000  # an unchanged cost field is published again after this time
 SCAN_TIMEOUT_S = 0.2  # how long a belief waits for its scan
 PREDICTION_TIMEOUT_S = 0.3  # how long a belief waits for predictions, which are requested once a second at most
+MAX_FIELD_CELLS = 250_000  # of a published cost field, so that the message is smaller than `MAX_BYTES`
 NO_REQUEST = -1  # differs from the number of every request
 
 
 def preference_message(field: CostField, goal: Goal, stamp_ns: int) -> Preference:
-    """The cost field of a goal as a message."""
+    """The cost field of a goal as a message.
+
+    In a large building, a cell of the message is a square of several cells and has the least cost in it.
+    """
     grid = field.graph.grid
-    rows, columns = grid.shape
+    known = np.where(field.graph.free.unknown, np.inf, field.cost)
+    side = math.ceil(math.sqrt(known.size / MAX_FIELD_CELLS))
+    side = max(side, *(math.ceil(length / MAX_FIELD_SIDE) for length in known.shape))
+    padded = np.pad(known, [(0, -length % side) for length in known.shape], constant_values=np.inf)
+    rows, columns = padded.shape[0] // side, padded.shape[1] // side
     return Preference(
         stamp_ns=stamp_ns,
         goal=goal.pose,
         origin=Pose(x=grid.origin[0], y=grid.origin[1]),
-        resolution=grid.resolution,
+        resolution=grid.resolution * side,
         width=columns,
         height=rows,
-        distance=np.where(field.graph.free.unknown, np.inf, field.cost).ravel().astype(np.float32),
+        distance=padded.reshape(rows, side, columns, side).min(axis=(1, 3)).ravel().astype(np.float32),
     )
 
 

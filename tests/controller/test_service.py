@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from common.bus.inbox import Inbox
 from common.messages.requests import PredictReply, Reply
-from common.messages.topics import BELIEF, CMD_VEL, PREDICT, SCAN
+from common.messages.topics import BELIEF, CMD_VEL, MAX_BYTES, PREDICT, SCAN
 from common.runtime.service import ServiceLoop
 from services.controller import service as shell
 from services.controller.policies.active_localisation import CandidateDrives
@@ -93,3 +95,21 @@ def test_answers(monkeypatch, needs_predictions, events, answers):
         found.append(" ".join(map(str, sent)) or ".")
     assert " ".join(found) == answers
     assert policy.used == len([e for e in events.split() if e == f"r{max(requests, default=0)}"])
+
+
+@pytest.mark.parametrize("shape", [(30, 50), (600, 901), (9001, 3)])
+def test_cost_field_of_a_large_building(shape):
+    """It is published with larger cells, each with the least cost in it, so that no receiver drops it."""
+    cost = np.random.default_rng(0).random(shape)
+    grid = SimpleNamespace(shape=shape, origin=(1.0, 2.0), resolution=0.1)
+    unknown = np.zeros(shape, bool)
+    unknown[0, 0] = True
+    graph = SimpleNamespace(grid=grid, free=SimpleNamespace(unknown=unknown))
+    message = shell.preference_message(SimpleNamespace(graph=graph, cost=cost), goal(3.0, 4.0), 7)
+    assert len(message.encode()) < MAX_BYTES
+    side = round(message.resolution / 0.1)
+    assert side == {30: 1, 600: 2, 9001: 3}[shape[0]]
+    sent = message.distance.reshape(message.height, message.width)
+    cost[0, 0] = np.inf
+    assert sent[0, 0] == pytest.approx(cost[:side, :side].min())
+    assert sent[-1, -1] == pytest.approx(cost[(message.height - 1) * side :, (message.width - 1) * side :].min())
