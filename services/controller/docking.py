@@ -3,7 +3,7 @@
 | phase | what the robot does | next phase |
 |---|---|---|
 | DRIVE | the policy drives to the start of the line | ALIGN, within the usual tolerance of a goal |
-| ALIGN | turns into the goal's heading | LINE |
+| ALIGN | turns to the goal's heading | LINE |
 | LINE | follows the line to the goal | arrived, or DRIVE if it left the line or stopped beside the goal |
 
 A differential base cannot correct its lateral error at the goal, so it converges to the line on the way, as does a

@@ -70,7 +70,8 @@ class Navigator:
 
     def on_drive(self, drive: Drive) -> None:
         """Stores a manual velocity command, which has priority over the goal."""
-        self._manual.update(drive, max(self.scan_stamp or 0, self._command.stamp_ns or 0))
+        # Not the later of the two: the command keeps its stamp when time goes back.
+        self._manual.update(drive, self.scan_stamp or self._command.stamp_ns or 0)
 
     def on_goal(self, goal: Goal) -> None:
         """Replaces, cancels or refuses the goal, or begins to explore. A goal known to be unreachable is refused."""
@@ -311,7 +312,7 @@ class Navigator:
                 if self._has_stood(belief.stamp_ns, 0.0):
                     self.goal_state.reach(_arrival(belief, goal))
                 return np.zeros(3)
-            self.decision = Decision(turn, "at the goal: turning into its heading")
+            self.decision = Decision(turn, "at the goal: turning to its heading")
             return turn
         return self._policy_velocity(belief)
 

@@ -39,7 +39,7 @@ class ControllerSettings(SelfFilterSettings):
     ] = "geodesic"
     heading: Annotated[
         Literal["travel", "keep"],
-        Field(description="a holonomic robot turns into its direction of travel, or keeps its heading"),
+        Field(description="a holonomic robot turns to face its direction of travel, or keeps its heading"),
     ] = "travel"
     epistemic: Annotated[bool, Field(description="motions are also judged by the information that they gain")] = True
     gamma: Annotated[float, Field(gt=0, lt=1, description="preset paper: action step size per scan (equation 4)")] = 0.3
@@ -51,6 +51,10 @@ class ControllerSettings(SelfFilterSettings):
         """Raises UserError if settings contradict each other."""
         self.build_robot()
         self.build_self_filter()
+        if self.heading == "keep" and self.drive == "differential":
+            raise UserError(
+                "a differential robot cannot keep its heading: give --drive holonomic, or leave out --heading keep"
+            )
         if self.preset == "paper" and self.drive != "holonomic":
             raise UserError(
                 "preset paper moves without turning, which only a holonomic robot can: give --drive holonomic, or use "

@@ -28,6 +28,7 @@ from services.mapper.slam.elements import elements_of_scan
 from services.mapper.slam.front_end import ScanPose
 from services.mapper.slam.mapper import Mapper, MapSnapshot
 
+MAX_LATE_NS = 1_000_000_000  # a scan that is earlier than the last one by less is left out; else, time went back
 UPDATE_PERIOD_NS = 1_000_000_000  # between the beginnings of two updates of the map, which leaves time for the scans
 REPEAT_PERIOD_NS = 5_000_000_000  # an unchanged map is published again after this time, for later subscribers
 
@@ -76,8 +77,12 @@ class MapperService(Service):
             self._add(scan, odom)
 
     def _add(self, scan: Scan, odom: Odom | None) -> None:
-        if self._belief is not None and self._belief.stamp_ns == scan.stamp_ns:
+        late_ns = 0 if self._belief is None else self._belief.stamp_ns - scan.stamp_ns
+        if self._belief is not None and late_ns == 0:
             self.publish(BELIEF, self._belief)  # a repeated scan gets the same belief again
+            return
+        if 0 < late_ns < MAX_LATE_NS:
+            self.counters["late_scans"] += 1
             return
         mapper, angles = self._mapper_for(scan), scan.angles()
         ranges = ranges_for_localisation(scan.ranges)
@@ -158,10 +163,11 @@ def save_map(folder: Path, name: str, mapper: Mapper) -> Path:
         raise UserError(f"{existing} exists already: choose another name")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        write_grid(path.parent, name, mapper.map.grid)
         write_tum(path.with_suffix(".tum"), *mapper.trajectory())
-        return write_grid(path.parent, name, mapper.map.grid)
     except OSError as error:
         raise UserError(f"{path}: cannot be written ({error.strerror}): choose another folder with --maps") from None
+    return path
 
 
 def belief_message(scan: Scan, scan_pose: ScanPose) -> Belief:

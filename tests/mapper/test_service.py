@@ -13,6 +13,7 @@ from common.messages.definitions import Belief, Map, Odom, Pose, Scan, Twist
 from common.messages.requests import SaveMapReply, SaveMapRequest
 from common.messages.topics import BELIEF, MAP, ODOM, SAVE_MAP, SCAN
 from common.robot.scan_geometry import Sweep
+from lab.accuracy import tasks
 from lab.accuracy.scenes import Scene
 from presage.live.commands import save_map
 from tests.conftest import WAIT_TIMEOUT_S, wait_for_message
@@ -73,6 +74,12 @@ def test_drive_and_save(process, bus, link, tmp_path, odometry):
     lost = scan_message(drive, last, nonsense).model_copy(update={"stamp_ns": round(drive.stamps[last] * 1e9) + 10**8})
     belief = belief_of(lost, truth[last])
     assert belief.state == "lost"
+
+    # A late scan is left out, and leaves the map.
+    bus.put(SCAN, scan_message(drive, last - 1).model_copy(update={"stamp_ns": lost.stamp_ns - 10**7}).encode())
+    later = scan_message(drive, last).model_copy(update={"stamp_ns": lost.stamp_ns + 10**8})
+    found = belief_of(later, truth[last])
+    assert tasks.is_at(se2.compose(truth[0], found.pose.array()), truth[last])
     assert belief.covariance is None
 
 

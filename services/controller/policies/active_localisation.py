@@ -40,7 +40,7 @@ MIN_WEIGHT = 1e-3  # hypotheses with less weight do not keep a belief from `trac
 MIN_COUNTED_WEIGHT = 0.05
 MAX_HYPOTHESES = 6  # scans are predicted for each
 PLACE_SPACING_M = 1.0  # of the places that are compared
-MIN_PATH_M, MAX_PATH_M = 0.8, 12.0  # length of the path to a place
+MIN_PATH_M, MAX_PATH_M = 0.8, 12.0  # cost of the path to a place; a metre costs 1 where nothing is near
 MAX_PLACES = 60
 CHOICE_PERIOD_NS = 1_000_000_000  # minimum time between two choices of a place
 MAX_SPEED = 0.5  # m/s, because it is not known what is behind and beside the robot
@@ -131,7 +131,7 @@ class ActiveLocaliser:
     ) -> None:
         """Keeps the robot's centre ``min_point_distance`` m away from scan points.
 
-        ``may_turn``: the robot may turn into its direction of motion.
+        ``may_turn``: the robot may turn to face its direction of motion.
         """
         self.may_turn = may_turn
         self.robot = robot.model_copy(update={"max_speed": min(robot.max_speed, MAX_SPEED)})
@@ -230,7 +230,7 @@ class ActiveLocaliser:
             self._recovery.begin(stamp_ns)
 
     def _candidate_places(self, pose: Array) -> tuple[Array, Array]:
-        """Displacements (M, 3) in base_link and path lengths (M,) m of the places around a hypothesis (3,)."""
+        """Displacements (M, 3) in base_link of the places around a hypothesis (3,), and costs (M,) m of the paths."""
         field = self.graph.cost_field(pose[:2], self.min_point_distance + PLACE_SPACING_M)
         if field is None:
             return np.zeros((0, 3)), np.zeros(0)
@@ -238,7 +238,11 @@ class ActiveLocaliser:
         rows, columns = np.meshgrid(*(np.arange(step // 2, n, step) for n in field.cost.shape), indexing="ij")
         cells = (rows * field.cost.shape[1] + columns).ravel()
         cost = field.cost.ravel()[cells]
-        cells, cost = (each[(cost > MIN_PATH_M) & (cost < MAX_PATH_M)] for each in (cells, cost))
+        is_candidate = (cost > MIN_PATH_M) & (cost < MAX_PATH_M)
+        if not is_candidate.any():  # where scans tell little about the pose, a metre costs up to a hundred
+            near = np.hypot(*(self.graph.grid.centres(cells) - pose[:2]).T) < MAX_PATH_M
+            is_candidate = (cost > MIN_PATH_M) & np.isfinite(cost) & near
+        cells, cost = cells[is_candidate], cost[is_candidate]
         # Thin out to MAX_PLACES, evenly over the costs.
         selected = np.argsort(cost, kind="stable")[:: max(1, -(-len(cost) // MAX_PLACES))]
         cells, cost = cells[selected], cost[selected]
@@ -274,7 +278,7 @@ class ActiveLocaliser:
         """Drives straight to the free place in the present scan where the next scan is expected to tell most."""
         bearing, room = _open_ranges(scan)
         length = np.minimum(room - self.min_point_distance, MAX_USEFUL_ROOM_M)
-        if room.max() < MIN_ROOM_M:
+        if room.max() < MIN_ROOM_M and self.may_turn:
             reason = f"the belief is {belief.state}: turning to where there is room"
             return Decision(np.array([0.0, 0.0, 0.5]), reason, "exploring")
         reason = f"the belief is {belief.state}: driving to where there is room, to see more"

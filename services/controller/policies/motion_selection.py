@@ -46,7 +46,7 @@ class Surroundings:
     min_point_distance: float  # m from the robot's centre
 
     field_of_view: Sector = ALL_ROUND  # directions that the scanner sees
-    may_turn: bool = True  # if the base may turn, it never has to move into a direction that the scanner does not see
+    may_turn: bool = True  # if the base may turn, it never has to move in a direction that the scanner does not see
 
     def sees(self, bearings: Array | float) -> npt.NDArray[np.bool_]:
         """Whether the scanner sees all that the body can meet on the way into ``bearings`` (...,) rad; (...,) bool."""

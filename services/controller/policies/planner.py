@@ -56,8 +56,9 @@ class GeodesicPolicy:
     ) -> None:
         """Builds the graph of the world. Without a world, every goal is refused until `use_map`.
 
-        ``keep_heading``: a holonomic base does not turn into its direction of motion. ``epistemic``: motions are also
-        judged by the information that they gain; otherwise the robot drives on as if the best hypothesis were true.
+        ``keep_heading``: a holonomic base does not turn to face its direction of motion. ``epistemic``: motions are
+        also judged by the information that they gain; otherwise the robot drives on as if the best hypothesis were
+        true.
         """
         # In a growing map this is off, because the information of a scan cannot be computed where the map is unknown.
         self.epistemic = epistemic and world is not None

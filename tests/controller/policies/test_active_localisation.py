@@ -45,3 +45,15 @@ def test_time_for_progress():
     assert visited.give_up_if_stalled(away)
     assert not visited.give_up_if_stalled(away)
     assert visited.positions[-1].tolist() == away.tolist()
+
+
+def test_places_where_scans_tell_little():
+    """Every metre there costs a hundred, so that no place is within the usual cost."""
+    poses = np.array([[3.0, 2.0, 0.0], [7.0, 2.0, 0.0]])
+    hypotheses = [BeliefHypothesis(pose=Pose.of(pose), weight=0.5) for pose in poses]
+    ambiguous = belief(0, poses[0], "ambiguous").model_copy(update={"hypotheses": hypotheses})
+    graph = FreeSpaceGraph(FreeSpace.of(room(10, 4)), ROBOT.radius)
+    graph.set_extra_cost_per_metre(np.full(graph.grid.shape, 100.0).ravel())
+    drives = ActiveLocaliser(ROBOT, graph, 0.33, Recovery()).prediction_request(ambiguous)
+    assert drives is not None
+    assert len(drives.displacements) > 5

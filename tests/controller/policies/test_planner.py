@@ -43,7 +43,7 @@ def test_turns_to_the_heading_of_the_goal(kind):
     poses, statuses, _ = drive(HALL, Robot(drive=kind), (4.0, 1.5, 0.0), to)
     assert statuses[-1].state == "reached"
     assert abs(poses[-1][2] - 2.0) <= 0.1
-    turning = [status.state for status in statuses if "turning into" in status.reason]
+    turning = [status.state for status in statuses if "turning to" in status.reason]
     assert set(turning) == {"navigating"}  # the goal is not reached before the turn ends
 
 
