@@ -96,6 +96,17 @@ def test_drive_without_beliefs():
     assert all(a - b <= PERIOD_S + 1e-9 for a, b in itertools.pairwise(commands))
 
 
+def test_drive_without_beliefs_after_time_went_back():
+    navigator = Navigator(world=ROOM)
+    for number in (*range(900, 960), *range(20)):
+        navigator.on_scan(scan(number * PERIOD_NS, [3.0, 2, 0], ROOM))
+        if number < 930:
+            navigator.on_drive(move(0.8))
+        answer = navigator.step_without_belief(number * PERIOD_NS)
+    assert answer is not None
+    assert answer[1].state == "manual"
+
+
 @pytest.mark.parametrize(
     ("messages", "valid"),
     [

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from common.bus.inbox import Inbox
+from common.errors import UserError
 from common.messages.requests import PredictReply, Reply
 from common.messages.topics import BELIEF, CMD_VEL, MAX_BYTES, PREDICT, SCAN
 from common.runtime.service import ServiceLoop
@@ -113,3 +114,8 @@ def test_cost_field_of_a_large_building(shape):
     cost[0, 0] = np.inf
     assert sent[0, 0] == pytest.approx(cost[:side, :side].min())
     assert sent[-1, -1] == pytest.approx(cost[(message.height - 1) * side :, (message.width - 1) * side :].min())
+
+
+def test_a_differential_base_cannot_keep_its_heading():
+    with pytest.raises(UserError, match="cannot keep its heading"):
+        ControllerSettings(drive="differential", heading="keep").check()
