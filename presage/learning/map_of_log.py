@@ -43,7 +43,7 @@ class MapOptions:
     reading: Reading | None = None
     poses: str = "slam"  # slam: from scans and odometry; reference: the log's own
     odometry: bool = True  # whether slam uses the log's odometry
-    refine: str = ""  # map or world whose frame and unseen parts are kept, of its model as well; slam only
+    refine: str = ""  # map whose frame is kept, and what the drive did not see of it and its model; only with slam
     models: Path | None = None  # folder for the weights of the model; defaults to no model
 
 
@@ -107,7 +107,7 @@ def _check(options: MapOptions) -> None:
     if options.models is not None:
         files.append(weights.path_of(options.models, options.out.stem))
     if existing := [str(path) for path in files if path.exists()]:
-        raise UserError(f"exists already: {', '.join(existing)}; choose another name with --out, or remove")
+        raise UserError(f"exists already: {', '.join(existing)}; choose another name with --out, or delete these files")
 
 
 def _check_scan_count(count: int, options: MapOptions) -> None:

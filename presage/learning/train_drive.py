@@ -51,8 +51,9 @@ class TrainDriveOptions:
     recipe: Recipe = Recipe(resolution=0.05)  # noqa: RUF009 - frozen
     share: float = 1.0  # of the drive to use, from its beginning
     reading: Reading | None = None  # properties of the log that the file does not state
-    rough: World | None = None  # the map that the drive refines: scans are simulated in it instead of in `world`
-    former: Path | None = None  # weights of its former model, which simulates the scans instead of both
+    # If the drive refines a map, scans are simulated by its former model if there is one, else in the map.
+    rough: World | None = None
+    former: Path | None = None  # weights of the former model
 
 
 def train_from_drive(options: TrainDriveOptions, console: Console) -> Path:

@@ -125,7 +125,7 @@ class GoalState:
         """
         if self.phase not in {Phase.NAVIGATING, Phase.BLOCKED}:
             return
-        self.reason = decision.reason or ("slowed by the scan" if limited_by_scan else "")
+        self.reason = decision.reason or ("slowed for an obstacle in the scan" if limited_by_scan else "")
         if decision.recovering:
             self.phase = Phase.BLOCKED
         elif not (limited_by_scan or decision.state == "blocked"):
@@ -133,7 +133,7 @@ class GoalState:
         elif self._standing_since is None or (moving and _has_moved(self._standing_since[1], pose)):
             self.phase, self._standing_since = Phase.NAVIGATING, (stamp_ns, pose)
         elif (stamp_ns - self._standing_since[0]) * 1e-9 >= BLOCKED_AFTER_S:
-            self.phase, self.reason = Phase.BLOCKED, decision.reason or "the scan shows something in the way"
+            self.phase, self.reason = Phase.BLOCKED, decision.reason or "an obstacle in the scan is in the way"
 
     def status(self, stamp_ns: int, distance: float | None) -> Status:
         """The status to publish, with the ``distance`` m to the goal if it is known."""

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from common.geometry.world import World
 
 LIFT_TOLERANCE_M = 0.1  # the robot waits within this distance of the lift's place
-MIN_WAY_M = 1e-6  # added to each way, as scipy takes 0 for no connection
-RIDE_LENGTH_M = 20.0  # a ride counts as much as this way on a floor (a guess)
+MIN_EDGE_M = 1e-6  # added to each edge, as scipy takes 0 for no connection
+RIDE_LENGTH_M = 20.0  # a ride costs as much as driving this distance (a guess)
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def plan_ride(world: World, place: Array, goal: Array, refusal: Callable[[Array]
     places = np.array([*(world.floor(name).to_map(world.lifts[number][name]) for number, name in stops), goal[:2]])
     lifts = np.array([*(number for number, _ in stops), -1])
     floors = np.array([*(name for _, name in stops), there.name])
-    distance = np.hypot(*(places[:, None] - places).transpose(2, 0, 1)) + MIN_WAY_M
+    distance = np.hypot(*(places[:, None] - places).transpose(2, 0, 1)) + MIN_EDGE_M
     same_floor = (floors[:, None] == floors) & (floors != here.name)  # here, the robot drives to the first lift only
     length = np.where(same_floor, distance, np.where(lifts[:, None] == lifts, RIDE_LENGTH_M, np.inf))
     to_goal, following = dijkstra(length, directed=False, indices=len(stops), return_predecessors=True)

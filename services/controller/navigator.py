@@ -54,9 +54,9 @@ class Navigator:
         self._docking: Docking | None = None  # if the goal has an approach direction
         self._ride: LiftRide | None = None  # while the goal is on another floor
         self._map: PlannedMap | None = None  # the mapper's, if there is one
-        self._pose: Array | None = None  # (3,) base_link in map, of the latest belief that tracks
-        self._tracking = False  # whether the latest belief tracks
-        self._floor: Floor | None = None  # for which the destination was chosen; None if it was not known
+        self._pose: Array | None = None  # (3,) base_link in map, of the latest belief in state `tracking`
+        self._tracking = False  # whether the latest belief is in that state
+        self._floor: Floor | None = None  # of the robot when the destination was chosen; None if it was unknown
         self.explorer: Explorer | None = None  # the last exploration, unless it was cancelled
         self._exploration_request: Goal | None = None  # waits for the first map and a pose in it
         self._scan: Scan | None = None

@@ -48,7 +48,7 @@ def test_obstacle_on_the_line():
     poses, statuses, contacts = drive(
         blocked, Robot(**IMPERFECT), (3.0, 3.0, -1.0), dock(0.0, 0.0), known=HALL, change=change
     )
-    assert (statuses[299].state, statuses[299].reason) == ("blocked", "the scan shows something in the way")
+    assert (statuses[299].state, statuses[299].reason) == ("blocked", "an obstacle in the scan is in the way")
     assert 0.02 < 6.0 - poses[299, 0] < 0.2
     assert (statuses[-1].state, contacts) == ("reached", 0)
 

@@ -30,7 +30,7 @@ REASONS = {
     "blocked": "no way around something that is not in the map at (12.3, 1.4): waiting until it clears",
     "exploring": "2 places are possible: going to (6.3, 4.1) to tell them apart",
 }
-PAST = (("idle", ""), ("navigating", ""), ("blocked", "the scan shows something in the way"), ("navigating", ""))
+PAST = (("idle", ""), ("navigating", ""), ("blocked", "an obstacle in the scan is in the way"), ("navigating", ""))
 SCANNER = SCANNERS["tim571"]
 DT = 1 / SCANNER.rate
 COVARIANCE = (4e-6, 1e-6, 0, 1e-6, 2.5e-6, 0, 0, 0, 3e-6)

@@ -38,7 +38,7 @@ class ExpectedFreeEnergy:
     """The terms of N motions in nats, (N,) each."""
 
     risk: Array
-    ambiguity: Array  # of the pose along the way; of a drive to tell hypotheses apart, of a beam at its end
+    ambiguity: Array  # motions: entropy of the pose along the path; drives to a place: mean entropy of a beam there
     pose_information: Array  # expected gain about where the robot is within a place
     place_information: Array  # expected gain about which of several places it is at
 

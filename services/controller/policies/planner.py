@@ -78,8 +78,8 @@ class GeodesicPolicy:
         self._scan: Scan | None = None
         self._information: ScanInformation | None = None  # None before the first scan, and without `epistemic`
         self._obstacles_set_ns = -REPLAN_PERIOD_NS  # when obstacles were last given to the graph
-        self._obstacle_cells: npt.NDArray[Any] = np.zeros(0, int)  # of the graph, that these obstacles occupy
-        self._field_outdated = False  # whether the field was computed before that
+        self._obstacle_cells: npt.NDArray[Any] = np.zeros(0, int)  # cells of the graph that these obstacles occupy
+        self._field_outdated = False  # whether the field was computed before these obstacles were given
         self._reachable_from: int | None = None  # a component of the graph; the goal can be reached from there
         self._field_of_view = ALL_ROUND
         # Least distance from the goal in m, and the stamp at which the robot got there; None until it is near the goal.

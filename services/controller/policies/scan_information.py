@@ -5,8 +5,8 @@ precision along n is 1 / ((sigma n·u)² + MAP_ERROR_M²): an error of the map d
 information of a scan is the sum over its beams (Censi 2007). Beams without a return give no information.
 
 A robot at a place p knows its pose by the scans there, or by those at another place q and dead reckoning from there.
-If the scans on the way at q leave the standard deviation s(q), that at p is the least of s(q) plus the drift from q to
-p, over all q. This is a shortest path.
+Let s(q) be the standard deviation that scans at q leave. The one at p is the minimum over q of s(q) plus the drift from
+q to p, which is the length of a shortest path.
 """
 
 from __future__ import annotations
@@ -99,8 +99,8 @@ def _propagate_deviation(graph: FreeSpaceGraph, deviation: Array) -> Array:
     `efe.DRIFT_PER_METRE`.
     """
     distance = deviation / efe.DRIFT_PER_METRE
-    # Dijkstra's algorithm starts at an additional node. Its distance from a cell is the way on which the deviation
-    # would grow to that of the scans there. A sparse matrix stores no edge of length 0.
+    # Dijkstra's algorithm starts at an additional node. The edge from it to a cell is as long as the drive over which
+    # drift alone causes the deviation that scans there leave. A sparse matrix stores no edge of length 0.
     additional = csr_matrix(np.append(np.maximum(distance, 1e-9), 0.0))
     lengths = graph.lengths
     lengths.resize((len(distance), len(distance) + 1))

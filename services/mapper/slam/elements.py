@@ -17,8 +17,8 @@ from common.robot.ranges import is_surface
 
 HALF_WIDTH_M = 0.06  # of an element, across the beams
 SPACING_M = 0.1  # between elements, across the beams
-# Neighbouring points belong to different surfaces if their distance exceeds both limits; the second one is in units of
-# the distance that beams have at this range on a surface that faces the scanner.
+# Neighbouring points belong to different surfaces if their distance exceeds both limits; the second one is a
+# multiple of the spacing of the beams at this range, on a surface perpendicular to them.
 MIN_GAP_M, GAP_BEAMS = 0.12, 6.0
 MAX_ROUGHNESS_M = 0.03  # standard deviation of the points from the line; rougher elements are corners
 MIN_POINTS = 3  # from which the direction of a surface is computed

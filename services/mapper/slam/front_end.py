@@ -55,8 +55,8 @@ MAX_SUSPECT_SCANS = 10  # after this many suspect scans in a row, the last of th
 MAX_SLIP = 6.0  # standard deviations of the motion; a scan that matches farther from the prior begins a piece
 CLOSE_TO_PRIOR = np.array([0.1, 0.1, 0.1])  # m, m, rad: after a suspect scan, a match farther away may be accidental
 NO_PIECE = -1  # of a suspect scan, instead of the number of a piece
-# Standard deviations of the motion. With odometry: of its error, as a share of the motion. Without: of the change of
-# the velocity in one second, m/s and rad/s, and of the velocity itself where the last one is unknown.
+# Standard deviations of the motion. With odometry: of its error, per unit of motion. Without: of the change of the
+# velocity in one second, m/s and rad/s, or of the velocity if the last one is unknown.
 ODOMETRY_PATH, ODOMETRY_TURN_BY_PATH, ODOMETRY_TURN = 0.4, 0.5, 1.0  # m/m, rad/m, rad/rad
 VELOCITY_CHANGE_DEVIATION = np.array([1.0, 1.0, 3.0])
 VELOCITY_DEVIATION = np.array([1.0, 1.0, 1.5])
@@ -278,7 +278,7 @@ class FrontEnd:
         """Adds a scan of which too little matches, at the pose that the motion model predicts."""
         scan_pose = ScanPose(pose, self._since_key, matched=False, piece=self._key_pieces[-1])
         self._append(scan_pose)
-        # Not earlier, although it sees something new: its pose is only predicted.
+        # A scan that sees something new is a key scan sooner, but not this one: its pose is only predicted.
         if self._is_key_due(scan, familiar=True):
             self._add_linked_key(scan, np.zeros((3, 3)))
         return scan_pose

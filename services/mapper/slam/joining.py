@@ -25,7 +25,8 @@ TARGET_SPACING_M = 2.0  # between segments of the map in which a segment is sear
 SEARCH_RANGE_M, TURN_STEP = 4.0, 0.06  # m to either side of a target, and rad between the headings that are tried
 SAME_PLACE_M, SAME_PLACE_RAD = 0.5, 0.1  # two candidates agree if they place the piece this close together
 MIN_SUPPORT = 2  # number of segments that must agree
-# A place is rejected if a larger share of the elements contradicts the nearest segments: this plus twice the usual one.
+# A place is rejected if the share of elements that contradict the nearest segments exceeds this, plus twice the share
+# that is usual between successive segments.
 MAX_CONTRADICTION, NEAREST_SEGMENTS = 0.03, 3
 
 
