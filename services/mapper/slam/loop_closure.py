@@ -149,8 +149,7 @@ def _close_loop(
 
 def _is_plausible(match: SegmentMatch, predicted: Array, covariance: Array) -> bool:
     """Whether a match agrees with the pose (3,) that the graph predicts within ``covariance`` (3, 3)."""
-    difference = match.pose - predicted
-    difference[2] = se2.wrap(difference[2])
+    difference = se2.difference(match.pose, predicted)
     return bool(difference @ np.linalg.solve(covariance + match.covariance, difference) < MAX_SQUARED_DEVIATION)
 
 

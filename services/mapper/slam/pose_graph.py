@@ -46,9 +46,7 @@ class LinkTable:
 
     def errors(self, poses: Array) -> Array:
         """Errors (L, 3) of the links at poses (N, 3), in the frame of the first pose of each."""
-        error = se2.between(poses[self.first], poses[self.second]) - self.poses
-        error[:, 2] = se2.wrap(error[:, 2])
-        return np.asarray(error)
+        return se2.difference(se2.between(poses[self.first], poses[self.second]), self.poses)
 
     def squared_deviations(self, poses: Array) -> Array:
         """Squared Mahalanobis distances (L,) of the links at poses (N, 3)."""

@@ -50,8 +50,7 @@ class PosePrior:
 
     def difference(self, pose: Array) -> tuple[Array, float]:
         """Difference (3,) of the mean from a pose, and its squared Mahalanobis distance."""
-        difference = self.mean - pose
-        difference[2] = se2.wrap(difference[2])
+        difference = se2.difference(self.mean, pose)
         return difference, float(difference @ self.information @ difference)
 
 

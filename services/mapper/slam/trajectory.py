@@ -73,8 +73,6 @@ def distribute_corrections(
     after = np.where(pieces[after] == pieces[before], after, before)
     sides = [se2.compose(corrected[k], se2.between(poses[keys[k]], poses)) for k in (before, after)]
     share = (number - keys[before]) / np.maximum(keys[after] - keys[before], 1)
-    off = sides[1] - sides[0]
-    off[:, 2] = se2.wrap(off[:, 2])
-    result = sides[0] + share[:, None] * off
+    result = sides[0] + share[:, None] * se2.difference(sides[1], sides[0])
     result[:, 2] = se2.wrap(result[:, 2])
     return np.asarray(result)
