@@ -24,6 +24,7 @@ from services.estimator.paper.decoder import DecoderShape, Normalisation, PaperM
 from services.estimator.paper.training import Trainer, TrainingData, TrainingParameters, usable_ranges
 
 TEST_SAMPLES = 1000
+HIDDEN, CHANNELS = 128, 8  # size of the shipped networks, see DecoderShape
 
 
 @dataclass(frozen=True)
@@ -37,8 +38,6 @@ class TrainPaperOptions:
     out: Path
     samples: int
     parameters: TrainingParameters
-    shape_hidden: int = 128
-    shape_channels: int = 8
 
 
 def train(options: TrainPaperOptions, link: Link, console: Console) -> Path:
@@ -91,7 +90,7 @@ def _fit(
     bar: Progress,
 ) -> tuple[Trainer, float]:
     norm = Normalisation.of(world.bounds, float(data["train"].ranges.max()))
-    shape = DecoderShape(scanner.beams, options.shape_hidden, options.shape_channels)
+    shape = DecoderShape(scanner.beams, HIDDEN, CHANNELS)
     trainer = Trainer(shape, norm, options.parameters, data["train"], data["test"])
     if checkpoint.restore(trainer):
         bar.console.print(f"resuming an interrupted run after epoch {trainer.progress.epoch}")
@@ -144,8 +143,8 @@ def _save(
         batch=parameters.batch,
         learning_rate=parameters.learning_rate,
         seed=parameters.seed,
-        hidden=options.shape_hidden,
-        channels=options.shape_channels,
+        hidden=HIDDEN,
+        channels=CHANNELS,
         center=trainer.norm.center,
         half_size=trainer.norm.half_size,
         range_scale=trainer.norm.range_scale,
