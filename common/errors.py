@@ -46,11 +46,15 @@ NAME_PATTERN = r"^[\w.-]+$"  # of names in files
 PATTERN_PROBLEMS = {NAME_PATTERN: "only letters, digits, '.', '-' and '_' may be in a name, not {input}"}
 
 
+def similar_key(key: str, known: Iterable[str]) -> str | None:
+    """The one of the ``known`` keys that was probably meant by an unknown ``key``; None if none is similar."""
+    return next(iter(difflib.get_close_matches(key, sorted(known), 1)), None)
+
+
 def unknown_key(key: str, known: Iterable[str]) -> str:
     """What to say of a key that is none of the ``known`` ones: the most similar one, or else all."""
-    names = sorted(known)
-    similar = difflib.get_close_matches(key, names, 1)
-    hint = f"did you mean {similar[0]!r}?" if similar else f"the keys are {', '.join(names)}"
+    similar = similar_key(key, known)
+    hint = f"did you mean {similar!r}?" if similar else f"the keys are {', '.join(sorted(known))}"
     return f"unknown key {key!r}; {hint}"
 
 

@@ -68,9 +68,9 @@ def read_building(data: dict[str, Any]) -> BuildingFile:
     try:
         return BuildingFile.model_validate(data)
     except ValidationError as error:
-        hint = "walls and obstacles belong in the files of its floors"
-        for key in error.errors(include_url=False)[0]["loc"][:1]:  # none for an unknown key
-            hint = f"an example is {EXAMPLES[key]}" if key in EXAMPLES else hint
+        key = str(next(iter(error.errors(include_url=False)[0]["loc"]), ""))  # empty for an unknown key
+        example = f"an example is {EXAMPLES[key]}" if key in EXAMPLES else None
+        hint = example or "walls and obstacles belong in the files of its floors"
         raise UserError(f"{first_fault(error)}; {hint}") from None
 
 

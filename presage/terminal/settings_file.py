@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
 from pathlib import Path
 
-from common.errors import UserError
+from common.errors import UserError, similar_key
 from common.runtime.config import read_settings_file
 
 COMMAND_SECTIONS = ("log", "train")
@@ -45,9 +44,9 @@ def check_keys(path: Path | None) -> Path | None:
     known.update(*(cls.model_fields.keys() - cls.private for cls in services))
     for key in read_settings_file(path):
         if key not in known:
-            similar = difflib.get_close_matches(str(key), known, 1)
+            similar = similar_key(str(key), known)
             raise UserError(
-                f"{path}: {key}: unknown key{f'; did you mean {similar[0]}?' if similar else ''}"
+                f"{path}: {key}: unknown key{f'; did you mean {similar}?' if similar else ''}"
                 " (docs/settings.yaml lists all)"
             )
     return path

@@ -28,7 +28,7 @@ from services.mapper.slam.elements import elements_of_scan
 from services.mapper.slam.front_end import ScanPose
 from services.mapper.slam.mapper import Mapper, MapSnapshot
 
-MAX_LATE_NS = 1_000_000_000  # a scan that is earlier than the last one by less is left out; else, time went back
+MAX_LATE_NS = 1_000_000_000  # a scan that is earlier than the last one by less is left out; by more, time went back
 UPDATE_PERIOD_NS = 1_000_000_000  # between the beginnings of two updates of the map, which leaves time for the scans
 REPEAT_PERIOD_NS = 5_000_000_000  # an unchanged map is published again after this time, for later subscribers
 
@@ -77,13 +77,14 @@ class MapperService(Service):
             self._add(scan, odom)
 
     def _add(self, scan: Scan, odom: Odom | None) -> None:
-        late_ns = 0 if self._belief is None else self._belief.stamp_ns - scan.stamp_ns
-        if self._belief is not None and late_ns == 0:
-            self.publish(BELIEF, self._belief)  # a repeated scan gets the same belief again
-            return
-        if 0 < late_ns < MAX_LATE_NS:
-            self.counters["late_scans"] += 1
-            return
+        if self._belief is not None:
+            late_ns = self._belief.stamp_ns - scan.stamp_ns
+            if late_ns == 0:
+                self.publish(BELIEF, self._belief)  # a repeated scan gets the same belief again
+                return
+            if 0 < late_ns < MAX_LATE_NS:
+                self.counters["late_scans"] += 1
+                return
         mapper, angles = self._mapper_for(scan), scan.angles()
         ranges = ranges_for_localisation(scan.ranges)
         if not np.array_equal(angles, mapper.laser.angles):  # some scanners' numbers of beams vary from turn to turn

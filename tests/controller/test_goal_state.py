@@ -25,6 +25,7 @@ LOSE, EXPLORE = (event(GoalState.lose_pose, activity, "unsure") for activity in 
 NO_BELIEF, FIND = event(GoalState.lose_belief, "no belief"), GoalState.find_pose
 CANCEL, SUSPEND = GoalState.cancel, GoalState.suspend
 IN_THE_WAY = "an obstacle in the scan is in the way"
+SLOWED = "slowed for an obstacle in the scan"
 FREE, HINDERED = progress(0), progress(1, limited=True)
 
 
@@ -48,26 +49,16 @@ FREE, HINDERED = progress(0), progress(1, limited=True)
         ([START, EXPLORE, NO_BELIEF], "lost", "no belief", True),
         ([START, NO_BELIEF, FIND], "navigating", "", True),
         ([START, NO_BELIEF, SUSPEND], "navigating", "", True),
-        ([START, HINDERED], "navigating", "slowed for an obstacle in the scan", True),
-        ([START, HINDERED, progress(2.9, limited=True)], "navigating", "slowed for an obstacle in the scan", True),
+        ([START, HINDERED], "navigating", SLOWED, True),
+        ([START, HINDERED, progress(2.9, limited=True)], "navigating", SLOWED, True),
         ([START, HINDERED, progress(3, limited=True)], "blocked", IN_THE_WAY, True),
         ([START, HINDERED, progress(3, state="blocked", reason="a box")], "blocked", "a box", True),
         ([START, HINDERED, progress(3, reason="slow")], "navigating", "slow", True),
-        ([START, HINDERED, FREE, progress(3, limited=True)], "navigating", "slowed for an obstacle in the scan", True),
+        ([START, HINDERED, FREE, progress(3, limited=True)], "navigating", SLOWED, True),
         ([START, HINDERED, progress(3, limited=True), FREE], "navigating", "", True),
         ([START, HINDERED, progress(3, at=(0, 0.01, 0.01), limited=True)], "blocked", IN_THE_WAY, True),
-        (
-            [START, HINDERED, progress(3, at=(0, 0.03, 0), limited=True)],
-            "navigating",
-            "slowed for an obstacle in the scan",
-            True,
-        ),
-        (
-            [START, HINDERED, progress(3, at=(0, 0, 0.1), limited=True)],
-            "navigating",
-            "slowed for an obstacle in the scan",
-            True,
-        ),
+        ([START, HINDERED, progress(3, at=(0, 0.03, 0), limited=True)], "navigating", SLOWED, True),
+        ([START, HINDERED, progress(3, at=(0, 0, 0.1), limited=True)], "navigating", SLOWED, True),
         ([START, HINDERED, progress(3, at=(0, 9, 0), moving=False, limited=True)], "blocked", IN_THE_WAY, True),
         ([START, progress(0, recovering=True, reason="backs off")], "blocked", "backs off", True),
         ([START, progress(0, recovering=True), LOSE, FIND], "navigating", "", True),

@@ -346,8 +346,8 @@ def track_drive(drive: RawDrive, report: Callable[[float], None] = lambda _done:
     """Tracks the scans of a drive; reports the share that is done."""
     front_end = FrontEnd(drive.laser)
     for k, (stamp, ranges) in enumerate(zip(drive.stamps, drive.ranges, strict=True)):
-        known = drive.odom is not None and np.isfinite(drive.odom[k]).all()
-        front_end.add(float(stamp), ranges, drive.odom[k] if drive.odom is not None and known else None)
+        odom = None if drive.odom is None or not np.isfinite(drive.odom[k]).all() else drive.odom[k]
+        front_end.add(float(stamp), ranges, odom)
         report(k / len(drive.ranges))
     return front_end.track()
 

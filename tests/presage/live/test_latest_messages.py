@@ -15,6 +15,7 @@ def test_error_for_an_unknown_robot(bus, link):
     bus.declare_alive("controller")
     with pytest.raises(UserError, match="no status"), session_bus(link):
         raise UserError("no status")
-    unknown = dataclasses.replace(link, robot="nobody")
-    with pytest.raises(UserError, match=f"no robot 'nobody' is running: choose .*{link.robot}"), session_bus(unknown):
+    reason = f"no robot 'nobody' is running: choose .*{link.robot}"
+    link_of_nobody = dataclasses.replace(link, robot="nobody")
+    with pytest.raises(UserError, match=reason), session_bus(link_of_nobody):
         raise UserError("no status")
