@@ -25,8 +25,8 @@ class VelocityCommand:
         self.robot = robot
         self.velocity = np.zeros(3)  # (3,) m/s, m/s, rad/s in base_link
         self.stamp_ns: int | None = None  # of the latest belief or scan that was answered
-        self._below_dead_band = np.zeros(3)  # desired velocities that were too low to command, summed over scans
-        self._period_s = 0.0  # between the last two commands that were not stops
+        self._below_dead_band = np.zeros(3)  # sum over scans of desired velocities that were too low to command
+        self._period_s = 0.0  # s between the last two commands that were not stops
         self._stopped = False  # whether the last command was a stop
         self._before_pause: Array | None = None  # velocity before a pause of the simulation
         self._sent: deque[tuple[int, Array]] = deque(maxlen=100)  # stamps in ns and velocities of the last commands
@@ -40,7 +40,8 @@ class VelocityCommand:
         possible, too_low = self._in_pulses(safety.clip_twist(desired, self.robot))
         ramped = safety.ramp(self.velocity, possible, self.robot, period_s)
         self.velocity, limited_by_scan = safety.limit_velocity(ramped, points, self.robot)
-        moves = self._speeds(self.velocity) >= self._dead_bands  # the base ignores less, as while it accelerates
+        # The base ignores speeds below the dead band, also while the command is still accelerating to a pulse.
+        moves = self._speeds(self.velocity) >= self._dead_bands
         self._below_dead_band -= np.where(too_low & moves, self.velocity, 0.0)
         self._sent.append((stamp_ns, self.velocity))
         vx, vy, wz = map(float, self.velocity)
@@ -75,7 +76,7 @@ class VelocityCommand:
         limits, speeds = self._dead_bands, self._speeds(desired)
         too_low = (speeds > 0) & (speeds < limits)
         total = np.where(too_low, self._below_dead_band + desired, 0.0)
-        # Never more than two pulses, which would otherwise add up where the robot may not move.
+        # At most two pulses wait. More would add up where an obstacle keeps the robot from moving.
         self._below_dead_band = total * np.minimum(1.0, 2 * limits / np.maximum(self._speeds(total), 1e-9))
         sums = self._speeds(self._below_dead_band)
         # Slightly more than the dead band, because the base compares rounded numbers.

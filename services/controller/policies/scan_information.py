@@ -5,8 +5,8 @@ precision along n is 1 / ((sigma n·u)² + MAP_ERROR_M²): an error of the map d
 information of a scan is the sum over its beams (Censi 2007). Beams without a return give no information.
 
 A robot at a place p knows its pose by the scans there, or by those at another place q and dead reckoning from there.
-Let s(q) be the standard deviation that scans at q leave. The one at p is the minimum over q of s(q) plus the drift from
-q to p, which is the length of a shortest path.
+Let s(q) be the standard deviation that scans at q leave. The deviation at p is the minimum over q of s(q) plus the
+drift from q to p, which is found as the length of a shortest path.
 """
 
 from __future__ import annotations
