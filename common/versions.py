@@ -1,11 +1,13 @@
-"""Package versions, the protocol version, and the commit of a checkout."""
+"""What made a result: package versions, the protocol version, the commit of a checkout, and the command."""
 
 from __future__ import annotations
 
 import functools
 import importlib.metadata
 import platform
+import shlex
 import subprocess
+import sys
 from pathlib import Path
 
 # Version of the messages, requests and keys. Increase it when an older service would misread a newer one's messages; a
@@ -29,6 +31,11 @@ def commit() -> str:
     except (OSError, subprocess.SubprocessError):
         return "unknown"
     return head + ("+" if dirty else "")
+
+
+def presage_command() -> str:
+    """The command `presage` that runs, quoted so that it can be pasted into a shell."""
+    return shlex.join(["presage", *sys.argv[1:]])
 
 
 @functools.cache

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +14,7 @@ from matplotlib.figure import Figure
 
 from common.errors import UserError
 from common.geometry.se2 import Array
-from common.versions import commit, versions
+from common.versions import commit, presage_command, versions
 
 
 @dataclass
@@ -33,7 +32,7 @@ class Result:
 
     def write(self, out: Path, figure: Figure | None) -> list[Path]:
         """Writes the result into the folder ``out``. Returns the paths of the files."""
-        provenance = {"command": " ".join(["presage", *sys.argv[1:]]), "commit": commit(), "versions": versions()}
+        provenance = {"command": presage_command(), "commit": commit(), "versions": versions()}
         path = out / f"{self.name}.json"
         if figure is not None:  # before the JSON file, which marks a result as complete
             for suffix in (".pdf", ".png"):

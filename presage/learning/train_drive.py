@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,7 +21,7 @@ from common.robot.ranges import is_surface
 from common.robot.robot import Robot
 from common.robot.scan_geometry import Sweep
 from common.robot.scanner import Scanner
-from common.versions import commit, versions
+from common.versions import commit, presage_command, versions
 from presage.learning.drive_figure import draw_learned
 from presage.logs.log import Reading
 from presage.logs.scan_files import Scans, read_scans
@@ -218,7 +217,7 @@ def card_of(
         source=source,
         calibration=calibration,
         commit=commit(),
-        command="presage " + " ".join(sys.argv[1:]),
+        command=presage_command(),
         versions=versions(),
     )
 

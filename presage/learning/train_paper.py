@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from common.bus.bus import Link
 from common.geometry.world import World, load_world
 from common.robot.robot import Robot
 from common.robot.scanner import Scanner
-from common.versions import commit, versions
+from common.versions import commit, presage_command, versions
 from presage.learning.simulated_scans import collect, scanner_on_bus
 from presage.plotting.style import empty_figure
 from services.estimator.paper import training, weights
@@ -155,7 +154,7 @@ def _save(
         curve_test_l1=[round(v, 5) for v in trainer.progress.test_l1],
         training_s=round(seconds, 1),
         commit=commit(),
-        command="presage " + " ".join(sys.argv[1:]),
+        command=presage_command(),
         versions=versions(),
     )
     weights.save(path, trainer.decoder, card)

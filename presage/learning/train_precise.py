@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,7 +16,7 @@ from common.geometry import se2
 from common.geometry.world import World, load_world
 from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS, Scanner
-from common.versions import commit, versions
+from common.versions import commit, presage_command, versions
 from presage.learning.simulated_scans import collect, scanner_on_bus
 from presage.plotting.style import empty_figure
 from services.estimator.factory import MIN_SIGMA_M
@@ -163,7 +162,7 @@ def _card(
         test_position_error_rms_m=errors.position_error_rms,
         learning_s=round(seconds, 1),
         commit=commit(),
-        command="presage " + " ".join(sys.argv[1:]),
+        command=presage_command(),
         versions=versions(),
     )
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import sys
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -24,7 +23,7 @@ from common.messages.definitions import Odom, Pose, Scan, Stamped, Truth, Twist
 from common.messages.requests import WorldReply
 from common.messages.topics import ODOM, SCAN, TRUTH, Topic
 from common.robot.scanner import Scanner
-from common.versions import versions
+from common.versions import presage_command, versions
 from presage.logs.log import Log, LoggedScan, Reading
 from presage.logs.opening import IS_A_RECORDING, kind_of, open_log
 from presage.terminal.output import check_file, provenance, write_json
@@ -137,7 +136,7 @@ def write_recording(
     period = float(np.median(np.diff([stamp for stamp, _ in first_scans])) * 1e-9) if len(first_scans) > 1 else 0.0
     writer, written = RecordingWriter(options.out), ImportCounts(first_ns=first_scans[0][0])
     try:
-        writer.metadata("presage", {"robot": options.robot, "command": " ".join(sys.argv), **versions()})
+        writer.metadata("presage", {"robot": options.robot, "command": presage_command(), **versions()})
         scanner = scanner_of(log, start, step, period, options.sigma)
         write_description(writer, "simulator", WorldReply(world=world, scanner=scanner))
         message_writer = _MessageWriter(writer, options.robot, written)

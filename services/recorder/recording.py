@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import shlex
 import sys
 import time
 from collections import Counter
@@ -39,7 +40,7 @@ class OpenRecording:
         self._logged_ns = 0  # log time of the last message
         limits = PartLimits(int(options.split_size * 1e6), options.split_minutes * 60)
         writer = self.writer = PartsWriter(parts_of(options, numbered=numbered), limits, self._counters)
-        writer.metadata("presage", {"robot": options.robot, "command": " ".join(sys.argv), **versions()})
+        writer.metadata("presage", {"robot": options.robot, "command": shlex.join(sys.argv), **versions()})
         writer.metadata("config:recorder", {"config": json.dumps(options.effective())})
         for topic in topics:
             if not topic.per_service:
