@@ -92,8 +92,9 @@ class BackEnd:
         return np.asarray(component == largest_component(component))
 
     def _add(self, found: list[LoopClosure], scans: KeyScanGraph) -> None:
-        if found:
-            self._uncertainty = None
+        if not found:
+            return  # the poses agree with the links already
+        self._uncertainty = None
         self.closures += found
         self.poses = optimise(self.poses, self._links(scans))
         self._drop_implausible()

@@ -12,7 +12,9 @@ from common.geometry import se2
 from common.geometry.world import load_world
 from lab.accuracy.motion_distortion import observations
 from lab.accuracy.scenes import TWIN_OFFSET, TWINS, Scene
+from services.mapper.slam import back_end as back_end_module
 from services.mapper.slam import correlative_search as correlative
+from services.mapper.slam.back_end import BackEnd
 from services.mapper.slam.correlative_search import correlative_search
 from services.mapper.slam.drive import Laser, RawDrive
 from services.mapper.slam.elements import Elements, concatenate
@@ -209,6 +211,19 @@ def test_closures_that_support_one_another():
     assert confirmed(right, wrong) == []
     assert confirmed(right, other) == [right, other]
     assert confirmed(right, wrong, other) == [right, other]
+
+
+def test_without_a_closure_nothing_is_optimised(monkeypatch):
+    office = load_world("office")
+    drive = driven(office, Scene.of(office, 300, 5).path(8))
+    scans = track_drive(drive).key_scans
+    back_end, calls = BackEnd(drive.laser), []
+    monkeypatch.setattr(back_end_module, "optimise", lambda poses, _: (calls.append(1), poses)[1])
+    back_end.extend(scans)
+    back_end.close_loops(scans, 30.0)
+    assert len(back_end.poses) > 8
+    assert not back_end.closures
+    assert not calls
 
 
 def test_look_alike_rooms_stay_apart():
