@@ -249,7 +249,7 @@ class Exploration(Message):
     """Progress of the exploration of an unknown building."""
 
     phase: Literal["exploring", "returning", "finished", "failed"]  # finished: all is seen, and the robot is back;
-    # failed: it cannot get back
+    # failed: it cannot get back, or cannot plan a path to what is left; the status says why
     seq: Count  # of the goal that requested it
     area: NotNegative  # m², free space in the map
     path: NotNegative  # m, driven since it began

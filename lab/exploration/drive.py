@@ -27,7 +27,7 @@ from services.mapper.slam.drive import Laser
 from services.mapper.slam.mapper import Mapper
 from services.simulator.simulation import Simulation, SimulationSetup
 
-ChooseViewpoint = Callable[[ExplorationState], Viewpoint | None]
+ChooseViewpoint = Callable[[ExplorationState], Viewpoint | str | None]
 CELL_M = 0.05  # of the map
 MAP_PERIOD_NS = 1_000_000_000  # between two versions of the map, as in the mapper's service
 LAST_SCANS = 15  # while the robot comes to a stand
@@ -104,7 +104,7 @@ class RobotWithMapper:
         began = time.perf_counter()
         viewpoint = self._choose(exploration_state)
         self.run.choice_ms.append(1e3 * (time.perf_counter() - began))
-        if viewpoint is not None:
+        if isinstance(viewpoint, Viewpoint):
             self.run.targets.append(viewpoint.pose)
         self._navigator.use_viewpoint(viewpoint, exploration_state)
 

@@ -18,7 +18,7 @@ STATUS_TIMEOUT_S = 30.0  # long enough to restart the mapper meanwhile
 
 
 def explore(link: Link, console: Console) -> int:
-    """Explores until everything that can be reached is mapped; returns 0 then, and 1 if the robot cannot get back."""
+    """Explores until everything that can be reached is mapped; returns 0 then, and 1 if that fails."""
     with session_bus(link) as bus:
         messages = LatestMessages(bus, STATUS)
         if not bus.wait_matching(GOAL, ANSWER_TIMEOUT_S):
@@ -54,7 +54,7 @@ def _follow(messages: LatestMessages, seq: int, console: Console) -> int:
                 console.print("`presage save-map NAME` saves the map")
                 return 0
             if progress.phase == "failed":
-                console.print(f"the robot cannot return to where it began: {status.reason}; {so_far}")
+                console.print(f"the exploration failed: {status.reason}; {so_far}")
                 return 1
             status = messages.wait_for(Status, lambda _: True, STATUS_TIMEOUT_S)
     raise UserError(f"the controller has published no status for {STATUS_TIMEOUT_S:g} s")

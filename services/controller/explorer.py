@@ -5,7 +5,8 @@
 | - | a goal with `explore` | EXPLORING |
 | EXPLORING, RETURNING | a viewpoint is worth a visit | EXPLORING |
 | EXPLORING, RETURNING | no viewpoint is worth a visit | RETURNING |
-| RETURNING | the robot has arrived | FINISHED |
+| EXPLORING, RETURNING | no viewpoint can be planned from where the robot is | RETURNING; FAILED at the start |
+| RETURNING | the robot has arrived, and no viewpoint was worth a visit | FINISHED |
 | RETURNING | the way back stays refused, and the robot does not move | FAILED |
 
 A viewpoint is given up if it is refused, or if the robot does not move `STALLED_M` in `STALLED_NS`. The way back is
@@ -52,6 +53,8 @@ class Explorer:
         self.paused = False  # whether a goal of a user takes precedence
         self.viewpoint_due = True  # whether a viewpoint has to be chosen; cleared by the caller that chooses it
         self.path_m = 0.0
+        self._failure = ""  # why the exploration has failed
+        self._can_plan = True  # whether the last choice of a viewpoint was possible
         self._pose, self._located = pose, True
         # The start is stored relative to the last key scan, so that it moves with the map when a loop closes.
         self._home_key = len(planned.message.poses) - 1
@@ -140,10 +143,16 @@ class Explorer:
         if state.active:
             return False
         if state.phase is Phase.REACHED:
-            self.phase = "finished"
+            if self._can_plan:
+                self.phase = "finished"
         elif stalled:
-            self.phase = "failed"
-        return self.active  # a refused return is tried again, because the next attempt may find another path
+            self._fail(f"cannot return to the start: {state.reason}")
+        # A refused return is tried again, because the next attempt may find another path. So is the choice of a
+        # viewpoint, because there may be more room at the start.
+        return self.active
+
+    def _fail(self, reason: str) -> None:
+        self.phase, self._failure = "failed", reason
 
     def _update_viewpoint(self, goal: Goal, state: GoalState, *, stalled: bool) -> bool:
         """Stores that the viewpoint was reached, or is given up; returns whether either is the case."""
@@ -156,11 +165,20 @@ class Explorer:
         self.goal, self._last_moved = None, (self._pose, 0)
         return True
 
-    def next_goal(self, viewpoint: Viewpoint | None, half_field_of_view: float, *, under_way: bool) -> Goal | None:
-        """The goal for a viewpoint, or for the way back if it is None; returns None if the present goal is kept.
+    def next_goal(
+        self, viewpoint: Viewpoint | str | None, half_field_of_view: float, *, under_way: bool
+    ) -> Goal | None:
+        """The goal for the result of `choose_viewpoint`: the viewpoint, or the way back if there is none.
 
-        The scanner sees ``half_field_of_view`` rad to either side. ``under_way``: the robot drives to the last goal.
+        Returns None if the present goal is kept, or the exploration has failed. The scanner sees ``half_field_of_view``
+        rad to either side. ``under_way``: the robot drives to the last goal.
         """
+        self._can_plan = not isinstance(viewpoint, str)
+        if isinstance(viewpoint, str):
+            if np.hypot(*(self._pose - self.home)[:2]) <= SAME_PLACE_M:
+                self._fail(viewpoint)
+                return None
+            viewpoint = None  # after the way back, there may be more room
         phase: Literal["exploring", "returning"] = "returning" if viewpoint is None else "exploring"
         pose = self.home if viewpoint is None else viewpoint.pose
         same = self.goal is not None and np.hypot(*(self.goal.pose.array() - pose)[:2]) <= SAME_PLACE_M
@@ -178,6 +196,8 @@ class Explorer:
         """The controller's status with the progress of the exploration."""
         progress = Exploration(phase=self.phase, seq=self.seq, area=self.map.free_area_m2, path=self.path_m)
         status = status.model_copy(update={"exploration": progress})
+        if self.phase == "failed" and status.state not in {"lost", "manual"}:
+            return status.model_copy(update={"state": "blocked", "reason": self._failure, "refused": True})
         if not self.drives or not self._located or status.state in {"lost", "manual"}:
             return status
         if status.state == "blocked" and not status.refused:

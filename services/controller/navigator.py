@@ -122,8 +122,8 @@ class Navigator:
 
         return explorer.exploration_state(FieldOfView.of(self._scan, explorer.map.message.grid.resolution))
 
-    def use_viewpoint(self, viewpoint: Viewpoint | None, exploration_state: ExplorationState) -> None:
-        """Drives to the viewpoint that was chosen, or back to the start if there is none."""
+    def use_viewpoint(self, viewpoint: Viewpoint | str | None, exploration_state: ExplorationState) -> None:
+        """Drives to the viewpoint that was chosen, or back to the start if there is none, or a reason against any."""
         if self.explorer is not None and self.explorer.drives:
             goal = self.explorer.next_goal(
                 viewpoint, exploration_state.field_of_view.sector.half, under_way=self.goal_state.active

@@ -90,7 +90,7 @@ class ControllerService(Service):
         self.geodesic: GeodesicPolicy | None = None  # the policy if the preset is `geodesic`
         self._map: PlannedMap | None = None  # the mapper's, if the policy plans in it
         self._map_job: BackgroundJob[PlannedMap] = BackgroundJob(self._wake)
-        self._viewpoint_job: BackgroundJob[tuple[Viewpoint | None, ExplorationState]] = BackgroundJob(self._wake)
+        self._viewpoint_job: BackgroundJob[tuple[Viewpoint | str | None, ExplorationState]] = BackgroundJob(self._wake)
         self.self_filter = settings.build_self_filter()
         self._wait: BeliefWait = NoBelief()
         self._belief_received_s = 0.0  # time.monotonic() of the latest belief

@@ -54,9 +54,14 @@ class PerfectRobot:
         raise AssertionError(status)
 
     def explore(self, *places) -> None:
-        """Gives the robot viewpoints at these places in m, one after another; None ends the exploration."""
+        """Gives the robot viewpoints at these places in m, one after another.
+
+        None ends the exploration; a text is the reason why no viewpoint can be planned.
+        """
         for place in places:
-            viewpoint = None if place is None else Viewpoint(np.array([*place, 0.0]), 9.0, np.array([place]))
+            viewpoint = place
+            if isinstance(place, tuple):
+                viewpoint = Viewpoint(np.array([*place, 0.0]), 9.0, np.array([place]))
             exploration_state = self.navigator.take_exploration_state()
             assert exploration_state is not None
             self.navigator.use_viewpoint(viewpoint, exploration_state)
@@ -193,8 +198,35 @@ def test_a_way_back_that_stays_refused_fails():
             robot.explore(None)
         status = robot.step()
     assert status.exploration.phase == "failed"
+    assert status.reason.startswith("cannot return to the start")
     assert "cannot be reached" in status.reason
     assert 7 * SCANS_PER_S < robot.scans - count < 10 * SCANS_PER_S
+
+
+def test_no_room_at_the_start_fails():
+    robot = exploring_robot()
+    robot.explore("too little room")
+    status = robot.step()
+    assert (status.exploration.phase, status.state, status.refused) == ("failed", "blocked", True)
+    assert status.reason == "too little room"
+    assert robot.navigator.take_exploration_state() is None
+    robot.navigator.on_goal(goal(0, 0, cancel=True))
+    assert robot.step().state == "idle"
+
+
+def test_after_the_way_back_there_may_be_more_room():
+    robot = exploring_robot()
+    robot.explore((5.0, 2.5))
+    robot.until(lambda _: robot.navigator.explorer.viewpoint_due)
+    robot.explore("too little room")
+    assert robot.step().exploration.phase == "returning"
+    robot.until(lambda _: robot.navigator.explorer.viewpoint_due)
+    assert np.hypot(*(robot.pose - START)[:2]) < 0.01
+    robot.explore((3.0, 2.5))
+    assert robot.step().exploration.phase == "exploring"
+    robot.until(lambda _: robot.navigator.explorer.viewpoint_due)
+    robot.explore(None)
+    robot.until(lambda status: status.exploration.phase == "finished")
 
 
 def test_a_new_map_may_show_a_better_viewpoint_and_moves_the_start():

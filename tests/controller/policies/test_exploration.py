@@ -27,7 +27,7 @@ CELL, RADIUS = 0.1, 0.1
 
 
 def exploration_state_of(
-    rows: str, pose=(1.2, 1.2, 0.0), *, scans=(), arrivals=(), sector=ALL_ROUND, target=None
+    rows: str, pose=(1.2, 1.2, 0.0), *, radius=RADIUS, scans=(), arrivals=(), sector=ALL_ROUND, target=None
 ) -> ExplorationState:
     """What is known of a map that is drawn with # wall, . free, ? unknown, the highest row first.
 
@@ -39,7 +39,7 @@ def exploration_state_of(
     clearance = np.full(grid.cells, 9.0)
     if len(walls):
         clearance = np.abs(centres[:, None] - walls).max(axis=2).min(axis=1) - CELL / 2
-    graph = FreeSpaceGraph(FreeSpace(grid, clearance.reshape(grid.shape), drawn == "?"), RADIUS)
+    graph = FreeSpaceGraph(FreeSpace(grid, clearance.reshape(grid.shape), drawn == "?"), radius)
     return ExplorationState(
         graph,
         np.reshape(scans, (-1, 3)),
@@ -162,6 +162,13 @@ def test_nothing_is_left_to_see():
     viewpoint = choose_viewpoint(state)
     assert viewpoint is not None
     assert choose_viewpoint(exploration_state_of(CORRIDOR, arrivals=[(*viewpoint.pose[:2], 0.0)] * 2)) is None
+
+
+def test_too_little_room_to_plan():
+    reason = choose_viewpoint(exploration_state_of(CORRIDOR, radius=0.35))
+    assert isinstance(reason, str)
+    assert "cannot plan a path from here: no place within 0.43 m" in reason
+    assert choose_viewpoint(exploration_state_of(CLOSED, radius=0.35)) is None  # nothing is left to see
 
 
 def test_unreachable_places_are_not_chosen():
