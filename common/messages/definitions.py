@@ -180,7 +180,20 @@ class Map(Stamped):
     grid: OccupancyGrid  # occupied, free and unknown cells
     poses: Poses  # (K, 3) base_link in map, key scans in order of time
     closures: Points = np.zeros((0, 2), np.float32)  # (2 C, 2) m in map, both ends of each loop closure
+    connected: Bytes = np.zeros(0, np.uint8)  # (N,) 1 for each key scan so far that is connected to the map, and so in
+    # poses, else 0; empty: all are
     frame_id: Name = "map"
+
+    @property
+    def numbers(self) -> npt.NDArray[np.intp]:
+        """Number (K,) of each key scan in `poses`: its index among all so far, the same in all versions of the map."""
+        return np.flatnonzero(self.connected) if len(self.connected) else np.arange(len(self.poses))
+
+    @model_validator(mode="after")
+    def _shape(self) -> Map:
+        if len(self.numbers) != len(self.poses):
+            raise ValueError(f"{len(self.poses)} poses of {len(self.numbers)} connected key scans")
+        return self
 
 
 class LearnedField(Stamped):

@@ -24,7 +24,6 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from common.geometry import se2
 from common.messages.definitions import Exploration, Goal, Pose, Status
 from services.controller.goal_state import Phase
 
@@ -56,9 +55,7 @@ class Explorer:
         self._failure = ""  # why the exploration has failed
         self._can_plan = True  # whether the last choice of a viewpoint was possible
         self._pose, self._located = pose, True
-        # The start is stored relative to the last key scan, so that it moves with the map when a loop closes.
-        self._home_key = len(planned.message.poses) - 1
-        self._home = se2.between(planned.message.poses[self._home_key], pose)
+        self._home = planned.anchor(pose)
         self._arrivals = np.zeros((0, 3))  # poses at which the robot arrived at viewpoints
         self._unreachable = np.zeros((0, 2))  # viewpoints that were given up
         self._user_goal_over_since_ns: int | None = None
@@ -75,10 +72,9 @@ class Explorer:
         return self.active and not self.paused
 
     @property
-    def home(self) -> Array:
-        """Where exploration began, (3,) in the present map."""
-        poses = self.map.message.poses
-        return se2.compose(poses[min(self._home_key, len(poses) - 1)], self._home)
+    def home(self) -> Array | None:
+        """Where exploration began, (3,) in the present map; None while that is not connected to it."""
+        return self.map.locate(self._home)
 
     def use_map(self, planned: PlannedMap) -> None:
         """Uses a new version of the map, in which another viewpoint may be better."""
@@ -101,9 +97,10 @@ class Explorer:
         target = None
         if self.goal is not None and self.phase == "exploring":
             target = self.goal.pose.array()[:2]
-        poses, home = self.map.message.poses, self.home[:2]
+        poses, home = self.map.message.poses, self.home
+        end = (self._pose if home is None else home)[:2]
         return ExplorationState(
-            self.map.graph, poses, self._arrivals, field_of_view, self._pose, home, target, self._unreachable
+            self.map.graph, poses, self._arrivals, field_of_view, self._pose, end, target, self._unreachable
         )
 
     def update(self, state: GoalState, stamp_ns: int) -> None:
@@ -174,13 +171,17 @@ class Explorer:
         rad to either side. ``under_way``: the robot drives to the last goal.
         """
         self._can_plan = not isinstance(viewpoint, str)
+        home = self.home
         if isinstance(viewpoint, str):
-            if np.hypot(*(self._pose - self.home)[:2]) <= SAME_PLACE_M:
+            if home is None or np.hypot(*(self._pose - home)[:2]) <= SAME_PLACE_M:
                 self._fail(viewpoint)
                 return None
             viewpoint = None  # after the way back, there may be more room
         phase: Literal["exploring", "returning"] = "returning" if viewpoint is None else "exploring"
-        pose = self.home if viewpoint is None else viewpoint.pose
+        pose = home if viewpoint is None else viewpoint.pose
+        if pose is None:
+            self._fail("cannot return to the start: nothing connects it to the present map")
+            return None
         same = self.goal is not None and np.hypot(*(self.goal.pose.array() - pose)[:2]) <= SAME_PLACE_M
         if same and phase == self.phase and under_way:
             return None

@@ -7,16 +7,26 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from common.geometry import se2
 from common.geometry.occupancy_grid import FREE
 from services.controller.policies.free_space import FreeSpace
 from services.controller.policies.geodesic_field import FreeSpaceGraph
 
 if TYPE_CHECKING:
+    from common.geometry.se2 import Array
     from common.messages.definitions import Map
 
 # A key scan that moved farther than this between two versions was moved by a loop closure. Obstacles that were seen
 # before are then at other places of the map.
 JUMP_M = 0.05
+
+
+@dataclass(frozen=True)
+class AnchoredPose:
+    """A pose that moves with the map when a loop closes."""
+
+    number: int  # of a key scan
+    relative: Array  # (3,) in the frame of that key scan
 
 
 @dataclass(frozen=True)
@@ -35,7 +45,17 @@ class PlannedMap:
 
     def jumped_from(self, before: PlannedMap) -> bool:
         """Whether a key scan of the version ``before`` has moved by more than `JUMP_M` in this one."""
-        old, new = before.message.poses, self.message.poses
-        if len(new) < len(old):
-            return True  # mapping started again
-        return bool(np.hypot(*(new[: len(old)] - old)[:, :2].T).max(initial=0.0) > JUMP_M)
+        old, new = before.message, self.message
+        _, in_old, in_new = np.intersect1d(old.numbers, new.numbers, assume_unique=True, return_indices=True)
+        if len(in_old) < len(old.poses):
+            return True  # mapping started again, or another piece of the drive has become the map
+        return bool(np.hypot(*(new.poses[in_new] - old.poses[in_old])[:, :2].T).max(initial=0.0) > JUMP_M)
+
+    def anchor(self, pose: Array) -> AnchoredPose:
+        """Anchors a pose (3,) in map to the last key scan, to which the mapper relates the robot's pose."""
+        return AnchoredPose(int(self.message.numbers[-1]), se2.between(self.message.poses[-1], pose))
+
+    def locate(self, anchored: AnchoredPose) -> Array | None:
+        """The pose (3,) in this version of the map; None if its key scan is not connected to the map."""
+        index = np.flatnonzero(self.message.numbers == anchored.number)
+        return se2.compose(self.message.poses[index[0]], anchored.relative) if len(index) else None

@@ -188,4 +188,10 @@ def map_message(stamp_ns: int, snapshot: MapSnapshot) -> Map:
     """The map as a message."""
     ends = snapshot.poses[snapshot.closures.ravel(), :2].astype(np.float32)
     known = np.isfinite(snapshot.poses).all(axis=1)
-    return Map(stamp_ns=stamp_ns, grid=snapshot.grid, poses=snapshot.poses[known], closures=ends)
+    return Map(
+        stamp_ns=stamp_ns,
+        grid=snapshot.grid,
+        poses=snapshot.poses[known],
+        closures=ends,
+        connected=np.asarray(known, np.uint8),
+    )

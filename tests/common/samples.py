@@ -14,7 +14,7 @@ from pydantic.fields import FieldInfo
 
 from common.geometry.occupancy_grid import OccupancyGrid
 from common.geometry.world import Box, Circle, Obstacle, World
-from common.messages.definitions import Belief, BeliefHypothesis, Preference
+from common.messages.definitions import Belief, BeliefHypothesis, Map, Preference
 from common.messages.topics import QUERIES, TOPICS
 from common.messages.wire import Binary, Message
 from common.robot.robot import Robot
@@ -51,6 +51,8 @@ def message_of(cls: type[Message]) -> st.SearchStrategy:
     if cls is Preference:
         rows |= {"width": st.just(3), "height": st.just(2)}
         rows["distance"] = st.lists(st.floats(0, allow_nan=False, width=32), min_size=6, max_size=6)
+    if cls is Map:
+        rows |= {"poses": st.just(np.zeros((2, 3))), "connected": st.sampled_from([[], [1, 0, 1]])}
     if cls is Belief:
         vector = st.none() | st.lists(st.floats(-1e6, 1e6, width=32), min_size=3, max_size=3)
         rows |= {"xi": vector, "protection": vector, "curvature": matrix}

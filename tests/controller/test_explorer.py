@@ -19,8 +19,10 @@ SCANS_PER_S = 15
 GRID = OccupancyGrid.of(np.full((100, 200), FREE, np.uint8), 0.05, (0.0, 0.0, 0.0))
 
 
-def map_with(*poses) -> PlannedMap:
-    return PlannedMap.of(Map(stamp_ns=0, grid=GRID, poses=np.array(poses, float)), 0.27)
+def map_with(*poses, connected=()) -> PlannedMap:
+    """A map with these key scans; ``connected`` as in the message."""
+    message = Map(stamp_ns=0, grid=GRID, poses=np.array(poses, float), connected=np.array(connected, np.uint8))
+    return PlannedMap.of(message, 0.27)
 
 
 class PerfectRobot:
@@ -239,3 +241,24 @@ def test_a_new_map_may_show_a_better_viewpoint_and_moves_the_start():
     assert exploration_state.home.tolist() == [2.1, 2.5]
     robot.navigator.use_viewpoint(Viewpoint(np.array([4.0, 4.0, 0.0]), 9.0, np.zeros((1, 2))), exploration_state)
     assert robot.step().goal.y == 4.0
+
+
+def test_another_piece_becomes_the_map():
+    """The start has no place in it, until the pieces are joined."""
+    robot = exploring_robot()
+    robot.explore((8.0, 2.5))
+    robot.use_map(map_with((3.0, 2.5, 0.0), (4.0, 2.5, 0.0), connected=[0, 1, 1]))
+    exploration_state = robot.navigator.take_exploration_state()
+    assert exploration_state.home.tolist() == list(START[:2])  # where the robot is
+    robot.navigator.use_viewpoint(None, exploration_state)
+    status = robot.step()
+    assert (status.exploration.phase, status.reason) == (
+        "failed",
+        "cannot return to the start: nothing connects it to the present map",
+    )
+    robot = exploring_robot()
+    robot.explore((8.0, 2.5))
+    robot.use_map(map_with((3.0, 2.5, 0.0), (4.0, 2.5, 0.0), connected=[0, 1, 1]))
+    robot.explore((7.0, 2.5))
+    robot.use_map(map_with((1.5, 2.5, 0.0), (3.0, 2.5, 0.0), (4.0, 2.5, 0.0)))
+    assert robot.navigator.take_exploration_state().home.tolist() == [1.5, 2.5]

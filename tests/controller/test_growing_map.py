@@ -17,13 +17,14 @@ CELL = 0.05
 NEAR, FAR = np.array([1.0, 1.0]), np.array([5.0, 1.0])
 
 
-def half_known(x_known: float, *, poses=((1.0, 1.0, 0.0),)) -> Map:
+def half_known(x_known: float, *, poses=((1.0, 1.0, 0.0),), connected=()) -> Map:
     """A room of 6 m by 2 m, of which the part up to ``x_known`` m has been seen."""
     cells = np.full((44, 124), UNKNOWN, np.uint8)  # with a margin of 2 cells
     cells[2:42, 2:122] = FREE
     cells[:, [1, 122]] = cells[[1, 42]] = OCCUPIED
     cells[:, round(x_known / CELL) + 2 :] = UNKNOWN
-    return Map(stamp_ns=0, grid=OccupancyGrid.of(cells, CELL, (-0.1, -0.1, 0.0)), poses=np.array(poses))
+    grid = OccupancyGrid.of(cells, CELL, (-0.1, -0.1, 0.0))
+    return Map(stamp_ns=0, grid=grid, poses=np.array(poses), connected=np.array(connected, np.uint8))
 
 
 def planner_in(message: Map) -> GeodesicPolicy:
@@ -116,3 +117,20 @@ def test_a_loop_closure_is_a_jump():
         for each in (poses, poses + np.array([0.0, 0.1, 0.0]), poses[:1])
     ]
     assert [each.jumped_from(before) for each in after] == [False, True, True]
+
+
+def test_another_piece_as_the_map_is_a_jump():
+    """Key scans are compared by their numbers, which leave out those of other pieces."""
+    poses = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
+    before = PlannedMap.of(half_known(6.0, poses=poses[:2], connected=[1, 0, 1]), 0.27)
+    for connected, jumped in (([1, 0, 1, 1], False), ([0, 1, 1, 1], True), ([1, 1, 0, 1], True), ([1, 1, 1], True)):
+        assert PlannedMap.of(half_known(6.0, poses=poses, connected=connected), 0.27).jumped_from(before) is jumped
+
+
+def test_anchored_poses_move_with_the_map():
+    first, turned = [[0.0, 0.0, 0.0], [2.0, 1.0, 0.0]], [[0.0, 0.0, 0.0], [2.0, 1.5, np.pi / 2], [4.0, 1.0, 0.0]]
+    anchored = PlannedMap.of(half_known(6.0, poses=first, connected=[1, 0, 1]), 0.27).anchor(np.array([3.0, 1.0, 0.5]))
+    moved = PlannedMap.of(half_known(6.0, poses=turned, connected=[1, 0, 1, 1]), 0.27)
+    np.testing.assert_allclose(moved.locate(anchored), [2.0, 2.5, 0.5 + np.pi / 2])
+    other = PlannedMap.of(half_known(6.0, poses=turned, connected=[0, 1, 0, 1, 1]), 0.27)
+    assert other.locate(anchored) is None

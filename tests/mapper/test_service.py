@@ -8,6 +8,7 @@ from rich.console import Console
 
 from common.bus.inbox import Inbox
 from common.geometry import se2
+from common.geometry.occupancy_grid import OccupancyGrid
 from common.geometry.world import load_world
 from common.messages.definitions import Belief, Map, Odom, Pose, Scan, Twist
 from common.messages.requests import SaveMapReply, SaveMapRequest
@@ -16,6 +17,8 @@ from common.robot.scan_geometry import Sweep
 from lab.accuracy import tasks
 from lab.accuracy.scenes import Scene
 from presage.live.commands import save_map
+from services.mapper.service import map_message
+from services.mapper.slam.mapper import MapSnapshot
 from tests.conftest import WAIT_TIMEOUT_S, wait_for_message
 from tests.mapper.drives import driven
 
@@ -81,6 +84,14 @@ def test_drive_and_save(process, bus, link, tmp_path, odometry):
     later = scan_message(drive, last).model_copy(update={"stamp_ns": lost.stamp_ns + 10**8})
     found = belief_of(later, truth[last])
     assert tasks.is_at(se2.compose(truth[0], found.pose.array()), truth[last])
+
+
+def test_key_scans_keep_their_numbers():
+    grid = OccupancyGrid.of(np.zeros((2, 2), np.uint8), 0.05, (0.0, 0.0, 0.0))
+    poses = np.array([[0.0, 0.0, 0.0], [np.nan] * 3, [np.nan] * 3, [1.0, 0.0, 0.0]])
+    message = map_message(7, MapSnapshot(grid, poses, np.array([[0, 3]])))
+    assert message.numbers.tolist() == [0, 3]
+    assert message.poses.tolist() == poses[[0, 3]].tolist()
 
 
 def test_save_before_the_first_scan(process, bus):

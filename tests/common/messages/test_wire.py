@@ -12,9 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from common.geometry.occupancy_grid import OccupancyGrid
 from common.limits import MAX_BEAMS, MAX_COORDINATE_M, MAX_DISTANCE_M
 from common.messages import definitions as messages
-from common.messages.definitions import Belief, CmdVel, Goal, Odom, Plan, Pose, Prediction, Scan, Status, Twist
+from common.messages.definitions import Belief, CmdVel, Goal, Map, Odom, Plan, Pose, Prediction, Scan, Status, Twist
 from common.messages.requests import PredictRequest, SampleReply
 from common.messages.topics import QUERIES, TOPICS
 from common.messages.wire import DecodeError
@@ -73,6 +74,12 @@ ODOM = Odom(stamp_ns=1, pose=Pose(x=0.0, y=0.0), twist=Twist(), covariance=np.ey
 POSE = Pose(x=0.0, y=0.0)
 BELIEF = Belief(
     stamp_ns=1, state="tracking", pose=POSE, xi=np.zeros(3), covariance=np.eye(3), free_energy=1.0, accuracy=1.0
+)
+MAP = Map(
+    stamp_ns=1,
+    grid=OccupancyGrid.of(np.zeros((1, 1), np.uint8), 0.05, (0.0, 0.0, 0.0)),
+    poses=np.zeros((2, 3)),
+    connected=np.array([0, 1, 1], np.uint8),
 )
 GOAL = Goal(stamp_ns=1, pose=Pose(x=0.0, y=0.0))
 REQUEST = PredictRequest(poses=np.zeros((1, 3)))
@@ -136,6 +143,7 @@ INVALID_VALUES = {
     "an absurd velocity": (Odom, encoded_with(ODOM, twist={"vx": 1e300})),
     "a path beyond all maps": (Plan, encoded_with(Plan(stamp_ns=1), path=np.float32([0, 1e20]).tobytes())),
     "poses beyond all maps": (PredictRequest, encoded_with(REQUEST, poses=np.full(3, 1e300).tobytes())),
+    "more poses than connected key scans": (Map, encoded_with(MAP, connected=b"\0\1\0")),
     "a name without end": (Scan, encoded_with(a_scan(), frame_id="x" * 201)),
 }
 
@@ -180,6 +188,12 @@ def test_the_error_names_the_field():
         Scan.decode(INVALID_VALUES["a scan of more beams than any scanner has"][1])
     with pytest.raises(DecodeError, match=r"Goal\.pose\.y: .*greater than or equal to -10000"):
         Goal.decode(INVALID_VALUES["a goal beyond all maps"][1])
+
+
+def test_numbers_of_key_scans():
+    assert Map.decode(MAP.encode()).numbers.tolist() == [1, 2]
+    recorded_before = Map.decode(encoded_with(MAP, connected=...))
+    assert recorded_before.numbers.tolist() == [0, 1]
 
 
 def test_unknown_and_missing_fields():
