@@ -30,7 +30,7 @@ from services.controller.goal_state import Phase
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from services.controller.goal_state import GoalState
-    from services.controller.growing_map import PlannedMap
+    from services.controller.growing_map import AnchoredPose, PlannedMap
     from services.controller.policies.exploration import ExplorationState, FieldOfView, Viewpoint
 
 PAUSE_NS = 2_000_000_000  # how long the robot stands at a goal of a user before it goes on exploring
@@ -56,8 +56,8 @@ class Explorer:
         self._can_plan = True  # whether the last choice of a viewpoint was possible
         self._pose, self._located = pose, True
         self._home = planned.anchor(pose)
-        self._arrivals = np.zeros((0, 3))  # poses at which the robot arrived at viewpoints
-        self._unreachable = np.zeros((0, 2))  # viewpoints that were given up
+        self._arrivals: list[AnchoredPose] = []  # where the robot arrived at viewpoints
+        self._unreachable: list[AnchoredPose] = []  # viewpoints that were given up
         self._user_goal_over_since_ns: int | None = None
         self._last_moved = pose, 0  # pose and stamp in ns; the stamp is 0 before the first step towards a goal
 
@@ -74,7 +74,7 @@ class Explorer:
     @property
     def home(self) -> Array | None:
         """Where exploration began, (3,) in the present map; None while that is not connected to it."""
-        return self.map.locate(self._home)
+        return next(iter(self.map.locate([self._home])), None)
 
     def use_map(self, planned: PlannedMap) -> None:
         """Uses a new version of the map, in which another viewpoint may be better."""
@@ -99,9 +99,8 @@ class Explorer:
             target = self.goal.pose.array()[:2]
         poses, home = self.map.message.poses, self.home
         end = (self._pose if home is None else home)[:2]
-        return ExplorationState(
-            self.map.graph, poses, self._arrivals, field_of_view, self._pose, end, target, self._unreachable
-        )
+        arrivals, unreachable = self.map.locate(self._arrivals), self.map.locate(self._unreachable)[:, :2]
+        return ExplorationState(self.map.graph, poses, arrivals, field_of_view, self._pose, end, target, unreachable)
 
     def update(self, state: GoalState, stamp_ns: int) -> None:
         """Processes the state of the robot's goal after a scan."""
@@ -156,9 +155,9 @@ class Explorer:
         if state.active and not stalled:
             return False
         if state.phase is Phase.REACHED:
-            self._arrivals = np.concatenate([self._arrivals, self._pose[None]])
+            self._arrivals.append(self.map.anchor(self._pose))
         else:
-            self._unreachable = np.concatenate([self._unreachable, goal.pose.array()[None, :2]])
+            self._unreachable.append(self.map.anchor(goal.pose.array()))
         self.goal, self._last_moved = None, (self._pose, 0)
         return True
 

@@ -13,6 +13,8 @@ from services.controller.policies.free_space import FreeSpace
 from services.controller.policies.geodesic_field import FreeSpaceGraph
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from common.geometry.se2 import Array
     from common.messages.definitions import Map
 
@@ -55,7 +57,12 @@ class PlannedMap:
         """Anchors a pose (3,) in map to the last key scan, to which the mapper relates the robot's pose."""
         return AnchoredPose(int(self.message.numbers[-1]), se2.between(self.message.poses[-1], pose))
 
-    def locate(self, anchored: AnchoredPose) -> Array | None:
-        """The pose (3,) in this version of the map; None if its key scan is not connected to the map."""
-        index = np.flatnonzero(self.message.numbers == anchored.number)
-        return se2.compose(self.message.poses[index[0]], anchored.relative) if len(index) else None
+    def locate(self, anchored: Sequence[AnchoredPose]) -> Array:
+        """The poses (N, 3) in this version of the map, without those whose key scan is not connected to it."""
+        index = {number: k for k, number in enumerate(self.message.numbers.tolist())}
+        placed = [
+            se2.compose(self.message.poses[index[each.number]], each.relative)
+            for each in anchored
+            if each.number in index
+        ]
+        return np.reshape(placed, (-1, 3))

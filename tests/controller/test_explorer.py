@@ -262,3 +262,16 @@ def test_another_piece_becomes_the_map():
     robot.explore((7.0, 2.5))
     robot.use_map(map_with((1.5, 2.5, 0.0), (3.0, 2.5, 0.0), (4.0, 2.5, 0.0)))
     assert robot.navigator.take_exploration_state().home.tolist() == [1.5, 2.5]
+
+
+def test_visited_and_given_up_places_move_with_the_map():
+    robot = exploring_robot()
+    robot.explore((3.0, 2.5))
+    robot.until(lambda _: robot.navigator.explorer.viewpoint_due)
+    arrival = robot.pose
+    robot.explore((8.0, 2.5))
+    robot.until(lambda _: robot.navigator.explorer.viewpoint_due, moves=False)
+    robot.use_map(map_with((2.0, 2.9, 0.0)))  # a loop closure moves all by 0.4 m
+    exploration_state = robot.navigator.take_exploration_state()
+    np.testing.assert_allclose(exploration_state.arrivals, arrival[None] + np.array([0.0, 0.4, 0.0]))
+    np.testing.assert_allclose(exploration_state.unreachable, [[8.0, 2.9]])

@@ -131,6 +131,6 @@ def test_anchored_poses_move_with_the_map():
     first, turned = [[0.0, 0.0, 0.0], [2.0, 1.0, 0.0]], [[0.0, 0.0, 0.0], [2.0, 1.5, np.pi / 2], [4.0, 1.0, 0.0]]
     anchored = PlannedMap.of(half_known(6.0, poses=first, connected=[1, 0, 1]), 0.27).anchor(np.array([3.0, 1.0, 0.5]))
     moved = PlannedMap.of(half_known(6.0, poses=turned, connected=[1, 0, 1, 1]), 0.27)
-    np.testing.assert_allclose(moved.locate(anchored), [2.0, 2.5, 0.5 + np.pi / 2])
+    np.testing.assert_allclose(moved.locate([anchored]), [[2.0, 2.5, 0.5 + np.pi / 2]])
     other = PlannedMap.of(half_known(6.0, poses=turned, connected=[0, 1, 0, 1, 1]), 0.27)
-    assert other.locate(anchored) is None
+    assert other.locate([anchored]).shape == (0, 3)
