@@ -88,6 +88,7 @@ class ControllerService(Service):
         super().__init__(settings)
         self.navigator = Navigator()
         self.geodesic: GeodesicPolicy | None = None  # the policy if the preset is `geodesic`
+        self._last_map: Map | None = None  # from the mapper
         self._map: PlannedMap | None = None  # the mapper's, if the policy plans in it
         self._map_job: BackgroundJob[PlannedMap] = BackgroundJob(self._wake)
         self._viewpoint_job: BackgroundJob[tuple[Viewpoint | str | None, ExplorationState]] = BackgroundJob(self._wake)
@@ -149,9 +150,14 @@ class ControllerService(Service):
         elif isinstance(message, Belief):
             self._on_belief(message)
         elif isinstance(message, Map) and self.geodesic is not None and not self.settings.world:
-            from services.controller.growing_map import PlannedMap
+            self._plan_in(message, self.geodesic.robot.radius)
 
-            radius = self.geodesic.robot.radius
+    def _plan_in(self, message: Map, radius: float) -> None:
+        """Prepares a map for planning in a thread, unless it is the last one again, repeated for late subscribers."""
+        from services.controller.growing_map import PlannedMap
+
+        last, self._last_map = self._last_map, message
+        if last is None or message.model_copy(update={"stamp_ns": last.stamp_ns, "seq": last.seq}) != last:
             self._map_job.submit(lambda: PlannedMap.of(message, radius))
 
     def close(self) -> None:

@@ -9,8 +9,10 @@ import pytest
 
 from common.bus.inbox import Inbox
 from common.errors import UserError
+from common.geometry.occupancy_grid import FREE, OccupancyGrid
+from common.messages.definitions import Map
 from common.messages.requests import PredictReply, Reply
-from common.messages.topics import BELIEF, CMD_VEL, MAX_BYTES, PREDICT, SCAN
+from common.messages.topics import BELIEF, CMD_VEL, MAP, MAX_BYTES, PREDICT, SCAN
 from common.runtime.service import ServiceLoop
 from services.controller import service as shell
 from services.controller.policies.active_localisation import CandidateDrives
@@ -96,6 +98,19 @@ def test_answers(monkeypatch, needs_predictions, events, answers):
         found.append(" ".join(map(str, sent)) or ".")
     assert " ".join(found) == answers
     assert policy.used == len([e for e in events.split() if e == f"r{max(requests, default=0)}"])
+
+
+def test_a_repeated_map_is_not_planned_in_again(monkeypatch):
+    service, planned = ControllerService(ControllerSettings(world="")), []
+    ServiceLoop(service, FakeBus(), Inbox())
+    service.open()
+    monkeypatch.setattr(service, "_map_job", SimpleNamespace(submit=lambda job: planned.append(job().message)))
+    grid = OccupancyGrid.of(np.full((9, 9), FREE, np.uint8), 0.05, (0.0, 0.0, 0.0))
+    first = Map(stamp_ns=1, grid=grid, poses=[(0.2, 0.2, 0.0)])
+    moved = first.model_copy(update={"poses": first.poses + 0.1, "stamp_ns": 3, "seq": 2})
+    for message in (first, first.model_copy(update={"stamp_ns": 2, "seq": 1}), moved, first):
+        service.on_message(MAP, message)
+    assert planned == [first, moved, first]
 
 
 @pytest.mark.parametrize(("shape", "side"), [((30, 50), 1), ((600, 901), 2), ((9001, 3), 3)])
