@@ -216,6 +216,7 @@ class ControllerService(Service):
         if isinstance(reply, PredictReply) and reply.ok:
             self.geodesic.use_predictions(reply)
         else:
+            self.geodesic.fail_prediction(reply.reason)
             self.log.warning("no predictions", reason=reply.reason)
         if isinstance(self._wait, AwaitsPredictions):
             self._step(self._wait.belief, self._wait.cpu_ns)

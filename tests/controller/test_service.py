@@ -39,13 +39,16 @@ class Predicting:
     """Stands in for the policy that needs predictions, for beliefs with the given numbers."""
 
     def __init__(self, numbers):
-        self.numbers, self.used = numbers, 0
+        self.numbers, self.used, self.failed = numbers, 0, 0
 
     def prediction_request(self, message):
         return DRIVES if message.stamp_ns // PERIOD_NS in self.numbers else None
 
     def use_predictions(self, reply):
         self.used += 1
+
+    def fail_prediction(self, reason):
+        self.failed += 1
 
 
 @pytest.mark.parametrize(
@@ -97,6 +100,7 @@ def test_answers(monkeypatch, needs_predictions, events, answers):
         bus.sent.clear()
         found.append(" ".join(map(str, sent)) or ".")
     assert " ".join(found) == answers
+    assert policy.failed == events.count("f")
     assert policy.used == len([e for e in events.split() if e == f"r{max(requests, default=0)}"])
 
 

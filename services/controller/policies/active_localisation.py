@@ -151,6 +151,7 @@ class ActiveLocaliser:
         """Forgets everything. Call it when the pose is known, or the goal has changed."""
         self._visited = VisitedPlaces()
         self._requested: tuple[int, CandidateDrives] | None = None  # stamp in ns and drives of the last request
+        self._prediction_failure = ""  # why the last request was not answered
         self._place: tuple[Array, dict[str, float]] | None = None  # (3,) in base_link, and its expected free energy
         self._field: tuple[Array, CostField | None] | None = None  # a place (2,) m in map and its field
         self._unknown_since_ns: int | None = None  # stamp since which there are no likely hypotheses
@@ -178,6 +179,7 @@ class ActiveLocaliser:
 
         ``cost_to_goal`` returns the cost (...,) m of the paths to the goal from places (..., 2) m in map.
         """
+        self._prediction_failure = ""
         if self._requested is None:
             return
         _, drives = self._requested
@@ -187,6 +189,10 @@ class ActiveLocaliser:
         energy = drive_energy(drives, ranges, sigma, range_max, cost_to_goal, self._visited.novelty)
         best = int(np.argmin(energy.total))
         self._place = drives.displacements[best], energy.of(best, energy.total)
+
+    def fail_prediction(self, reason: str) -> None:
+        """Stores why the last request was not answered. The next one follows after `CHOICE_PERIOD_NS`."""
+        self._prediction_failure = reason
 
     def decide(self, belief: Belief, scan: Scan, points: Array, velocity: Array, field_of_view: Sector) -> Decision:
         """Chooses a velocity; ``points`` (K, 2) m in base_link are obstacles."""
@@ -213,6 +219,9 @@ class ActiveLocaliser:
                 self._give_up_if_stalled(belief.stamp_ns, self._place[0][:2])
                 return self._drive_to(poses[0], *self._place, surroundings, velocity, len(poses))
             self._visited.restart_clock()
+            if self._prediction_failure:
+                reason = f"{len(poses)} places are possible; standing without predicted scans to tell them apart"
+                return Decision(reason=f"{reason}: {self._prediction_failure}", state="lost")
             return Decision(reason=f"{len(poses)} places are possible: choosing where to drive to tell them apart")
         if self._unknown_since_ns is None or belief.stamp_ns < self._unknown_since_ns:
             self._unknown_since_ns = belief.stamp_ns

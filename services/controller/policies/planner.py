@@ -219,6 +219,10 @@ class GeodesicPolicy:
         if self._scan is not None:
             self.localiser.use_predictions(reply, self._scan.range_max, self._cost_to_goal)
 
+    def fail_prediction(self, reason: str) -> None:
+        """Stores why the last `prediction_request` was not answered, for the status."""
+        self.localiser.fail_prediction(reason)
+
     def _cost_to_goal(self, points: Array) -> Array:
         """Cost (...,) m of the path to the goal from points (..., 2) m in map, at most `MAX_COST_TO_GOAL_M`."""
         if self.field is None and self._goal is not None:

@@ -7,11 +7,12 @@ import pytest
 
 from common.messages.definitions import BeliefHypothesis, Pose
 from common.robot.robot import Robot
-from services.controller.policies.active_localisation import ActiveLocaliser, VisitedPlaces
+from common.robot.scan_geometry import Sector
+from services.controller.policies.active_localisation import CHOICE_PERIOD_NS, ActiveLocaliser, VisitedPlaces
 from services.controller.policies.free_space import FreeSpace
 from services.controller.policies.geodesic_field import FreeSpaceGraph
 from services.controller.policies.recovery import Recovery
-from tests.controller.driving import belief, room
+from tests.controller.driving import belief, room, scan
 
 ROBOT = Robot()
 
@@ -57,3 +58,19 @@ def test_places_where_scans_tell_little():
     drives = ActiveLocaliser(ROBOT, graph, 0.33, Recovery()).prediction_request(ambiguous)
     assert drives is not None
     assert len(drives.displacements) > 5
+
+
+def test_without_predictions_the_robot_asks_again_and_says_why_it_stands():
+    poses, world = np.array([[3.0, 2.0, 0.0], [7.0, 2.0, 0.0]]), room(10, 4)
+    hypotheses = [BeliefHypothesis(pose=Pose.of(pose), weight=0.5) for pose in poses]
+    localiser = ActiveLocaliser(ROBOT, FreeSpaceGraph(FreeSpace.of(world), ROBOT.radius), 0.33, Recovery())
+    for stamp in (0, CHOICE_PERIOD_NS):
+        ambiguous = belief(stamp, poses[0], "ambiguous").model_copy(update={"hypotheses": hypotheses})
+        assert localiser.prediction_request(ambiguous) is not None
+        localiser.fail_prediction("is the estimator running?")
+        decision = localiser.decide(
+            ambiguous, scan(stamp, poses[0], world), np.zeros((0, 2)), np.zeros(3), Sector(0.0, np.pi)
+        )
+        assert decision.state == "lost"
+        assert decision.reason.startswith("2 places are possible; standing without predicted scans")
+        assert decision.reason.endswith("is the estimator running?")
