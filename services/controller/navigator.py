@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -31,6 +31,13 @@ if TYPE_CHECKING:
     from common.geometry.world import World
     from services.controller.growing_map import PlannedMap
     from services.controller.policies.exploration import ExplorationState, Viewpoint
+
+
+class Answer(NamedTuple):
+    """The answer to a belief, or to a scan without one: a command and a status, both with its stamp."""
+
+    command: CmdVel
+    status: Status
 
 
 @dataclass
@@ -192,7 +199,7 @@ class Navigator:
         """Stamp of the latest scan in ns; None before the first scan."""
         return None if self._scan is None else self._scan.stamp_ns
 
-    def step(self, belief: Belief) -> tuple[CmdVel, Status]:
+    def step(self, belief: Belief) -> Answer:
         """Returns command and status for a belief, both with its stamp."""
         pose, manual_twist = belief.pose.array(), self._manual.twist(belief.stamp_ns)
         self._resume_after_pause(belief.stamp_ns)
@@ -213,7 +220,7 @@ class Navigator:
         shown_distance = distance if self._ride is None else None  # between floors it has no meaning
         if manual_twist is not None:
             command, _ = self._command.limit(belief.stamp_ns, manual_twist, self._scan_points)
-            return command, self._add_exploration(self._manual_status(belief.stamp_ns, shown_distance))
+            return Answer(command, self._add_exploration(self._manual_status(belief.stamp_ns, shown_distance)))
         desired = np.zeros(3)
         if goal is not None and distance is not None and self.goal_state.active:
             desired = self._goal_velocity(belief, pose, goal, distance)
@@ -227,9 +234,9 @@ class Navigator:
         status = self._add_exploration(self.goal_state.status(belief.stamp_ns, shown_distance))
         if (terms := self.decision.terms) is not None:
             status = status.model_copy(update={"energy": PolicyEnergy(**terms)})
-        return command, status
+        return Answer(command, status)
 
-    def step_without_belief(self, stamp_ns: int) -> tuple[CmdVel, Status] | None:
+    def step_without_belief(self, stamp_ns: int) -> Answer | None:
         """Returns command and status for a scan while no estimator runs, so that manual driving still works.
 
         Returns None if the robot stands and is not driven by hand.
@@ -241,12 +248,12 @@ class Navigator:
         if manual_twist is not None:
             self._suspend_goal()
             command, _ = self._command.limit(stamp_ns, manual_twist, self._scan_points)
-            return command, self._add_exploration(self._manual_status(stamp_ns, None))
+            return Answer(command, self._add_exploration(self._manual_status(stamp_ns, None)))
         self.goal_state.lose_belief("no belief: is the estimator running?")
         command, _ = self._command.limit(stamp_ns, np.zeros(3), self._scan_points)
-        return command, self.status(stamp_ns)
+        return Answer(command, self.status(stamp_ns))
 
-    def stop_without_belief(self, stamp_ns: int, reason: str) -> tuple[CmdVel, Status]:
+    def stop_without_belief(self, stamp_ns: int, reason: str) -> Answer:
         """Returns the command to stop and its status, for when no belief came in time.
 
         The goal is kept, and resumed with the next belief.
@@ -259,7 +266,7 @@ class Navigator:
         status = self.status(stamp_ns)
         if not status.refused:  # otherwise keep showing why the goal was refused
             status = status.model_copy(update={"reason": reason})
-        return command, status
+        return Answer(command, status)
 
     def _resume_after_pause(self, stamp_ns: int) -> None:
         if self._command.resume(stamp_ns):

@@ -10,7 +10,7 @@ import numpy as np
 
 from common.geometry.world import load_world
 from common.limits import MAX_FIELD_SIDE
-from common.messages.definitions import Belief, CmdVel, Drive, Goal, Map, Plan, Pose, Preference, Scan, Stamped, Status
+from common.messages.definitions import Belief, Drive, Goal, Map, Plan, Pose, Preference, Scan, Stamped, Status
 from common.messages.requests import PredictReply, PredictRequest, Reply
 from common.messages.topics import (
     BELIEF,
@@ -29,7 +29,7 @@ from common.messages.topics import (
 from common.runtime.service import Service
 from services.controller.background_job import BackgroundJob
 from services.controller.belief_wait import Answered, AwaitsPredictions, AwaitsScan, BeliefWait, NoBelief
-from services.controller.navigator import Navigator
+from services.controller.navigator import Answer, Navigator
 from services.controller.policies.paper_action import ActionParameters
 from services.controller.settings import ControllerSettings
 
@@ -98,7 +98,7 @@ class ControllerService(Service):
         self._latest_request = NO_REQUEST  # number of the latest request for predictions
 
         # What was published last.
-        self._last_answer: tuple[int, CmdVel, Status] | None = None  # stamp, command, status
+        self._last_answer: Answer | None = None
         self._field_published_ns = -FIELD_PERIOD_NS
         self._plan_shown = False  # whether the last published plan has content
 
@@ -145,8 +145,7 @@ class ControllerService(Service):
             self.navigator.on_goal(message)
             x, y, floor = message.pose.x, message.pose.y, message.map_id
             self.log.info("goal", x=x, y=y, floor=floor, cancel=message.cancel, explore=message.explore)
-            stamp_ns = self._last_answer[0] if self._last_answer else 0
-            self.publish(STATUS, self.navigator.status(stamp_ns))
+            self.publish(STATUS, self.navigator.status(self._last_stamp_ns))
         elif isinstance(message, Belief):
             self._on_belief(message)
         elif isinstance(message, Map) and self.geodesic is not None and not self.settings.world:
@@ -174,14 +173,14 @@ class ControllerService(Service):
             self._process(self._wait.belief)
         # Manual driving needs no belief, so it works without an estimator.
         if isinstance(self._wait, NoBelief) and (answer := self.navigator.step_without_belief(scan.stamp_ns)):
-            self._answer(*answer)
+            self._answer(answer)
 
     def _on_belief(self, belief: Belief) -> None:
         self._belief_received_s = time.monotonic()
         if isinstance(self._wait, NoBelief):
             self._wait = Answered()
-        if self._last_answer is not None and self._last_answer[0] == belief.stamp_ns:
-            self._send(self._last_answer[1], self._last_answer[2])  # a repeated belief gets the same answer again
+        if self._last_answer is not None and self._last_stamp_ns == belief.stamp_ns:
+            self._send(self._last_answer)  # a repeated belief gets the same answer again
             return
         if isinstance(self._wait, AwaitsScan | AwaitsPredictions) and self._wait.belief.stamp_ns == belief.stamp_ns:
             return  # repeated before it was answered
@@ -231,14 +230,20 @@ class ControllerService(Service):
         self.counters["steps"] += 1
         self.counters["step_us"] += took_us
         self.counters["step_us_max"] = max(self.counters["step_us_max"], took_us)
-        self._answer(*answer)
+        self._answer(answer)
 
-    def _answer(self, command: CmdVel, status: Status) -> None:
-        if status.state != (self._last_answer[2].state if self._last_answer is not None else "idle"):
+    @property
+    def _last_stamp_ns(self) -> int:
+        """Stamp of the last answer; 0 before the first one."""
+        return 0 if self._last_answer is None else self._last_answer.command.stamp_ns
+
+    def _answer(self, answer: Answer) -> None:
+        status = answer.status
+        if status.state != ("idle" if self._last_answer is None else self._last_answer.status.state):
             self.log.info(status.state, **({"reason": status.reason} if status.reason else {}))
-        self._last_answer = (command.stamp_ns, command, status)
-        self._send(command, status)
-        self._publish_plan(command.stamp_ns)
+        self._last_answer = answer
+        self._send(answer)
+        self._publish_plan(answer.command.stamp_ns)
 
     def due(self) -> float | None:
         """Seconds until the deadline of the present wait, 0 if a job is done; None if there is nothing to wait for."""
@@ -265,11 +270,10 @@ class ControllerService(Service):
             self._process(self._wait.belief)
             return
         self._wait = NoBelief()
-        stamp_ns = self._last_answer[0] if self._last_answer is not None else 0
         reason = f"no belief for {self.settings.belief_timeout:g} s: is the estimator running?"
         self.log.warning("stopping the robot", reason=reason)
         self.counters["belief_timeouts"] += 1
-        self._send(*self.navigator.stop_without_belief(stamp_ns, reason))
+        self._send(self.navigator.stop_without_belief(self._last_stamp_ns, reason))
 
     def _use_map(self, planned: PlannedMap) -> None:
         assert self.geodesic is not None  # noqa: S101 - it plans in the map
@@ -285,9 +289,9 @@ class ControllerService(Service):
 
             self._viewpoint_job.submit(lambda: (choose_viewpoint(exploration_state), exploration_state))
 
-    def _send(self, command: CmdVel, status: Status) -> None:
-        self.publish(STATUS, status)
-        self.publish(CMD_VEL, command)
+    def _send(self, answer: Answer) -> None:
+        self.publish(STATUS, answer.status)
+        self.publish(CMD_VEL, answer.command)
 
     def _publish_plan(self, stamp_ns: int) -> None:
         """Publishes path, predicted motion, obstacles and cost field for the page and for recordings."""
