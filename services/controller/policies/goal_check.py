@@ -15,15 +15,9 @@ def wall_refusal(world: World, goal: Array, radius: float) -> str | None:
     """The reason why a robot of ``radius`` m cannot stand at a goal (2,) m, or None if it can."""
     if world.has_room(goal, radius):
         return None
-    where = place_text(world.floors, goal)
-    return refusal_text(world.name, where, near_wall(float(world.clearance(goal)[0])))
+    return f"{place_text(world.floors, goal)} in {world.name} {near_wall(float(world.clearance(goal)[0]))}"
 
 
 def near_wall(clearance: float) -> str:
     """What is wrong with a goal ``clearance`` m from the nearest wall."""
     return "is inside something, or off the map" if clearance < 0 else f"is {clearance:.2f} m from a wall"
-
-
-def refusal_text(world: str, goal: str, problem: str) -> str:
-    """The reason in `Status` for refusing a ``goal``, given by `place_text`, in the world of that name."""
-    return f"{goal} in {world} {problem}"

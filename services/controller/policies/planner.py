@@ -18,7 +18,7 @@ from services.controller.policies.active_localisation import ActiveLocaliser, Ca
 from services.controller.policies.decision import Decision, DecisionState
 from services.controller.policies.free_space import NO_MAP, FreeSpace
 from services.controller.policies.geodesic_field import WALL_COST_RANGE_M, CostField, FreeSpaceGraph
-from services.controller.policies.goal_check import near_wall, refusal_text, wall_refusal
+from services.controller.policies.goal_check import near_wall, wall_refusal
 from services.controller.policies.motion_model import (
     STEP_S,
     is_moving,
@@ -107,7 +107,7 @@ class GeodesicPolicy:
 
     def _refusal_text(self, goal: Array, problem: str) -> str:
         map_name = "the map so far" if self.world is None else self.world.name
-        return refusal_text(map_name, self.free.place_text(goal), problem)
+        return f"{self.free.place_text(goal)} in {map_name} {problem}"
 
     def _wall_refusal(self, goal: Array) -> str | None:
         """The reason why the robot cannot stand at a goal (2,) m, or None if it can."""
