@@ -10,7 +10,7 @@ from common.robot.robot import Robot
 from common.robot.scan_geometry import ALL_ROUND, Sector, Sweep
 from common.robot.scanner import SCANNERS
 from services.controller.policies.free_space import FreeSpace
-from services.controller.policies.motion_model import turn_to_attractor
+from services.controller.policies.motion_model import turn_to_lookahead
 from services.controller.policies.motion_selection import FIELD_OF_VIEW_MARGIN_RAD, Surroundings, select_motion
 from services.controller.policies.obstacles import TemporaryObstacles
 from services.controller.policies.planner import BLIND_AHEAD, GeodesicPolicy
@@ -53,14 +53,14 @@ def test_actions_stay_within_the_view(centre, half_deg):
     no_points, no_walls = np.zeros((0, 2)), lambda places: np.full(places.shape[:-1], np.inf)
     surroundings = Surroundings(no_walls, no_points, np.zeros(0, bool), 0.0, 0.33, field_of_view=view)
     for bearing in np.arange(0, 2 * np.pi, 0.5):
-        attractor = 3 * np.array([np.cos(bearing), np.sin(bearing)])
-        action = select_motion(np.zeros(3), attractor, surroundings, Robot()).action
+        lookahead = 3 * np.array([np.cos(bearing), np.sin(bearing)])
+        action = select_motion(np.zeros(3), lookahead, surroundings, Robot()).action
         if np.hypot(*action[:2]) > 0.02:
             off = abs(float(se2.wrap(np.arctan2(action[1], action[0]) - centre)))
             assert off <= max(view.half - FIELD_OF_VIEW_MARGIN_RAD, view.half / 3) + 1e-6
         else:
-            turned = turn_to_attractor(action, attractor, Robot(), may_turn=True, forward=surroundings.forward)
-            assert abs(turned[2]) > 0.1  # turns until the attractor is in view
+            turned = turn_to_lookahead(action, lookahead, Robot(), may_turn=True, forward=surroundings.forward)
+            assert abs(turned[2]) > 0.1  # turns until the lookahead point is in view
 
 
 @pytest.mark.parametrize("name", TURNED)

@@ -21,7 +21,7 @@ from common.robot.scan_geometry import Sweep
 from services.controller.policies import expected_free_energy as efe
 from services.controller.policies.decision import Decision
 from services.controller.policies.expected_free_energy import NATS_PER_METRE, ExpectedFreeEnergy
-from services.controller.policies.motion_model import turn_to_attractor
+from services.controller.policies.motion_model import turn_to_lookahead
 from services.controller.policies.motion_selection import Surroundings, select_motion
 from services.controller.policies.recovery import BACKING_OFF, back_off
 
@@ -280,8 +280,8 @@ class ActiveLocaliser:
         if field is None or not len(path):
             self._place = None
             return Decision(reason="no way to where places could be told apart", state="blocked")
-        attractor = se2.rotate(-pose[2], field.attractor(pose[:2], path) - pose[:2])
-        return self._approach(attractor, surroundings, velocity, Decision(reason=reason, path=path, terms=terms))
+        lookahead = se2.rotate(-pose[2], field.lookahead_point(pose[:2], path) - pose[:2])
+        return self._approach(lookahead, surroundings, velocity, Decision(reason=reason, path=path, terms=terms))
 
     def _drive_to_open_space(self, belief: Belief, scan: Scan, surroundings: Surroundings, velocity: Array) -> Decision:
         """Drives straight to the free place in the present scan where the next scan is expected to tell most."""
@@ -298,22 +298,22 @@ class ActiveLocaliser:
         energy = ExpectedFreeEnergy(NATS_PER_METRE * (length + turn), zero, zero, gain)
         best = int(np.argmin(energy.total))
         self._give_up_if_stalled(belief.stamp_ns, length[best] * direction[best])
-        attractor = min(float(length[best]), 2.0) * direction[best]
+        lookahead = min(float(length[best]), 2.0) * direction[best]
         return self._approach(
-            attractor, surroundings, velocity, Decision(reason=reason, terms=energy.of(best, energy.total))
+            lookahead, surroundings, velocity, Decision(reason=reason, terms=energy.of(best, energy.total))
         )
 
-    def _approach(self, attractor: Array, surroundings: Surroundings, velocity: Array, decision: Decision) -> Decision:
-        """The ``decision`` with a velocity towards the attractor (2,) m in base_link."""
-        action = turn_to_attractor(
-            select_motion(velocity, attractor, surroundings, self.robot).action,
-            attractor,
+    def _approach(self, lookahead: Array, surroundings: Surroundings, velocity: Array, decision: Decision) -> Decision:
+        """The ``decision`` with a velocity towards the lookahead point (2,) m in base_link."""
+        action = turn_to_lookahead(
+            select_motion(velocity, lookahead, surroundings, self.robot).action,
+            lookahead,
             self.robot,
             may_turn=self.may_turn,
             forward=surroundings.forward,
         )
         if not action.any() and self.may_turn:  # no free motion: turn to look elsewhere
-            action[2] = 0.5 if attractor[1] >= 0 else -0.5
+            action[2] = 0.5 if lookahead[1] >= 0 else -0.5
         decision.action, decision.state = action, "exploring"
         return decision
 

@@ -6,8 +6,8 @@ everywhere, as if it were a Gaussian whose precision, lambda / d, grows as the r
 not vanish on the last metres.
 
 Distances come from Dijkstra's algorithm (scipy.sparse.csgraph) on a grid with 16 neighbours. They are at most 2.7 %
-longer than the true ones. The robot does not follow the grid: it is attracted by the farthest point of the path to
-which a straight line is free.
+longer than the true ones. The robot does not follow the grid: it drives towards the lookahead point, which is the
+farthest point of the path to which a straight line is free.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ WALL_GAP_M = 0.03  # minimum distance between footprint and wall; the obstacle s
 WALL_COST_RANGE_M = 0.35  # range of clearances beyond the minimum within which a metre costs more
 MAX_WALL_COST = 1.0  # additional cost of a metre at the minimum clearance
 UNKNOWN_COST = 30.0  # additional cost of a metre where nothing is known: a path through it is the last resort
-ATTRACTOR_RANGE_M = 3.0  # length of the path within which the attractor is chosen
-MAX_ATTRACTOR_CANDIDATES = 12  # points of the path that are tried, evenly spaced
-MAX_LINE_COST_RATIO = 1.02  # cost of the straight line to the attractor, relative to the path on the grid
+LOOKAHEAD_RANGE_M = 3.0  # length of the path within which the lookahead point is chosen
+MAX_LOOKAHEAD_CANDIDATES = 12  # points of the path that are tried, evenly spaced
+MAX_LINE_COST_RATIO = 1.02  # cost of the straight line to the lookahead point, relative to the path on the grid
 # Half of the 16 neighbours as (rows, columns); the other half are their opposites. A knight's move passes over two more
 # cells, which must be free as well.
 MOVES = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (2, -1), (1, -2))
@@ -164,13 +164,13 @@ class CostField:
         centres = self.graph.grid.centres(np.array(cells))
         return np.concatenate([np.atleast_2d(point), centres[1:-1], self.goal[None]])
 
-    def attractor(self, point: Array, path: Array) -> Array:
-        """The point (2,) m of ``path`` that attracts a robot at ``point``: the farthest on a free straight line."""
+    def lookahead_point(self, point: Array, path: Array) -> Array:
+        """The lookahead point (2,) m on ``path`` of a robot at ``point``: the farthest on a free straight line."""
         distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
-        near = np.flatnonzero(distance[1:] <= ATTRACTOR_RANGE_M) + 1
+        near = np.flatnonzero(distance[1:] <= LOOKAHEAD_RANGE_M) + 1
         tried = np.array([1])
         if len(near):
-            tried = near[np.unique(np.linspace(0, len(near) - 1, MAX_ATTRACTOR_CANDIDATES).astype(int))]
+            tried = near[np.unique(np.linspace(0, len(near) - 1, MAX_LOOKAHEAD_CANDIDATES).astype(int))]
         remaining = self._cost_at(path[tried])
         free, line_cost = self.graph.clear_line(point, path[tried])
         path_cost = self._cost_at(path[:1])[0] - remaining

@@ -22,7 +22,7 @@ HOLD_S = 0.4  # how long most motions hold their action; the next scan leads to 
 STEP_S = 1 / 15  # time step of predicted motion: the scan period of the shipped scanner
 SHORT_HOLDS_S = STEP_S * np.arange(1, 6)  # of motions that stop at the target, or end their turn in its direction
 TURN_ACCELERATION_SHARE = 0.4  # share of the acceleration that a turn during motion may use
-NEAR_ATTRACTOR_M = 0.5  # nearer than this, the robot no longer turns to an attractor that lies ahead
+NEAR_LOOKAHEAD_M = 0.5  # nearer than this, the robot no longer turns to a lookahead point that lies ahead
 STANDING_SPEED = 0.02  # m/s or rad/s; anything slower counts as standing
 
 
@@ -131,16 +131,16 @@ def turn_rate(angle: float, robot: Robot, hold: float = STEP_S) -> float:
     return float(np.sign(angle) * min(robot.max_turn, rate))
 
 
-def turn_to_attractor(action: Array, attractor: Array, robot: Robot, *, may_turn: bool, forward: float = 0.0) -> Array:
+def turn_to_lookahead(action: Array, lookahead: Array, robot: Robot, *, may_turn: bool, forward: float = 0.0) -> Array:
     """Adds a turn to the action (3,) of a holonomic base, so that the scanner faces the direction of motion.
 
-    The side at bearing ``forward`` rad in base_link is turned towards the attractor (2,) m, unless the attractor is
-    near and lies ahead. Returns the action unchanged for a differential base, and if ``may_turn`` is False.
+    The side at bearing ``forward`` rad in base_link is turned towards the lookahead point (2,) m, unless that is near
+    and lies ahead. Returns the action unchanged for a differential base, and if ``may_turn`` is False.
     """
     if robot.drive != "holonomic" or not may_turn:
         return np.array(action)
-    bearing = float(se2.wrap(np.arctan2(attractor[1], attractor[0]) - forward))
-    if np.hypot(*attractor) < NEAR_ATTRACTOR_M and abs(bearing) < np.pi / 3:
+    bearing = float(se2.wrap(np.arctan2(lookahead[1], lookahead[0]) - forward))
+    if np.hypot(*lookahead) < NEAR_LOOKAHEAD_M and abs(bearing) < np.pi / 3:
         return np.array([action[0], action[1], 0.0])
     # A base that turns keeps its velocity in map only by a change of that in base_link, which takes acceleration.
     max_turn = TURN_ACCELERATION_SHARE * robot.acceleration / max(float(np.hypot(action[0], action[1])), 1e-3)
@@ -148,17 +148,18 @@ def turn_to_attractor(action: Array, attractor: Array, robot: Robot, *, may_turn
     return np.array([*se2.rotate(-turn * STEP_S / 2, action[:2]), turn])
 
 
-def candidate_motions(current: Array, attractor: Array, robot: Robot) -> Array:
-    """Motions (N, 5) to choose from: braking, the current action, and a fan around the attractor (2,) m in base_link.
+def candidate_motions(current: Array, lookahead: Array, robot: Robot) -> Array:
+    """Motions (N, 5) to choose from: braking, the current action, and a fan around the lookahead point.
 
-    One of the speeds is that with which the robot stops at the attractor. The last motions hold a higher speed for less
-    time. A differential base may also turn until the attractor lies ahead, and drive straight from then on.
+    The lookahead point (2,) m is in base_link. One of the speeds is that with which the robot stops there. The last
+    motions hold a higher speed for less time. A differential base may also turn until the lookahead point lies ahead,
+    and drive straight from then on.
     """
-    bearing, distance = float(np.arctan2(attractor[1], attractor[0])), float(np.hypot(*attractor))
+    bearing, distance = float(np.arctan2(lookahead[1], lookahead[0])), float(np.hypot(*lookahead))
     speeds = np.unique([*(robot.max_speed * np.array([0.08, 0.2, 0.4, 0.7, 1.0])), braking_speed(distance, robot)])
     fan = _holonomic_fan(speeds, bearing) if robot.drive == "holonomic" else _arcs(speeds, bearing, distance, robot)
     held = np.pad(np.concatenate([np.zeros((1, 3)), current[None], fan]), ((0, 0), (0, 2)), constant_values=HOLD_S)
-    late = [(stopping_action(current, attractor, robot, hold), hold) for hold in SHORT_HOLDS_S]
+    late = [(stopping_action(current, lookahead, robot, hold), hold) for hold in SHORT_HOLDS_S]
     motions = [[*action, hold, hold] for action, hold in late if action is not None]
     if robot.drive == "differential":
         rates = [(turn_rate(bearing, robot, hold), hold) for hold in SHORT_HOLDS_S]

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from common.robot.robot import Robot
     from services.controller.policies.scan_information import ScanInformation
 
-HEADING_FADE_M = 0.3  # closer to the attractor, the cost of turning towards it fades out
+HEADING_FADE_M = 0.3  # closer to the lookahead point, the cost of turning towards it fades out
 BLIND_SPEED = 0.25  # m/s into directions that the scanner does not see, for a base that may not turn; others turn first
 # The field of view must extend this far to either side of the direction of motion, because the body is wide. In a
 # field of view too narrow for that, motion is allowed in its middle third.
@@ -29,7 +29,7 @@ FIELD_OF_VIEW_MARGIN_RAD, FIELD_OF_VIEW_DIVISOR = np.pi / 4, 3
 # Cost in m of a change of velocity by 1 m/s, so that the choice does not alternate between motions of equal merit.
 CHANGE_COST_S = 0.02
 WALKING_SPEED = 1.0  # m/s at which moving obstacles are assumed to approach
-LINE_SAMPLES = (np.arange(6) + 0.5) / 6  # shares of the line to the attractor at which the ambiguity is looked up
+LINE_SAMPLES = (np.arange(6) + 0.5) / 6  # shares of the line to the lookahead point at which the ambiguity is looked up
 MOTION_STRIDE = 5  # the ambiguity is looked up at every fifth pose of a motion
 HINDERED_M = 0.05  # a status text is shown if walls and obstacles make the way longer by this much
 GAP_TOLERANCE_M = 1e-3  # for rounding errors
@@ -116,17 +116,17 @@ class PoseBelief:
         """Variance of the position, m², over both axes."""
         return float(self.covariance[0, 0] + self.covariance[1, 1])
 
-    def ambiguity_and_gain(self, motions: Array, attractor: Array, seconds: float) -> tuple[Array, Array]:
-        """Ambiguity and information gain (N,) nats about the pose, of motions (N, T, 3) and the line to the attractor.
+    def ambiguity_and_gain(self, motions: Array, lookahead: Array, seconds: float) -> tuple[Array, Array]:
+        """Ambiguity and information gain (N,) nats about the pose, of motions (N, T, 3) and the lines beyond.
 
-        The motions and the attractor (2,) m are in base_link, and take ``seconds``.
+        The lines lead to the lookahead point (2,) m. All is in base_link, and the motions take ``seconds``.
         """
         if self.scans is None:
             return np.zeros(len(motions)), np.zeros(len(motions))
         ends, length = motions[:, -1, :2], path_lengths(motions)
-        line = ends[:, None] + LINE_SAMPLES[:, None] * (attractor - ends)[:, None]
+        line = ends[:, None] + LINE_SAMPLES[:, None] * (lookahead - ends)[:, None]
         points = se2.transform(self.pose, np.concatenate([motions[:, ::MOTION_STRIDE, :2], line], axis=1))
-        line_length = np.hypot(*(attractor - ends).T)
+        line_length = np.hypot(*(lookahead - ends).T)
         metres = np.full(points.shape[:2], 1.0)  # length of the part of the way that each point represents
         metres[:, -len(LINE_SAMPLES) :] *= line_length[:, None] / len(LINE_SAMPLES)
         metres[:, : -len(LINE_SAMPLES)] *= length[:, None] / (points.shape[1] - len(LINE_SAMPLES))
@@ -148,16 +148,16 @@ class SelectedMotion:
 
 
 def select_motion(
-    current: Array, attractor: Array, surroundings: Surroundings, robot: Robot, belief: PoseBelief | None = None
+    current: Array, lookahead: Array, surroundings: Surroundings, robot: Robot, belief: PoseBelief | None = None
 ) -> SelectedMotion:
     """The candidate motion of least expected free energy.
 
-    ``current`` (3,) is the present velocity and ``attractor`` (2,) m the target, both in base_link. Motions are
-    sampled around the attractor, and then once more around the best of them. A motion is excluded if something is in
+    ``current`` (3,) is the present velocity and ``lookahead`` (2,) m the lookahead point, both in base_link. Motions
+    are sampled around the latter, and then once more around the best of them. A motion is excluded if something is in
     its way, or may come into its way before the robot stands.
     """
-    evaluator = _Evaluator(current, attractor, surroundings, robot, belief or PoseBelief())
-    sampled = evaluator.evaluate(motion_model.candidate_motions(current, attractor, robot), braking_is_free=True)
+    evaluator = _Evaluator(current, lookahead, surroundings, robot, belief or PoseBelief())
+    sampled = evaluator.evaluate(motion_model.candidate_motions(current, lookahead, robot), braking_is_free=True)
     refined = evaluator.evaluate(motion_model.refined_motions(sampled.motions[sampled.best], robot))
     chosen = sampled if sampled.least <= refined.least else refined
     hindered = float(sampled.energy.total.min()) < chosen.least - HINDERED_M * NATS_PER_METRE
@@ -191,9 +191,9 @@ class _Evaluator:
     """Evaluates candidate motions in one situation."""
 
     def __init__(
-        self, current: Array, attractor: Array, surroundings: Surroundings, robot: Robot, belief: PoseBelief
+        self, current: Array, lookahead: Array, surroundings: Surroundings, robot: Robot, belief: PoseBelief
     ) -> None:
-        self.current, self.attractor, self.surroundings = current, attractor, surroundings
+        self.current, self.lookahead, self.surroundings = current, lookahead, surroundings
         self.robot, self.belief = robot, belief
         # If the robot is too close to something already, every motion that leads away from it counts as free.
         present_gap = float(surroundings.gaps(np.zeros((1, 1, 3)), np.zeros(1), max_gap=WALL_COST_RANGE_M)[0, 0])
@@ -212,7 +212,7 @@ class _Evaluator:
         if braking_is_free:
             free[0] = True
         metres = self._risk_metres(motions, poses, gaps, deviation)
-        ambiguity, information = self.belief.ambiguity_and_gain(poses, self.attractor, float(times[-1]))
+        ambiguity, information = self.belief.ambiguity_and_gain(poses, self.lookahead, float(times[-1]))
         energy = ExpectedFreeEnergy(NATS_PER_METRE * metres, ambiguity, information, np.zeros(len(motions)))
         return _Evaluation(motions, poses, energy, np.where(free, energy.total, np.inf))
 
@@ -222,7 +222,7 @@ class _Evaluator:
         It is the sum of the mean distance to go during the motion, the distance to go at its end, additional metres if
         its narrowest gap is small, and the cost of the change of velocity.
         """
-        distance = efe.expected_distance(remaining_distance(poses, self.attractor, self.robot), self.belief.variance)
+        distance = efe.expected_distance(remaining_distance(poses, self.lookahead, self.robot), self.belief.variance)
         closeness = efe.expected_square(1 - gaps.min(axis=1) / WALL_COST_RANGE_M, deviation / WALL_COST_RANGE_M)
         effort = CHANGE_COST_S * np.hypot(*(motions[:, :2] - self.current[:2]).T)
         near_obstacles = MAX_WALL_COST * closeness * path_lengths(poses)
@@ -234,12 +234,12 @@ def path_lengths(poses: Array) -> Array:
     return np.asarray(np.hypot(*np.diff(poses[..., :2], axis=1).T).sum(axis=0))
 
 
-def remaining_distance(poses: Array, attractor: Array, robot: Robot) -> Array:
-    """Distance (...,) m from poses (..., 3) to the attractor.
+def remaining_distance(poses: Array, lookahead: Array, robot: Robot) -> Array:
+    """Distance (...,) m from poses (..., 3) to the lookahead point.
 
     For a differential base it includes the distance that could be driven in the time that the turn takes.
     """
-    offset = attractor - poses[..., :2]
+    offset = lookahead - poses[..., :2]
     distance = np.hypot(offset[..., 0], offset[..., 1])
     if robot.drive == "holonomic":
         return np.asarray(distance)

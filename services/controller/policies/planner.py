@@ -23,7 +23,7 @@ from services.controller.policies.motion_model import (
     STEP_S,
     is_moving,
     turn_rate,
-    turn_to_attractor,
+    turn_to_lookahead,
 )
 from services.controller.policies.motion_selection import PoseBelief, Surroundings, least_distance, select_motion
 from services.controller.policies.obstacles import TemporaryObstacles
@@ -185,11 +185,11 @@ class GeodesicPolicy:
         assert self.field is not None  # noqa: S101 - there is a path
         if (stop := self._stop_beside_goal(stamp_ns, pose, self.field.goal, surroundings, path)) is not None:
             return stop
-        attractor = se2.rotate(-pose[2], self.field.attractor(pose[:2], path) - pose[:2])
+        lookahead = se2.rotate(-pose[2], self.field.lookahead_point(pose[:2], path) - pose[:2])
         known = PoseBelief(pose, _covariance(belief), self._information)
-        selected = select_motion(velocity, attractor, surroundings, self.robot, known)
-        action = turn_to_attractor(
-            selected.action, attractor, self.robot, may_turn=surroundings.may_turn, forward=surroundings.forward
+        selected = select_motion(velocity, lookahead, surroundings, self.robot, known)
+        action = turn_to_lookahead(
+            selected.action, lookahead, self.robot, may_turn=surroundings.may_turn, forward=surroundings.forward
         )
         # The velocity that was commanded counts, not the action: the limits may have stopped the robot.
         self._recovery.watch(stamp_ns, moving=is_moving(velocity))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from services.controller.policies.motion_model import turn_to_attractor
+from services.controller.policies.motion_model import turn_to_lookahead
 from services.controller.policies.motion_selection import SelectedMotion, Surroundings, select_motion
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def back_off(velocity: Array, surroundings: Surroundings, robot: Robot) -> Selec
     targets = BACK_OFF_M * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     target = targets[int(np.argmax(surroundings.gaps(targets[:, None, :], np.zeros(1))[:, 0]))]
     selected = select_motion(velocity, target, surroundings, robot)
-    action = turn_to_attractor(
+    action = turn_to_lookahead(
         selected.action, target, robot, may_turn=surroundings.may_turn, forward=surroundings.forward
     )
     return replace(selected, action=action)

@@ -1,4 +1,4 @@
-"""Cost over free space: paths around walls, of nearly the shortest length, and visible attractors."""
+"""Cost over free space: paths around walls, of nearly the shortest length, and visible lookahead points."""
 
 from __future__ import annotations
 
@@ -69,11 +69,11 @@ def test_cost_without_walls_is_the_distance(empty):
     assert ratio.max() < 1.0275  # 16 neighbours
 
 
-def follow_attractor(field, here, room) -> float:
-    """Length in m of the way to the goal along attractors, each in straight line within ``room``."""
+def follow_lookahead(field, here, room) -> float:
+    """Length in m of the way to the goal along lookahead points, each in straight line within ``room``."""
     travelled = 0.0
     while np.hypot(*(here - field.goal)) >= 0.01:
-        point = field.attractor(here, field.path(here))
+        point = field.lookahead_point(here, field.path(here))
         assert shapely.covers(room, shapely.LineString([here, point])), (here, point)
         distance = float(np.hypot(*(point - here)))
         step = min(0.3, distance)
@@ -103,8 +103,8 @@ def test_nearly_shortest_paths(name):
         if shapely.covers(wide, shapely.LineString([start, goal])):
             assert path_length(path) < 1.06 * straight + 0.2
         if world.has_room(start, 0.4) and world.has_room(goal, 0.4):
-            # The attractor shortens the detours of the grid.
-            assert follow_attractor(field, start, inner) <= path_length(path) + 0.05
+            # The lookahead point shortens the detours of the grid.
+            assert follow_lookahead(field, start, inner) <= path_length(path) + 0.05
     assert reached >= 9
 
 

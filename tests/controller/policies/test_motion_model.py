@@ -16,7 +16,7 @@ from services.controller.policies.motion_model import (
     braking_speed,
     rollouts,
     turn_rate,
-    turn_to_attractor,
+    turn_to_lookahead,
 )
 from services.controller.policies.motion_selection import Surroundings, remaining_distance, select_motion
 
@@ -127,6 +127,6 @@ def test_unseen_directions():
     behind, view = np.array([-3.0, 0.0]), Sector(0.0, np.deg2rad(135))
     action = select_motion(np.zeros(3), behind, around(field_of_view=view), ROBOT).action
     assert abs(np.arctan2(action[1], action[0])) <= np.pi / 2 + 1e-9  # the body is wide
-    assert abs(turn_to_attractor(action, behind, ROBOT, may_turn=True)[2]) > 1.0
+    assert abs(turn_to_lookahead(action, behind, ROBOT, may_turn=True)[2]) > 1.0
     kept = select_motion(np.zeros(3), behind, around(field_of_view=view, may_turn=False), ROBOT).action
     assert 0 < np.hypot(*kept[:2]) <= 0.25 + 1e-9
