@@ -35,7 +35,7 @@ from services.estimator.shared.model_folder import training_folder
 
 CALIBRATION_SAMPLES, TEST_SAMPLES = 250, 250  # scans without noise, for the standard deviations and the errors
 MIN_SAMPLES, SAMPLES_PER_M2 = 5000, 10  # training scans; the error depends on the number of beams that meet a surface
-MIN_BEAMS_PER_SAMPLE = 400  # of a training scan, on average, in each sweep of learning
+MIN_BEAMS_PER_SAMPLE = 400  # of a training scan, on average, in each step of learning
 
 
 @dataclass(frozen=True)

@@ -71,11 +71,11 @@ class BackEnd:
         found = self._joiner.find(segments, self.poses, component)
         if not found:
             return False
-        self._move_later_part(found[0].link, component)
+        self._move_later_component(found[0].link, component)
         self._add(found, scans)
         return True
 
-    def _move_later_part(self, link: PoseLink, component: npt.NDArray[np.int_]) -> None:
+    def _move_later_component(self, link: PoseLink, component: npt.NDArray[np.int_]) -> None:
         """Moves the later one of two components so that a link between them fits."""
         first, second = (component == component[k] for k in (link.first, link.second))
         if np.argmax(first) < np.argmax(second):
@@ -87,7 +87,7 @@ class BackEnd:
         self.poses[later] = se2.compose(origin, self.poses[later])
 
     def in_map(self, scans: KeyScanGraph) -> npt.NDArray[np.bool_]:
-        """Mask (K,) of the key scans that belong to the map: the largest part of the drive that links connect."""
+        """Mask (K,) of the key scans that belong to the map: the largest component that links connect."""
         component = self._components(scans)
         return np.asarray(component == largest_component(component))
 

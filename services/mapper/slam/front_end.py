@@ -28,7 +28,7 @@ from services.mapper.slam.drive import Laser, RawDrive
 from services.mapper.slam.elements import Elements, concatenate, elements_of_scan
 from services.mapper.slam.pose_graph import PoseLink
 from services.mapper.slam.registration import (
-    MIN_PARTNERS,
+    MIN_CORRESPONDENCES,
     PRIOR_INFLATION,
     PosePrior,
     Registration,
@@ -147,7 +147,7 @@ class FrontEnd:
         self.stamps.append(stamp)
         if len(self.stamps) == 1:
             return self._begin_piece(np.zeros(3), scan)
-        if self._odom is None and len(self._local.elements) < MIN_PARTNERS <= len(scan.elements):
+        if self._odom is None and len(self._local.elements) < MIN_CORRESPONDENCES <= len(scan.elements):
             return self._begin_piece(self.poses[-1], scan)  # so far there was nothing that a scan could match
         prior, covariance = self._prior(motion, deviation)
         self._since_key = self._since_key + PRIOR_INFLATION**2 * covariance
@@ -286,7 +286,7 @@ class FrontEnd:
     def _add_suspect(self, scan: _Scan, pose: Array) -> ScanPose:
         """Adds a scan whose pose is unknown; after several of them, another piece begins."""
         self._suspect_scans += 1
-        if self._suspect_scans >= MAX_SUSPECT_SCANS and len(scan.elements) >= MIN_PARTNERS:
+        if self._suspect_scans >= MAX_SUSPECT_SCANS and len(scan.elements) >= MIN_CORRESPONDENCES:
             return self._begin_piece(pose, scan)
         scan_pose = ScanPose(pose, self._since_key, matched=False, piece=NO_PIECE)
         self._append(scan_pose)

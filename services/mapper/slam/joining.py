@@ -3,6 +3,8 @@
 Segments of the piece are searched for in the whole map. The rest of the piece distinguishes places that look alike: it
 is joined only if two of its segments agree on its pose, no segment contradicts it, and no other pose is as good. If a
 later segment contradicts it, the piece is separated again.
+
+Pieces that links connect form a component of the pose graph, and are joined together. The largest component is the map.
 """
 
 from __future__ import annotations
@@ -54,18 +56,18 @@ class PieceJoiner:
         in_map = of_segment == largest_component(component)
         targets = _spaced_out(segments, poses, np.flatnonzero(in_map))
         for second in np.flatnonzero(~in_map).tolist():
-            of_part = of_segment == of_segment[second]
-            if np.count_nonzero(of_part) < MIN_SUPPORT:
+            moved = of_segment == of_segment[second]
+            if np.count_nonzero(moved) < MIN_SUPPORT:
                 continue
             for first in targets:
                 if (first, second) not in self._searched:
                     self._searched.add((first, second))
                     self._candidates += _search_segment(segments, first, second, poses)
             candidates = [
-                each for each in self._candidates if in_map[each.closure.first] and of_part[each.closure.second]
+                each for each in self._candidates if in_map[each.closure.first] and moved[each.closure.second]
             ]
-            parts = np.flatnonzero(in_map).tolist(), np.flatnonzero(of_part).tolist()
-            if found := _agreed_closures(candidates, parts, segments, poses):
+            components = np.flatnonzero(in_map).tolist(), np.flatnonzero(moved).tolist()
+            if found := _agreed_closures(candidates, components, segments, poses):
                 # Each candidate is used once: if this join is undone, the same candidates must not lead to it again.
                 self._candidates = [
                     each for each in self._candidates if all(each.closure is not used for used in found)
@@ -105,11 +107,14 @@ def _search_segment(segments: Sequence[Segment], first: int, second: int, poses:
 
 
 def _agreed_closures(
-    candidates: Sequence[JoinCandidate], parts: tuple[list[int], list[int]], segments: Sequence[Segment], poses: Array
+    candidates: Sequence[JoinCandidate],
+    components: tuple[list[int], list[int]],
+    segments: Sequence[Segment],
+    poses: Array,
 ) -> list[LoopClosure]:
-    """The loop closures that agree on the pose of a part of the drive in the map, if no other pose is as good.
+    """The loop closures that agree on the pose of a component in the map, if no other pose is as good.
 
-    ``parts`` are the numbers of the segments of the map, and of the part.
+    ``components`` are the numbers of the segments of the map, and of the component to be joined.
     """
     if not candidates:
         return []
@@ -123,7 +128,7 @@ def _agreed_closures(
         best = int(np.argmax(np.where(possible, totals, 0.0)))
         if len(scores[best]) < MIN_SUPPORT:
             return []
-        if not _is_place_contradicted(places[best], parts, segments, poses):
+        if not _is_place_contradicted(places[best], components, segments, poses):
             rival = totals[possible & ~agree[best]].max(initial=0.0)
             return [] if rival > RIVAL_SHARE * totals[best] else [each.closure for each in groups[best]]
         possible &= ~agree[best]
@@ -153,10 +158,10 @@ def _place_of_piece(link: PoseLink, poses: Array) -> Array:
 
 
 def _is_place_contradicted(
-    place: Array, parts: tuple[list[int], list[int]], segments: Sequence[Segment], poses: Array
+    place: Array, components: tuple[list[int], list[int]], segments: Sequence[Segment], poses: Array
 ) -> bool:
-    """Whether, with the frame of the second part at ``place`` (3,), some segment of it contradicts the first part."""
-    targets, moved = parts
+    """Whether, with the frame of the second component at ``place`` (3,), some segment of it contradicts the first."""
+    targets, moved = components
     return any(
         is_contradicted(number, se2.compose(place, poses[segments[number].reference]), targets, segments, poses)
         for number in moved

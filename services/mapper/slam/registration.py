@@ -1,7 +1,7 @@
 """Registration of surface elements: finds the pose at which a scan fits a map.
 
-Point-to-line iterative closest point (Censi, ICRA 2008) with a Gaussian prior. Partners are nearest in position and
-direction together, so that a surface is never matched with its back.
+Point-to-line iterative closest point (Censi, ICRA 2008) with a Gaussian prior. Corresponding elements are nearest in
+position and direction together, so that a surface is never matched with its back.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from common.geometry.se2 import Array
 from services.mapper.slam.elements import Elements
 
 NORMAL_DIFFERENCE_M = 0.3  # a difference of 1 between two unit normals counts as this distance
-PARTNER_RADII_M = (0.6, 0.6, 0.5, 0.4, 0.3, 0.2, 0.2, 0.2)  # largest distance of partners, iteration by iteration
-RESIDUAL_M = 0.03  # standard deviation of the distance between partners, and scale of the Cauchy weights
+CORRESPONDENCE_RADII_M = (0.6, 0.6, 0.5, 0.4, 0.3, 0.2, 0.2, 0.2)  # largest distance, iteration by iteration
+RESIDUAL_M = 0.03  # standard deviation between corresponding elements, and scale of the Cauchy weights
 PRIOR_SCALE = 2.0  # standard deviations, scale of the prior's Cauchy weight: wheels slip
 PRIOR_INFLATION = 2.0  # factor on the deviations of the prior, because those of the elements are too large as well
-MATCHED_M = 0.15  # an element whose partner is nearer than this is matched
-MIN_PARTNERS = 10  # elements with a counterpart in the target; with fewer there is no match
+MATCHED_M = 0.15  # an element whose correspondence is nearer than this is matched
+MIN_CORRESPONDENCES = 10  # between elements and target; with fewer there is no match
 CORRELATED_ELEMENTS = 10.0  # number of elements that match or fail together, because they belong to one object
 
 
@@ -36,8 +36,8 @@ class Surface:
         self.elements = self.elements.divided()
         self.tree = cKDTree(_features(self.elements))
 
-    def partner_distances(self, elements: Elements) -> Array:
-        """Distance (K,) in m of each element from its partner, with differences of direction; inf if not matched."""
+    def correspondence_distances(self, elements: Elements) -> Array:
+        """Distance (K,) m of each element from its correspondence, with the direction's difference; inf: unmatched."""
         return np.asarray(self.tree.query(_features(elements), distance_upper_bound=MATCHED_M)[0])
 
 
@@ -71,15 +71,15 @@ class Registration:
 def register(surface: Surface, elements: Elements, start: Array, prior: PosePrior = NO_PRIOR) -> Registration | None:
     """Registers elements, starting at the pose ``start`` (3,); returns None if too few match."""
     pose = np.array(start, float)
-    for radius in PARTNER_RADII_M:
+    for radius in CORRESPONDENCE_RADII_M:
         placed = elements.transformed(pose)
-        distance, partner = surface.tree.query(_features(placed), distance_upper_bound=radius)
+        distance, nearest = surface.tree.query(_features(placed), distance_upper_bound=radius)
         paired = np.isfinite(distance)
-        if paired.sum() < MIN_PARTNERS:
+        if paired.sum() < MIN_CORRESPONDENCES:
             return None
-        partner = partner[paired]
-        normal = surface.elements.normals[partner]
-        error = np.einsum("ni,ni->n", normal, placed.points[paired] - surface.elements.points[partner])
+        nearest = nearest[paired]
+        normal = surface.elements.normals[nearest]
+        error = np.einsum("ni,ni->n", normal, placed.points[paired] - surface.elements.points[nearest])
         arm = placed.points[paired] - pose[:2]
         J = np.column_stack([normal, normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]])
         weight = 1 / (1 + (error / RESIDUAL_M) ** 2) / RESIDUAL_M**2

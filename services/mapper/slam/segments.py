@@ -115,8 +115,8 @@ class Agreement:
 def compare_segments(first: Segment, surface: Surface, second: Segment, pose: Array) -> Agreement:
     """Compares two segments, the second at ``pose`` (3,) in the first; ``surface`` has the elements of the first."""
     placed = second.elements.transformed(pose)
-    second_matches = surface.partner_distances(placed) < MATCHED_M
-    first_matches = Surface(placed).partner_distances(first.elements) < MATCHED_M
+    second_matches = surface.correspondence_distances(placed) < MATCHED_M
+    first_matches = Surface(placed).correspondence_distances(first.elements) < MATCHED_M
     first_in_second = first.elements.transformed(se2.inverse(pose))
     contradicting = _count_contradicting(first.scans, placed.part(~second_matches))
     contradicting += _count_contradicting(second.scans, first_in_second.part(~first_matches))

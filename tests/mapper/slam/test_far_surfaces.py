@@ -13,10 +13,10 @@ ANGLES = np.deg2rad(np.arange(-60.0, 61.0))
 
 
 @pytest.mark.parametrize("moved", [0.05, 0.13, 0.4])
-def test_partners_between_beams(moved):
+def test_correspondences_between_beams(moved):
     wall = elements_of_scan(15 / np.cos(ANGLES), ANGLES, np.zeros(3), 80.0)
     again = wall.transformed(np.array([0.0, moved, 0.0]))
-    assert (Surface(wall).partner_distances(again) < MATCHED_M).mean() > 0.95
+    assert (Surface(wall).correspondence_distances(again) < MATCHED_M).mean() > 0.95
 
 
 @pytest.mark.parametrize(("seen", "free"), [(19.0, False), (24.0, False), (40.0, True)])

@@ -3,7 +3,7 @@
 1. The end points of beams are pooled in cells; their covariance gives a surface element (mean, normal) for each cell.
 2. Near surfaces, phi is the weighted distance to the elements around (implicit moving least squares, Kolluri 2008);
    elsewhere it is the distance to the nearest surface.
-3. Sweeps of prediction: where beams end, phi is corrected along the gradient of the squared prediction error (diagonal
+3. Gradient descent: where beams end, phi is corrected along the gradient of the squared prediction error (diagonal
    Gauss-Newton steps), in the same way as perception corrects the belief.
 """
 
@@ -49,7 +49,7 @@ class Recipe:
     """Parameters of learning."""
 
     resolution: float = 0.04  # m
-    sweeps: int = 10  # of step 3
+    sweeps: int = 10  # steps of gradient descent, each on a sample of the beams
     beams_per_sweep: int = 2_000_000
     seed: int = 0
 
@@ -73,7 +73,7 @@ def learn_field(
         report("prediction errors", sweep / recipe.sweeps)
         # Sorted, because neighbouring beams of a scan need the same part of the field: a third less time.
         sample = np.sort(rng.integers(0, len(beams.ranges), min(recipe.beams_per_sweep, len(beams.ranges))))
-        rate = 1 / (1 + sweep / 2)  # decreases, so that the noise averages out in the last sweeps
+        rate = 1 / (1 + sweep / 2)  # decreases, so that the noise averages out in the last steps
         phi = _descend(DistanceField(phi, field.origin, field.resolution), beams, sample, rate, threads)
     return DistanceField(phi, field.origin, field.resolution)
 
@@ -153,7 +153,7 @@ def _map_parts(function: Callable[[Beams], Any], beams: Beams, threads: int) -> 
 
 
 def _descend(field: DistanceField, beams: Beams, sample: npt.NDArray[np.intp], rate: float, threads: int) -> Floats:
-    """One sweep of prediction over a sample of the beams.
+    """One step of gradient descent on a sample of the beams.
 
     Since dr = dphi / |n . u|, an error e = o - r requires dphi = e |n . u| where the beam ends, with weight
     1 / |n . u|². Surfaces that most beams passed through are removed: planes extended past an edge, objects that moved.

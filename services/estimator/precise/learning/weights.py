@@ -40,7 +40,7 @@ class FieldCard(BaseModel):
     seed: int
     resolution: float  # m
     origin: tuple[float, float]  # m
-    sweeps: int  # descent steps on samples of the beams
+    sweeps: int  # steps of gradient descent, each on a sample of the beams
     ripple: float  # rad, see GenerativeModel
     inflation: float  # factor on the covariance, because errors of the model are correlated between beams
     test_samples: int
