@@ -84,6 +84,18 @@ class World(WorldPart):
         check_floors(self.floors, self.lifts)
         return self
 
+    @model_validator(mode="after")
+    def _obstacles_differ(self) -> World:
+        taken: set[str] = set()
+        for obstacle in self.obstacles:
+            if obstacle.name in taken:
+                raise ValueError(f"two obstacles are named {obstacle.name!r}; give each a name of its own")
+            if obstacle.name == "boundary":
+                raise ValueError("an obstacle is named 'boundary', as the walls are; give it another name")
+            if obstacle.name:
+                taken.add(obstacle.name)
+        return self
+
     def with_obstacles(self, obstacles: list[Obstacle]) -> World:
         """The same world with other obstacles."""
         # Not a copy, which would keep the cached geometry.

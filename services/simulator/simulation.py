@@ -327,13 +327,7 @@ def _create_physics(engine: Engine, world: World, robot: Robot, pose: Array) -> 
 
 def _name_obstacles(world: World) -> World:
     """The world with a name for every obstacle, by which it can be moved and removed."""
-    taken = [o.name for o in world.obstacles if o.name]
-    if duplicates := sorted({name for name in taken if taken.count(name) > 1}):
-        raise UserError(f"world {world.name!r}: two obstacles are named {duplicates[0]!r}; give each a name of its own")
-    if "boundary" in taken:
-        raise UserError(
-            f"world {world.name!r}: an obstacle is named 'boundary', as the walls are; give it another name"
-        )
+    taken = {o.name for o in world.obstacles}
     free = (name for number in itertools.count() if (name := f"obstacle-{number}") not in taken)
     named = [o if o.name else o.model_copy(update={"name": next(free)}) for o in world.obstacles]
     return world.with_obstacles(named)

@@ -129,6 +129,14 @@ def test_name_defaults_to_that_of_the_file(tmp_path):
             "{boundary: [[0, 0], [1, 0], [1, 1]], obstacles: [{circle: {centre: [0, 0], radius: 1}}]}",
             "obstacles, entry 1, circle: unknown key 'centre'; did you mean 'center'?",
         ),
+        (
+            "{boundary: [[0, 0], [1, 0], [1, 1]], obstacles: [&a {name: a, circle: {center: [0, 0], radius: 1}}, *a]}",
+            "two obstacles are named 'a'; give each a name of its own",
+        ),
+        (
+            "{boundary: [[0, 0], [1, 0], [1, 1]], obstacles: [{name: boundary, circle: {center: [0, 0], radius: 1}}]}",
+            "an obstacle is named 'boundary', as the walls are; give it another name",
+        ),
         ("{name: ../x, boundary: [[0, 0], [1, 0], [1, 1]]}", "name: only letters, digits"),
         ("3", "file"),
         ("{name: x, since: 2020-13-45}", "month"),

@@ -253,7 +253,7 @@ def test_ambiguity_of_the_pose():
 
 def test_out_of_sight():
     """In a hall with a range of 2 m, a metre costs more the farther the walls are out of sight; near them, little."""
-    hall = room(12, 9, *(box(x, y, 0.5, 0.6) for x in range(1, 12, 2) for y in (0.3, 8.7)))
+    hall = room(12, 9, *(box(x, y, 0.5, 0.6, "") for x in range(1, 12, 2) for y in (0.3, 8.7)))
     short = information_of(hall, scan(0, [6.0, 1.5, 0.0], hall).model_copy(update={"range_max": 2.0}))
     near, edge, middle = short.free_grid.interpolate(short.ambiguity, np.array([[6.0, 1.3], [6.0, 3.4], [6.0, 4.5]]))
     assert near < 0.01 < edge < middle
