@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
+MAX_HEADING_DEG = 360  # a larger one is probably a mistake, such as a coordinate in its place
+
 Floor = Annotated[
     str, typer.Option(help="Floor in whose frame the place is (docs/maps.md). Defaults to the frame of the whole map.")
 ]
@@ -71,8 +73,8 @@ def goal(
     if not cancel and (x is None or y is None):
         raise UserError("a goal is two numbers, X Y in m (or --cancel)")
     yaw = yaw_option if yaw is None else yaw
-    if approach is not None and not np.isfinite(approach):
-        raise UserError(f"--approach {approach}: a finite number is needed, in deg")
+    if approach is not None and not abs(approach) <= MAX_HEADING_DEG:
+        raise UserError(f"--approach {approach:g}: give a direction from -{MAX_HEADING_DEG} to {MAX_HEADING_DEG} deg")
     if not np.isfinite(tolerance):
         raise UserError(f"--tolerance {tolerance}: a finite number is needed, in m")
     # The time as sequence number distinguishes this goal from those of other clients in the controller's status.
@@ -184,7 +186,7 @@ def save_model(
 
 
 def _pose(x: float, y: float, yaw: float = 0.0) -> Pose:
-    """A pose from m and deg; raises UserError if a value is not finite or too far from the origin."""
+    """A pose from m and deg; raises UserError if a value is not finite or too large."""
     from common.messages.definitions import Pose
 
     if not np.isfinite([x, y, yaw]).all():
@@ -192,4 +194,6 @@ def _pose(x: float, y: float, yaw: float = 0.0) -> Pose:
         raise UserError(f"{given}: a place is finite numbers, X Y in m and YAW in deg")
     if max(abs(x), abs(y)) > MAX_COORDINATE_M:
         raise UserError(f"{x:g} {y:g}: X and Y must be within {MAX_COORDINATE_M:g} m of the origin")
+    if abs(yaw) > MAX_HEADING_DEG:
+        raise UserError(f"{x:g} {y:g} {yaw:g}: YAW must be from -{MAX_HEADING_DEG} to {MAX_HEADING_DEG} deg")
     return Pose(x=x, y=y, yaw=float(se2.wrap(np.deg2rad(yaw))))

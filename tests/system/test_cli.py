@@ -37,6 +37,8 @@ NO_SESSION = ("--connect", "tcp/127.0.0.1:9")  # the discard port, on which noth
         (("goal", "nan", "1"), "nan 1: a place is finite numbers"),
         (("goal", "1", "1", "--tolerance", "inf"), "--tolerance inf"),
         (("goal", "1", "1", "--approach", "nan"), "--approach nan"),
+        (("goal", "1", "2", "900"), "1 2 900: YAW must be from -360 to 360 deg"),
+        (("goal", "1", "2", "--approach", "-900"), "--approach -900: give a direction from -360 to 360 deg"),
         (("goal", "1", "2", "--wiat"), "--wiat"),
         (("goal", "1e300", "1"), "1e+300 1: X and Y must be within 10000 m of the origin"),
         (("obstacle", "add", "crate", "-1", "2", "--radius", "-1"), "the obstacle: circle.radius"),
