@@ -11,6 +11,7 @@ from common.messages.definitions import Health
 from common.messages.topics import topic_of
 from common.messages.wire import DecodeError
 from presage.recordings.selection import robots_of
+from presage.recordings.service_drops import ServiceDrops
 from services.recorder.files.message_counts import MessageCounts, from_metadata, is_numbered
 from services.recorder.reader import Recording
 
@@ -52,7 +53,7 @@ class RecordingFacts:
     versions: dict[str, str]
     metadata: dict[str, list[str]]  # names of the values in each record
     attachments: dict[str, int]  # size in bytes by name
-    dropped_by_services: dict[str, int] | None  # messages by "service key", from health messages; None if not checked
+    dropped_by_services: dict[str, int] | None  # messages during the recording, by "service key"; None if not checked
 
     def as_dict(self) -> dict[str, Any]:
         """The facts as values that JSON can hold."""
@@ -73,7 +74,7 @@ class _PayloadCheck:
         self.undecodable: Counter[str] = Counter()
         self.first: dict[str, int] = {}  # by key: time of the first message, ns of wall time
         self.last: dict[str, int] = {}
-        self.last_health: dict[tuple[str, str], Health] = {}  # by service and instance
+        self.drops = ServiceDrops()
 
     def read(self, recording: Recording) -> None:
         for raw in recording.payloads():
@@ -90,15 +91,7 @@ class _PayloadCheck:
                 self.undecodable[raw.key] += 1
                 continue
             if isinstance(message, Health):
-                self.last_health[message.service, message.instance] = message
-
-    def dropped(self) -> dict[str, int]:
-        """Number of messages that services received but dropped, from their last health messages."""
-        dropped = Counter[str]()
-        for health in self.last_health.values():
-            for row in health.topics:
-                dropped[f"{health.service} {row.key}"] += row.dropped
-        return dict(+dropped)
+                self.drops.add(message)
 
 
 def collect_facts(recording: Recording, check: bool | None = None) -> RecordingFacts:
@@ -128,7 +121,9 @@ def collect_facts(recording: Recording, check: bool | None = None) -> RecordingF
         versions={name: text for name, text in about.items() if name not in {"robot", "command"}},
         metadata={name: list(record) for name, record in recording.metadata.items()},
         attachments={name: len(data) for name, data in recording.attachments.items()},
-        dropped_by_services=None if checked is None else checked.dropped(),
+        dropped_by_services=None
+        if checked is None
+        else {f"{service} {key}": count for (service, key), count in checked.drops.counts().items()},
     )
 
 

@@ -19,6 +19,7 @@ from common.geometry.world import World
 from common.messages.definitions import Belief, Goal, Health, Prediction, Scan, Stamped, Status, Truth
 from common.robot.robot import Robot
 from presage.recordings.selection import entries, robot_of
+from presage.recordings.service_drops import ServiceDrops
 from services.recorder.reader import Recording, read_recording
 
 Stamps = npt.NDArray[np.int64]
@@ -99,7 +100,7 @@ class RecordedSession:
     goals: list[Goal] = field(default_factory=list)
     goal_times_ns: list[int] = field(default_factory=list)  # of each goal: stamp of the last scan or truth before it
     reached: list[Status] = field(default_factory=list)  # statuses in state reached
-    healths: dict[str, Health] = field(default_factory=dict)  # the last of each service
+    drops: ServiceDrops = field(default_factory=ServiceDrops)
 
     def energies(self) -> Array:
         """Free energy, accuracy and complexity of each belief (N, 3), nats; NaN where unknown."""
@@ -191,7 +192,7 @@ class _Gatherer:
             self.session.reached.append(status)
 
     def _health(self, health: Health, _: int) -> None:
-        self.session.healths[health.service] = health
+        self.session.drops.add(health)
 
     def _prediction(self, prediction: Prediction, _: int) -> None:
         if (scan := self._waiting.get(prediction.stamp_ns)) is not None:

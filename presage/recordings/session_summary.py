@@ -25,7 +25,7 @@ class SessionSummary:
     complete: bool  # whether the recording is complete
     scans: int
     messages: int
-    dropped: int | None  # messages dropped by services, from their last health messages
+    dropped: int | None  # messages dropped by services during the recording
     dropped_by_key: dict[str, int]  # only keys with dropped messages
     undecodable: int
     duration_s: float  # from the first to the last reception
@@ -108,7 +108,7 @@ def summary_of(session: RecordedSession) -> SessionSummary:
         complete=not session.warning,
         scans=len(scans),
         messages=sum(session.counts.values()),
-        dropped=sum(dropped.values()) if session.healths else None,
+        dropped=sum(dropped.values()) if session.drops.last else None,
         dropped_by_key=dropped,
         undecodable=session.undecodable,
         duration_s=session.duration_s,
@@ -133,9 +133,9 @@ def summary_of(session: RecordedSession) -> SessionSummary:
 def _dropped_by_key(session: RecordedSession) -> dict[str, int]:
     """Number of messages that services dropped, without those of the viewer, which may skip messages without harm."""
     dropped = Counter[str]()
-    for service, health in session.healths.items():
+    for (service, key), count in session.drops.counts().items():
         if service != "viewer":
-            dropped.update({row.key: row.dropped for row in health.topics if row.dropped})
+            dropped[key] += count
     return dict(dropped)
 
 
