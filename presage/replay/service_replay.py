@@ -41,6 +41,11 @@ from services.estimator.service import EstimatorService
 from services.estimator.settings import EstimatorSettings
 from services.recorder.reader import Recording, read_recording
 
+CAUSES = (
+    "check whether a service ran before the recording began, was restarted, or received a request such as `presage "
+    "relocalise`, because these are not repeated"
+)
+
 
 @dataclass(frozen=True)
 class ServiceReplayOptions:
@@ -195,7 +200,7 @@ def _verdict(outcome: ReplayOutcome) -> str:
     if outcome.lockstep and outcome.agrees:
         return "[bold green]the session ran in lockstep, and the results are identical[/]"
     if outcome.lockstep:
-        return "[bold red]the session ran in lockstep: the results should be identical, but are not[/]"
+        return f"[bold red]the session ran in lockstep: the results should be identical, but are not[/]; {CAUSES}"
     limit = f"within {TOLERANCE_M:g} m and {TOLERANCE_RAD:g} rad while tracking"
-    agreement = f"[bold green]{limit}[/]" if outcome.agrees else f"[bold red]not {limit}[/]"
+    agreement = f"[bold green]{limit}[/]" if outcome.agrees else f"[bold red]not {limit}[/]; {CAUSES}"
     return f"{outcome.tolerance_reason}, so the results need not be identical: {agreement}"

@@ -55,12 +55,14 @@ def test_single_bit_is_noticed(other):
 
 
 def test_verdict_needs_a_comparison():
-    assert not ReplayOutcome(lockstep=True).agrees
-    assert not ReplayOutcome(lockstep=False).agrees
+    for lockstep in (True, False):
+        assert not ReplayOutcome(lockstep).agrees
+        assert "check whether a service ran before the recording began" in describe(ReplayOutcome(lockstep))[-1]
     outcome = ReplayOutcome(lockstep=True)
     outcome.beliefs.add_recorded(belief(1))
     outcome.beliefs.add_new(belief(1))
     assert outcome.agrees
+    assert "check" not in describe(outcome)[-1]
     outcome.damaged = "damaged: a chunk's checksum"
     assert not outcome.agrees
     assert "what comes after that was not compared" in describe(outcome)[-1]
