@@ -37,7 +37,7 @@ def hz(
     """
     from presage.live.commands import show_rates
 
-    raise typer.Exit(show_rates(chosen_link(context, OBSERVER), topic, seconds, console))
+    show_rates(chosen_link(context, OBSERVER), topic, seconds, console)
 
 
 @app.command(rich_help_panel="Diagnose", short_help="Health of every service, until Ctrl-C.")

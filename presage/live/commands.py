@@ -152,7 +152,10 @@ def list_topics(robot: str, console: Console) -> None:
 
 
 def measure_rates(link: Link, topics: tuple[Topic, ...], seconds: float) -> dict[str, list[int]]:
-    """Receives ``topics`` for ``seconds`` s; returns the arrival times (ns of wall time) by key."""
+    """Receives ``topics`` for ``seconds`` s; returns the arrival times (ns of wall time) by key.
+
+    Raises UserError if no message comes.
+    """
     with session_bus(link) as bus:
         inbox, times = Inbox(), defaultdict(list)
         for topic in topics:
@@ -162,11 +165,14 @@ def measure_rates(link: Link, topics: tuple[Topic, ...], seconds: float) -> dict
             sample = inbox.get(left)
             if isinstance(sample, Sample):
                 times[sample.key].append(sample.received_ns)
+        if not times:
+            what = f"on {topics[0].key(link.robot)}" if len(topics) == 1 else f"of robot {link.robot!r}"
+            raise UserError(f"no message {what} within {seconds:g} s: `presage top` shows which services run")
         return dict(times)
 
 
-def show_rates(link: Link, name: str | None, seconds: float, console: Console) -> int:
-    """Prints measured and nominal rates of a topic, or of all if ``name`` is None; returns 1 if no message came."""
+def show_rates(link: Link, name: str | None, seconds: float, console: Console) -> None:
+    """Prints measured and nominal rates of a topic, or of all if ``name`` is None."""
     topics = (topic_named(name),) if name else TOPICS
     with console.status(f"measuring for {seconds:g} s"):
         times = measure_rates(link, topics, seconds)
@@ -185,7 +191,6 @@ def show_rates(link: Link, name: str | None, seconds: float, console: Console) -
             )
             table.add_row(key, str(len(stamps)), row[0], f"{topic.rate:g}" if topic.rate else "-", *row[1:])
     console.print(table)
-    return 0 if times else 1
 
 
 def to_plain_values(message: Message, *, full: bool) -> dict[str, Any]:
