@@ -271,7 +271,9 @@ class ControllerService(Service):
             return
         self._wait = NoBelief()
         reason = f"no belief for {self.settings.belief_timeout:g} s: is the estimator running?"
-        self.log.warning("stopping the robot", reason=reason)
+        # A robot that stands may well wait for a search of the whole map, as after `presage relocalise`.
+        if self._last_answer is not None and self._last_answer.command.twist.array().any():
+            self.log.warning("stopping the robot", reason=reason)
         self.counters["belief_timeouts"] += 1
         self._send(self.navigator.stop_without_belief(self._last_stamp_ns, reason))
 

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from structlog.testing import capture_logs
 
 from common.bus.inbox import Inbox
 from common.errors import UserError
@@ -115,6 +116,23 @@ def test_a_repeated_map_is_not_planned_in_again(monkeypatch):
     for message in (first, first.model_copy(update={"stamp_ns": 2, "seq": 1}), moved, first):
         service.on_message(MAP, message)
     assert planned == [first, moved, first]
+
+
+@pytest.mark.parametrize("drives", [False, True])
+def test_warning_without_beliefs(drives):
+    """Only a robot that drives is stopped; one that stands may wait for a search of the whole map."""
+    service, bus = ControllerService(ControllerSettings(world="", preset="paper")), FakeBus()
+    ServiceLoop(service, bus, Inbox())
+    service.open()
+    if drives:
+        service.navigator.on_goal(goal(8, 2))
+    for number in range(3):
+        service.on_message(SCAN, scan(number * PERIOD_NS, POSE, ROOM))
+        service.on_message(BELIEF, belief(number * PERIOD_NS, POSE))
+    with capture_logs() as lines:
+        service.on_timer()
+    assert [line["event"] for line in lines] == ["stopping the robot"] * drives
+    assert service.counters["belief_timeouts"] == 1
 
 
 @pytest.mark.parametrize(("shape", "side"), [((30, 50), 1), ((600, 901), 2), ((9001, 3), 3)])
