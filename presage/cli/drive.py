@@ -138,7 +138,10 @@ def relocalise(
     yaw: Annotated[float | None, typer.Argument(parser=_number, help="Heading, deg. Defaults to any heading.")] = None,
     floor: Floor = "",
 ) -> None:
-    """Reset the estimator and localise again, near a given position or globally.
+    """Reset the estimator and localise again, near a given position or globally; print the state and pose found.
+
+    Waits up to 10 s for state tracking, and exits with status 1 without it. `presage echo belief -n 1` prints the
+    present belief.
 
     Examples: `presage relocalise`; `presage relocalise 3 1.5`; `presage relocalise 3 1.5 90`.
     """
@@ -149,7 +152,7 @@ def relocalise(
     if floor and x is None:
         raise UserError("--floor needs a position on the floor, X Y in m")
     pose = _pose(x, y, yaw or 0.0) if x is not None and y is not None else None
-    run(chosen_link(context), pose, console, heading_known=yaw is not None, floor=floor)
+    raise typer.Exit(run(chosen_link(context), pose, console, heading_known=yaw is not None, floor=floor))
 
 
 @app.command("save-map", rich_help_panel="Drive", short_help="Save the map that is being built.")

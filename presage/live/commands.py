@@ -15,7 +15,7 @@ from rich.table import Table
 from common.bus.bus import Link, wait_until
 from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
-from common.messages.definitions import Goal, Pose, Status
+from common.messages.definitions import Belief, Goal, Pose, Status
 from common.messages.requests import (
     LocaliseRequest,
     PoseRequest,
@@ -25,7 +25,18 @@ from common.messages.requests import (
     SaveModelReply,
     SaveModelRequest,
 )
-from common.messages.topics import GOAL, LOCALISE, QUERIES, SAVE_MAP, SAVE_MODEL, STATUS, TELEPORT, TOPICS, Topic
+from common.messages.topics import (
+    BELIEF,
+    GOAL,
+    LOCALISE,
+    QUERIES,
+    SAVE_MAP,
+    SAVE_MODEL,
+    STATUS,
+    TELEPORT,
+    TOPICS,
+    Topic,
+)
 from common.messages.wire import DecodeError, Message
 from presage.live.latest_messages import LatestMessages, session_bus
 from presage.terminal.progress import status_line
@@ -35,6 +46,7 @@ BLOCKED_TIMEOUT_S = 30.0
 # Without statuses from the controller: time until a note is printed, and until the command gives up.
 STATUS_WARNING_S, STATUS_TIMEOUT_S = 3.0, 30.0
 MIN_PROGRESS_M = 0.3  # a smaller decrease of the distance to the goal does not end a blockage
+LOCALISATION_TIMEOUT_S = 10.0  # preset paper takes 3 s
 DISCOVERY_TIMEOUT_S, SAVE_TIMEOUT_S = 3.0, 30.0  # a large map takes a while to save
 MAX_TEXT = 200  # characters; longer texts are shortened
 
@@ -239,18 +251,28 @@ def echo(link: Link, name: str, count: int, console: Console, *, full: bool) -> 
     return 0
 
 
-def relocalise(link: Link, pose: Pose | None, console: Console, *, heading_known: bool = True, floor: str = "") -> None:
-    """Resets the estimator's belief; the pose is in map, or in the frame of a floor.
+def relocalise(link: Link, pose: Pose | None, console: Console, *, heading_known: bool = True, floor: str = "") -> int:
+    """Resets the estimator's belief, and prints the state and pose that it finds; returns 0 if it is tracking, else 1.
 
-    Raises UserError with the reason if the estimator refuses.
+    ``pose`` is in map, or in the frame of a floor. Raises UserError if the estimator refuses, or publishes no belief.
     """
     with session_bus(link) as bus:
         reply = bus.query(LOCALISE, LocaliseRequest(pose=pose, heading_known=heading_known, map_id=floor), Reply)
-    if not reply.ok:
-        raise UserError(f"refused: {reply.reason}")
-    heading = f", {np.rad2deg(pose.yaw):g} deg" if pose and heading_known else ""
-    start = f"{_place(pose, floor)}{heading}" if pose else "the initial pose, or anywhere if none was given"
-    console.print(f"localising again from {start}")
+        if not reply.ok:
+            raise UserError(f"refused: {reply.reason}")
+        heading = f", {np.rad2deg(pose.yaw):g} deg" if pose and heading_known else ""
+        start = f"{_place(pose, floor)}{heading}" if pose else "the initial pose, or anywhere if none was given"
+        console.print(f"localising again from {start}")
+        messages = LatestMessages(bus, BELIEF)  # only now, so that no belief is from before
+        with console.status("waiting for state tracking"):
+            messages.wait_for(Belief, lambda belief: belief.state == "tracking", LOCALISATION_TIMEOUT_S)
+        belief = messages.latest.get(BELIEF.name)
+        if not isinstance(belief, Belief):
+            raise UserError(f"no belief came within {LOCALISATION_TIMEOUT_S:g} s: `presage doctor` finds the cause")
+    x, y, yaw = belief.pose.x, belief.pose.y, np.rad2deg(belief.pose.yaw)
+    late = "" if belief.state == "tracking" else f" after {LOCALISATION_TIMEOUT_S:g} s, most probably"
+    console.print(f"{belief.state}{late} at ({x:.3f}, {y:.3f}), {yaw:.1f} deg in the map", highlight=False)
+    return 0 if belief.state == "tracking" else 1
 
 
 def save_map(link: Link, name: str, console: Console) -> None:

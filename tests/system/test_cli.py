@@ -112,7 +112,7 @@ def test_tools_beside_a_session(presage, process, bus, link, monkeypatch):
         ("obstacle add crate 13 1.5", 2, "already an obstacle 'crate'"),
         ("obstacle remove crate", 0, ""),
         ("goal 0.1 0.1", 2, "the nearest place that can be reached is"),
-        ("relocalise 3.5 1.5", 0, ""),
+        ("relocalise 3.5 1.5", 0, "\ntracking at (3."),
         ("goal 4 1.5 90 --wait", 0, "reached"),
         ("goal --cancel", 0, ""),
         ("save-map here", 2, "no mapper is running"),
