@@ -57,6 +57,9 @@ def map_command(options: MapOptions, console: Console, progress: Console) -> Pat
     scans.print_notes(progress)
     stamps = scans.stamps
     if stamps is None:  # not needed for a map, but for a drive
+        trajectory = options.out.with_suffix(".tum")
+        note = f"the scans have no stamps: they are taken to be 1 s apart, also in {trajectory}"
+        progress.print(note, highlight=False, soft_wrap=True)
         stamps = np.arange(len(scans.ranges), dtype=np.float64)
     scans = replace(scans, stamps=stamps)
     _check_scan_count(len(scans), options)  # now, because the poses take a while

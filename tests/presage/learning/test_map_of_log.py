@@ -122,9 +122,10 @@ def test_mount_of_a_recording(tmp_path):
 def test_a_map_needs_no_stamps(log, tmp_path):
     with np.load(log) as arrays:
         np.savez(tmp_path / "bare.npz", **{name: values for name, values in arrays.items() if name != "stamps"})
-    bare = map_command(
-        MapOptions(tmp_path / "bare.npz", tmp_path / "bare.yaml", reading=HERE, poses="reference"), QUIET, QUIET
-    )
+    options = MapOptions(tmp_path / "bare.npz", tmp_path / "bare.yaml", reading=HERE, poses="reference")
+    notes = Console(file=io.StringIO())
+    bare = map_command(options, QUIET, notes)
+    assert "the scans have no stamps: they are taken to be 1 s apart, also in" in notes.file.getvalue()
     assert load_world(str(bare)).grid.values.tolist() == made(log, tmp_path).grid.values.tolist()
 
 
