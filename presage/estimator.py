@@ -53,7 +53,8 @@ class Estimator:
             preset: "precise", "paper", "particle-filter" or "amcl-defaults".
             scanner: a Scanner or its name in SCANNERS; only needed for plain arrays of ranges, and to predict before
                 the first scan.
-            mount: (3,) pose of the laser in base_link, m, m, rad; replaces the one that scanner or scans state.
+            mount: (3,) pose of the laser in base_link, m, m, rad; replaces the one that scanner or scans state. Most
+                of SCANNERS state (0.2, 0, 0).
             model: for preset "precise": "learned", "exact" (rays cast in the world), a file of weights, or any object
                 with the methods of GenerativeModel.
             models: folder of weights; defaults to the shipped ones.
