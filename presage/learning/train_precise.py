@@ -186,4 +186,4 @@ def _draw(model: FieldModel, card: weights.FieldCard, png: Path) -> None:
         title=f"{card.world.name}: learned distance (m) to the nearest surface, and its zero",
     )
     figure.colorbar(image, ax=axes, shrink=0.8)
-    figure.savefig(png, dpi=120)
+    figure.savefig(png, dpi=120, bbox_inches="tight")  # else the title of a narrow world is cut off
