@@ -17,7 +17,7 @@ from presage.terminal.options import (
     console,
     err_console,
 )
-from presage.terminal.output import make_folder
+from presage.terminal.output import output_folder
 
 app = typer.Typer()
 
@@ -82,24 +82,24 @@ def train(
         raise UserError("--from trains preset precise only: the paper's decoder needs scans taken at one heading")
     folder, seed = out or training_folder(), seed or 0
     tuning = load_section(TrainSettings, config, "train")
-    if drive is not None:
-        make_folder(folder)
-        reading = load_section(LogSettings, config, "log", mount=mount).reading()
-        recipe = Recipe(tuning.resolution or 0.05, seed=seed)
-        train_from_drive(
-            TrainDriveOptions(drive, world, folder, samples or 2000, recipe, tuning.share, reading), console
-        )
-        return
-    simulator = arguments(config=config, scanner=scanner, mount=mount, beams=beams)
-    settings = load_settings(SimulatorSettings, simulator)
-    world, chosen, link = world or settings.world, settings.build_scanner(), link_of(settings.connect, settings.robot)
-    make_folder(folder)
-    if preset == "precise":
-        recipe = Recipe(tuning.resolution or 0.04, seed=seed)
-        precise.train_precise(
-            precise.TrainPreciseOptions(world, chosen, tuple(simulator), folder, samples, recipe), link, console
-        )
-    else:
+    with output_folder(folder):
+        if drive is not None:
+            reading = load_section(LogSettings, config, "log", mount=mount).reading()
+            recipe = Recipe(tuning.resolution or 0.05, seed=seed)
+            train_from_drive(
+                TrainDriveOptions(drive, world, folder, samples or 2000, recipe, tuning.share, reading), console
+            )
+            return
+        simulator = arguments(config=config, scanner=scanner, mount=mount, beams=beams)
+        settings = load_settings(SimulatorSettings, simulator)
+        chosen, link = settings.build_scanner(), link_of(settings.connect, settings.robot)
+        world = world or settings.world
+        if preset == "precise":
+            recipe = Recipe(tuning.resolution or 0.04, seed=seed)
+            precise.train_precise(
+                precise.TrainPreciseOptions(world, chosen, tuple(simulator), folder, samples, recipe), link, console
+            )
+            return
         from presage.learning import train_paper as paper  # imports torch, which need not be installed
         from services.estimator.paper.training import TrainingParameters
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +38,17 @@ def make_folder(folder: Path) -> None:
         raise UserError(
             f"{folder}: cannot be written to ({error.strerror}); choose another folder with --out"
         ) from None
+
+
+@contextmanager
+def output_folder(folder: Path) -> Iterator[None]:
+    """`make_folder` for the block; removes the folder if the block, perhaps interrupted, leaves it empty."""
+    make_folder(folder)
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # it is not empty
+            folder.rmdir()
 
 
 def write_json(file: Path | None, data: dict[str, Any]) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from common.errors import UserError
-from presage.terminal.output import check_file, make_folder
+from presage.terminal.output import check_file, make_folder, output_folder
 
 
 def test_checks_leave_no_trace(tmp_path):
@@ -20,6 +20,19 @@ def test_checks_leave_no_trace(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "old", "pipe"]
     assert (tmp_path / "old").read_text() == "old"
     assert not list((tmp_path / "a" / "b").iterdir())
+
+
+def test_interruption_leaves_no_empty_folder(tmp_path):
+    def interrupted(name, *files):
+        with output_folder(tmp_path / name):
+            for file in files:
+                (tmp_path / name / file).touch()
+            raise KeyboardInterrupt
+
+    for files in ((), ("kept",)):
+        with pytest.raises(KeyboardInterrupt):
+            interrupted(f"{len(files)} files", *files)
+    assert [path.name for path in tmp_path.iterdir()] == ["1 files"]
 
 
 @pytest.mark.parametrize("name", ["missing/x.json", "file/x.json", "."])
