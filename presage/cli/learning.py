@@ -99,15 +99,19 @@ def train(
             precise.train_precise(
                 precise.TrainPreciseOptions(world, chosen, tuple(simulator), folder, samples, recipe), link, console
             )
-            return
-        from presage.learning import train_paper as paper  # imports torch, which need not be installed
-        from services.estimator.paper.training import TrainingParameters
+        else:
+            from presage.learning import train_paper as paper  # imports torch, which need not be installed
+            from services.estimator.paper.training import TrainingParameters
 
-        parameters = TrainingParameters(tuning.epochs, tuning.batch, tuning.learning_rate, seed)
-        options = paper.TrainPaperOptions(
-            world, preset, chosen, tuple(simulator), folder, samples or 13_000, parameters
-        )
-        paper.train(options, link, console)
+            parameters = TrainingParameters(tuning.epochs, tuning.batch, tuning.learning_rate, seed)
+            options = paper.TrainPaperOptions(
+                world, preset, chosen, tuple(simulator), folder, samples or 13_000, parameters
+            )
+            paper.train(options, link, console)
+    # Without --scanner, `presage up` would simulate the default one; without --model, it looks in the default folder.
+    estimator = "" if preset == "precise" else preset
+    use = ["presage", "up", *arguments(world=world, estimator=estimator, model=out, scanner=scanner, config=config)]
+    console.print("use it with:", *use, highlight=False, soft_wrap=True)
 
 
 @app.command("map", rich_help_panel="Learn", short_help="Build a ROS map from a drive.")

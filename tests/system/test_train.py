@@ -56,6 +56,8 @@ def assert_used(preset, process, bus, world, tmp_path):
 def test_precise_with_own_simulator(process, bus, world, train, tmp_path):
     training = train("precise", 300)
     assert training.wait(120) == 0, training.output
+    use = f"use it with: presage up --world={world} --model={tmp_path / 'models'} --config={tmp_path / 'train.yaml'}"
+    assert training.output.splitlines()[-1] == use
     process("simulator", "--world", world, "--beams", "61")
     assert_used("precise", process, bus, world, tmp_path)
 
