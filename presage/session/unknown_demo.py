@@ -27,6 +27,7 @@ from common.messages.requests import PoseRequest, Reply
 from common.messages.topics import BELIEF, GOAL, MAP, STATUS, TELEPORT, TRUTH
 from common.versions import commit
 from presage.live.latest_messages import LatestMessages
+from presage.recordings.session_figure import draw_session
 from presage.session.demo import DemoOptions, check_recorded, new_recording
 from presage.session.page import show_page_link
 from presage.session.running_sessions import announced, credentials_for
@@ -295,14 +296,18 @@ def run_unknown_demo(demo: DemoOptions, stack: Stack, console: Console) -> tuple
 
 
 def unknown_demo_command(demo: DemoOptions, json_file: Path | None) -> int:
-    """Runs the demo and prints how it ended; returns status 1 if a step failed."""
+    """Runs the demo, draws its figure and prints how it ended; returns status 1 if a step failed."""
     if demo.goal is not None or demo.estimator:
         raise UserError("--unknown chooses the goal itself, and runs no estimator: leave out --goal and --estimator")
     check_file(json_file, "--json")
     console = Console(width=None if sys.stdout.isatty() else 150)
     with Stack("robot", quiet=demo.quiet, security=credentials_for("robot")) as stack:
         recording, observer, failure = run_unknown_demo(demo, stack, console)
-    console.print(f"contacts: {observer.contacts}; recording: {recording}", soft_wrap=True, highlight=False)
+    figure = recording.with_suffix(".png")
+    with console.status("drawing"):
+        draw_session(recording, figure)
+    files = f"recording: {recording}; figure: {figure}"
+    console.print(f"contacts: {observer.contacts}; {files}", soft_wrap=True, highlight=False)
     numbers = {
         "world": observer.world.name,
         "steps": [asdict(step) for step in observer.steps],
