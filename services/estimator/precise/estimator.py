@@ -170,7 +170,9 @@ class PreciseEstimator:
         match = self._match_map(view, motions, period, with_odometry=odom is not None)
         # Local map
         if view.surface_evidence(match.poses).explained[0] < self.settings.min_explained_share:
-            match = self._match_local_map(view, match, self._predict_local_motion(period, odom, observation.command))
+            match = self._match_local_map(
+                view, match, self._predict_local_motion(period, odom, observation.command), motions[0][-1].covariance
+            )
         if observation.time_increment and any(each.excess(match.poses[0]) == 0 for each in motions[0][:-1]):
             # Only if the match is one of the predicted motions: otherwise the robot may have been carried to another
             # place, and may have stood still during the scan.
@@ -291,18 +293,18 @@ class PreciseEstimator:
                 poses, evidence = wider_poses, wider_evidence
         return ScanMatch(motions, poses, evidence)
 
-    def _match_local_map(self, view: View, match: ScanMatch, motions: list[MotionCandidate]) -> ScanMatch:
+    def _match_local_map(self, view: View, match: ScanMatch, motions: list[MotionCandidate], prior: Array) -> ScanMatch:
         """Matches the scan to the map again, near the motion that scan matching to the local map gives.
 
         ``motions`` are predicted in the local frame, so that an error of the pose in the map does not bias them; the
-        pose that fits the map is only a further start. Returns ``match`` unchanged if the local map gives no motion, or
-        if the scan fits the map far better there.
+        pose that fits the map is only a further start; ``prior`` (3, 3) is the covariance of the predicted pose in map.
+        Returns ``match`` unchanged if the local map gives no motion, or if the scan fits the map far better there.
         """
         starts = np.array([*(each.mean for each in motions), self._local_map.to_local(match.poses[0])])
         found = self._local_map.match(starts, view, motions[-1])
         if found is None:
             return match
-        moved = self._local_map.candidate(found)
+        moved = self._local_map.candidate(found, prior)
         # All hypotheses share the relative motion.
         step = se2.between(self.modes[0].pose, moved.mean)
         moves = [replace(moved, mean=se2.compose(mode.pose, step)) for mode in self.modes]

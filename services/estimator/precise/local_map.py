@@ -1,7 +1,7 @@
 """The local map: the last key scans, in the local frame.
 
-Point-to-line scan matching (Censi, ICRA 2008), to several scans instead of one, so that the error does not grow with
-every scan. It gives the motion where the map does not show the surroundings.
+A scan is matched to several scans instead of one, so that the error does not grow with every scan. This gives the
+motion where the map does not show the surroundings.
 """
 
 from __future__ import annotations
@@ -16,25 +16,19 @@ from scipy.spatial import cKDTree
 
 from common.geometry import se2
 from common.geometry.se2 import Array
-from services.estimator.precise.gauss_newton import View, position_information
+from services.estimator.precise.gauss_newton import View
 from services.estimator.precise.motion_model import MotionCandidate
 from services.estimator.precise.scan_surfaces import MIN_BEAMS
+from services.estimator.precise.surface_points import MIN_POINTS, Match, SurfacePoints, place_points
 
 MAX_SCANS = 12  # in the local map
 MIN_DISTANCE_M, MIN_TURN_RAD = 0.25, 0.35  # a key scan is taken after a motion of either size
-CELL_M = 0.05  # points within one cell are averaged
-NEIGHBOURS, NEIGHBOUR_RADIUS_M = 10, 0.3  # points from which the normal of a surface is estimated
-# Largest distance to a point's partner, iteration by iteration.
-PARTNER_RADII_M = (0.6, 0.6, 0.4, 0.4, 0.2, 0.2, 0.1, 0.1, 0.1, 0.1)
-CAUCHY_SCALE_M = 0.02  # of the Cauchy weight of a point by its distance from the line
-MATCHED_RADIUS_M = 0.08  # a point is matched if it is this near to one of the local map
 # A point is on a surface seen before if it is this near to a point of the local map, since neighbouring beams are so
 # far apart on a distant surface, ...
 SEEN_RADIUS_M = 0.15
 # ... and this near to the line through that point, if there are enough neighbours for a line. Three standard deviations
 # of the noise are added in quadrature. A wider tolerance takes much of another room for this one.
 SEEN_ACROSS_M = 0.05
-MIN_POINTS = 20  # of a scan that must have a partner in the local map
 MAX_SQUARED_DISTANCE = 4.0  # squared standard deviations of the result from the prior
 CHANGE_MEMORY_S = 30.0  # after which a change of the surroundings counts by 1 / e (a guess)
 PASSED_M = 0.3  # a beam that is longer by this than the distance to a surface has passed through it
@@ -42,18 +36,6 @@ MIN_MATCHED_FRACTION = 0.5  # of a scan's points, else there is no match
 CLEAR_MATCHED_FRACTION = 0.8  # if fewer match, matching is repeated from `EXTRA_HEADINGS_RAD`
 EXTRA_HEADINGS_RAD = np.array([-0.3, -0.15, 0.15, 0.3])
 DRIFT_PER_SCAN = np.array([0.02, 0.02, 0.005])  # m, m, rad: standard deviation that each key scan contributes
-MIN_MATCH_INFORMATION_RATIO = 0.02  # a direction is unobserved if its information, divided by that across it, is less
-
-
-@dataclass(frozen=True)
-class Match:
-    """Pose of a scan in the local map."""
-
-    pose: Array  # (3,) base_link in the local frame
-    covariance: Array  # (3, 3) of x, y, yaw, relative to the key scans
-    matched_fraction: float  # of the scan's points
-    score: float  # mean weight of the scan's points, higher for closer matches
-    degenerate: bool  # the points have almost no information along some direction
 
 
 @dataclass(frozen=True)
@@ -66,7 +48,7 @@ class LocalScan:
     @property
     def points(self) -> Array:
         """End points (K, 2) of the beams that returned, m in the local frame."""
-        return se2.transform(se2.compose(self.pose, self.view.mount), self.view.points)
+        return place_points(self.view, self.pose)
 
 
 @dataclass(frozen=True)
@@ -117,15 +99,13 @@ class LocalMap:
     frame: Array = field(default_factory=lambda: np.zeros(3))  # (3,) local frame in map
     # (3, 3) of the pose in map at the last key scan, with the drift that this scan contributes
     covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
-    _tree: cKDTree | None = None
+    _points: SurfacePoints | None = None
     _unmapped: cKDTree | None = None  # of the points that are not on surfaces of the map
-    _points: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    _normals: Array | None = None
 
     def clear(self) -> None:
         """Removes all scans."""
         self.scans.clear()
-        self._tree = self._unmapped = None
+        self._points = self._unmapped = None
 
     def to_local(self, pose: Array) -> Array:
         """A pose (3,) in map, in the local frame."""
@@ -144,7 +124,7 @@ class LocalMap:
         self.scans.append(key)
         self.place(key.pose, pose)
         self.covariance = covariance + np.diag(DRIFT_PER_SCAN**2)
-        self._tree = self._unmapped = None
+        self._points = self._unmapped = None
 
     def find_seen_and_appeared(
         self, local: Array, view: View, mapped: npt.NDArray[np.bool_]
@@ -157,11 +137,11 @@ class LocalMap:
         - Appeared: they end where a key scan saw free space, so the surface came since then, wherever the robot is.
         """
         seen, appeared = np.zeros(len(view.ranges), np.bool_), np.zeros(len(view.ranges), np.bool_)
-        if not self.scans or not len(self._tree_of_points().data):
+        if not any(len(each.view.points) for each in self.scans):
             return seen, appeared
         placed = LocalScan(local, view).points
         noise = view.likelihood.deviation(view.ranges[view.returned])
-        near = self._is_on_surface(placed, np.hypot(SEEN_ACROSS_M, 3 * noise))
+        near = self._surface_points().find_near(placed, SEEN_RADIUS_M, np.hypot(SEEN_ACROSS_M, 3 * noise))
         free = np.zeros(len(near), np.bool_)
         free[~near] = self._in_free_space(placed[~near])
         appeared[view.returned] = free
@@ -171,16 +151,6 @@ class LocalMap:
         seen[:] = ~view.returned
         seen[view.returned] = near
         return seen, appeared
-
-    def _is_on_surface(self, points: Array, tolerance: Array) -> npt.NDArray[np.bool_]:
-        """Mask (K,) of local points (K, 2) m within ``tolerance`` (K,) m of the line through a point of a key scan."""
-        normals = self._normals_of_points()
-        distance, nearest = self._tree_of_points().query(points, distance_upper_bound=SEEN_RADIUS_M)
-        near = np.isfinite(distance)
-        off = points[near] - self._points[nearest[near]]
-        across = np.full(len(points), np.inf)
-        across[near] = np.abs(np.einsum("ni,ni->n", normals[nearest[near]], off))
-        return np.asarray(across < tolerance)
 
     def _in_free_space(self, points: Array) -> npt.NDArray[np.bool_]:
         """Mask (K,) of local points (K, 2) in m that a beam of a key scan passed."""
@@ -205,27 +175,30 @@ class LocalMap:
                 found = again
         return None if found is None or found.matched_fraction < MIN_MATCHED_FRACTION or found.degenerate else found
 
-    def candidate(self, match: Match) -> MotionCandidate:
-        """The pose in map that a match gives."""
+    def candidate(self, match: Match, prior: Array) -> MotionCandidate:
+        """The pose in map that a match gives; ``prior`` (3, 3) is the pose's covariance in map before the match."""
         turn = se2.rotation(float(self.frame[2]))
-        covariance = self.covariance + turn @ match.covariance @ turn.T
-        return MotionCandidate(se2.compose(self.frame, match.pose), covariance, 1.0)
+        # If the surfaces have moved instead of the robot, its motion since the last key scan is wrong.
+        motion = se2.difference(match.pose, self.scans[-1].pose)
+        covariance = match.covariance(turn.T @ prior @ turn + np.outer(motion, motion))
+        return MotionCandidate(se2.compose(self.frame, match.pose), self.covariance + turn @ covariance @ turn.T, 1.0)
 
     def _best_match(self, starts: Array, view: View, prior: MotionCandidate) -> Match | None:
-        information = np.asarray(np.linalg.inv(prior.covariance), float)
-        found = [self._register(start, view, prior.mean, information) for start in starts]
+        points = self._surface_points()
+        found = [points.match(start, view, prior) for start in starts]
         plausible = [
             each for each in found if each is not None and prior.squared_distance(each.pose) < MAX_SQUARED_DISTANCE
         ]
         return max(plausible, key=lambda each: each.score, default=None)
 
-    def _tree_of_points(self) -> cKDTree:
-        """Index of the points of all scans; kept until the scans change."""
-        if self._tree is None:
-            self._points = _average_in_cells(np.concatenate([each.points for each in self.scans]))
-            self._normals = None
-            self._tree = cKDTree(self._points)
-        return self._tree
+    def _surface_points(self) -> SurfacePoints:
+        """The points of all scans; kept until the scans change."""
+        if self._points is None:
+            points = np.concatenate([each.points for each in self.scans])
+            self._points = SurfacePoints.of(
+                points, np.concatenate([each.mapped[each.view.returned] for each in self.scans])
+            )
+        return self._points
 
     def _tree_of_unmapped_points(self) -> cKDTree:
         """Index of the points of all scans that are not on surfaces of the map; kept until the scans change."""
@@ -233,52 +206,6 @@ class LocalMap:
             unmapped = [each.points[~each.mapped[each.view.returned]] for each in self.scans]
             self._unmapped = cKDTree(np.concatenate(unmapped))
         return self._unmapped
-
-    def _normals_of_points(self) -> Array:
-        """Normals (K, 2) of the surfaces at all points; 0 where there are too few neighbours."""
-        if self._normals is None:
-            _, neighbour = self._tree_of_points().query(
-                self._points, NEIGHBOURS, distance_upper_bound=NEIGHBOUR_RADIUS_M
-            )
-            exists = neighbour < len(self._points)
-            around = self._points[np.where(exists, neighbour, np.arange(len(neighbour))[:, None])]
-            off = around - around.mean(axis=1, keepdims=True)
-            _, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", off, off))
-            self._normals = np.asarray(vectors[:, :, 0] * (exists.sum(axis=1) > 2)[:, None])
-        return self._normals
-
-    def _register(self, start: Array, view: View, mean: Array, information: Array) -> Match | None:
-        """Registers a scan by iteratively reweighted Gauss-Newton, with a Gaussian prior.
-
-        Returns None if too few points have a partner.
-        """
-        tree, normals = self._tree_of_points(), self._normals_of_points()
-        pose = np.array(start)
-        for radius in PARTNER_RADII_M:
-            placed = LocalScan(pose, view).points
-            distance, partner = tree.query(placed, distance_upper_bound=radius)
-            paired = np.isfinite(distance)
-            if paired.sum() < MIN_POINTS:
-                return None
-            normal, target = normals[partner[paired]], self._points[partner[paired]]
-            error = np.einsum("ni,ni->n", normal, placed[paired] - target)
-            arm = placed[paired] - pose[:2]
-            J = np.column_stack([normal, normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]])
-            weight = 1 / (1 + (error / CAUCHY_SCALE_M) ** 2)
-            H = (J.T * weight) @ J
-            to_prior = se2.difference(mean, pose)
-            step = np.linalg.solve(
-                H + CAUCHY_SCALE_M**2 * information,
-                CAUCHY_SCALE_M**2 * information @ to_prior - (J.T * weight) @ error,
-            )
-            pose = pose + step
-            pose[2] = se2.wrap(pose[2])
-        placed = LocalScan(pose, view).points
-        distance, partner = tree.query(placed)
-        error = np.einsum("ni,ni->n", normals[partner], placed - self._points[partner])
-        score = ((distance < 2 * MATCHED_RADIUS_M) / (1 + (error / CAUCHY_SCALE_M) ** 2)).mean()
-        covariance = np.asarray(CAUCHY_SCALE_M**2 * np.linalg.inv(H + 1e-6 * np.eye(3)), float)
-        return Match(pose, covariance, float((distance < MATCHED_RADIUS_M).mean()), float(score), _is_degenerate(H))
 
 
 def count_changes(last: LocalScan, now: LocalScan) -> int:
@@ -298,22 +225,6 @@ def is_key_pose(last: Array, pose: Array) -> bool:
     """Whether ``pose`` (3,) is so far from that of the ``last`` (3,) key scan that a key scan is due there."""
     motion = se2.between(last, pose)
     return bool(np.hypot(motion[0], motion[1]) >= MIN_DISTANCE_M or abs(motion[2]) >= MIN_TURN_RAD)
-
-
-def _average_in_cells(points: Array) -> Array:
-    """Replaces points (K, 2) by their mean in every cell of `CELL_M`.
-
-    The means are less noisy, and the neighbours used for a normal lie farther apart than the noise.
-    """
-    column, row = np.floor(points / CELL_M).astype(np.int64).T
-    _, cell = np.unique(column * 2**32 + row, return_inverse=True)
-    count = np.bincount(cell)
-    return np.stack([np.bincount(cell, points[:, k]) / count for k in (0, 1)], axis=-1)
-
-
-def _is_degenerate(H: Array) -> bool:
-    low, high = np.linalg.eigvalsh(position_information(H))
-    return bool(low < MIN_MATCH_INFORMATION_RATIO * high)
 
 
 def _passed(scan: LocalScan, points: Array, distance: float) -> npt.NDArray[np.bool_]:

@@ -70,7 +70,7 @@ def test_match_in_any_frame(offset, frame, seed):
     assert match is not None
     assert not match.degenerate
     assert match.matched_fraction > 0.7
-    off = se2.between(there, made.candidate(match).mean)
+    off = se2.between(there, made.candidate(match, STEP).mean)
     assert np.hypot(off[0], off[1]) < 0.02
     assert abs(off[2]) < 0.01
 
@@ -82,7 +82,7 @@ def test_covariance_turns_with_the_frame():
     for yaw in (0.0, 1.2):
         made = local_map(scene, HERE, frame=(1.0, 2.0, yaw))
         match = match_near(made, HERE, scan)
-        found.append(made.candidate(match).covariance)
+        found.append(made.candidate(match, STEP).covariance)
     assert found[0] == pytest.approx(found[1], rel=0.1, abs=3e-7)
 
 
