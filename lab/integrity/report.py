@@ -18,12 +18,12 @@ from presage.plotting.style import BOUND, COLOURS, GOAL, figure_of, legend_below
 from presage.terminal.output import make_folder
 
 ESTIMATORS = ("precise", "particle-filter", RECOVERING_FILTER, "amcl-defaults")
-HEADS = ("`tracking` %", "wrong of these %; longest", "correct %", "error (mm)", "NEES")  # of each estimator
+HEADS = ("`tracking` %", "wrong of these %; longest; in drives", "correct %", "error (mm)", "NEES")  # of each estimator
 SHORT_COLUMNS = 3  # of these, in a table of more than two estimators
 LEGEND = """*Tracking*: share of the scans that are reported as `tracking`. *Wrong*: share of these with an error above
-0.2 m or 5°, with Wilson's 95 % interval (too narrow, because scans of one trial depend on each other), or its upper
-bound if none was wrong. *Longest*: wrong stretch. *Correct*: scans within 0.2 m and 5°, in any state. *Error*:
-median/RMS of correct scans. *NEES*: mean of x, y and heading where `tracking`; 3 is ideal. The JSON has more."""
+0.2 m or 5°; the longest wrong stretch; the number of drives with a wrong scan. *Correct*: scans within 0.2 m and 5°,
+in any state. *Error*: median/RMS of correct scans. *NEES*: mean of x, y and heading where `tracking`; 3 is ideal. The
+JSON has intervals and more."""
 
 
 def bench_integrity(plan: IntegrityPlan, out: Path, workers: int, console: Console) -> int:
@@ -90,14 +90,11 @@ def _percent(share: dict[str, Any] | None) -> str:
 
 
 def _wrong(row: dict[str, Any]) -> str:
-    """Share of the `tracking` scans that are wrong, and the longest wrong stretch; an upper bound if there are none."""
-    wrong = row["wrong"]
-    if wrong is None:
-        return "–"
-    low, high = (100 * bound for bound in wrong["interval_95"])
-    if not wrong["count"]:
-        return f"0 (≤ {high:.2g})"
-    return f"{_percent(wrong)} ({low:.3g} to {high:.3g}); {row['longest_wrong_s']:.1f} s"
+    """Share of the `tracking` scans that are wrong, the longest wrong stretch, and in how many drives there is one."""
+    wrong, drives = row["wrong"], row["trials_wrong"]
+    if wrong is None or not wrong["count"]:
+        return _percent(wrong)
+    return f"{_percent(wrong)}; {row['longest_wrong_s']:.1f} s; {drives['count']} of {drives['of']}"
 
 
 def _short(value: float | None) -> str:

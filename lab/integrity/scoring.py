@@ -13,7 +13,7 @@ import numpy.typing as npt
 from common.geometry import se2
 from common.geometry.se2 import Array
 from lab.accuracy.tasks import FOUND_DISTANCE, FOUND_YAW
-from lab.statistics import wilson_interval
+from lab.statistics import bootstrap_interval, wilson_interval
 from services.estimator.shared.interface import Posterior
 
 Mask = npt.NDArray[np.bool_]
@@ -21,6 +21,7 @@ Mask = npt.NDArray[np.bool_]
 MAX_NEES = 1e6  # of a degenerate covariance
 RECOVERY_SCANS = 20  # after a kidnapping, until the robot must be found
 MAX_WRONG_S = 1.0  # a longer wrong stretch fails a trial
+MIN_BUILDINGS = 10  # for an interval of a share of scans; fewer say too little about how buildings differ
 # Edges of the bins of reported probability; the last bins matter for safety.
 PROBABILITY_EDGES = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.99, 0.999, 0.9999, 1.0)
 
@@ -106,6 +107,7 @@ def score_trial(scans: Estimates, rate: float, kidnappings: Sequence[int], *, se
     return {
         "scans": len(scans.tracking),
         "tracking": int(scans.tracking.sum()),
+        "in_map": int(np.isfinite(scans.error[:, 0]).sum()),
         "correct": int(scans.correct.sum()),
         "wrong": int(scans.wrong.sum()),
         "longest_wrong_s": longest / rate,
@@ -121,41 +123,65 @@ def longest_run(values: Mask) -> int:
 
 
 def score_case(trials: Sequence[dict[str, Any]], scans: Estimates) -> dict[str, Any]:
-    """Scores of a case, from those of its trials and from all their scans. Shares have Wilson's 95 % interval."""
-    count, tracking, correct, wrong, kidnapped, recovered = (
-        sum(trial[name] for trial in trials)
-        for name in ("scans", "tracking", "correct", "wrong", "kidnapped", "recovered")
-    )
+    """Scores of a case, from those of its trials and from all their scans, with 95 % intervals.
+
+    Scans of one building depend on each other, so the intervals of shares of scans are by building.
+    """
     longest = [trial["longest_wrong_s"] for trial in trials]
     distance = np.hypot(scans.error[:, 0], scans.error[:, 1])[scans.correct]
-    in_map = int(np.isfinite(scans.error[:, 0]).sum())
     return {
         "trials": len(trials),
-        "scans": count,
-        "tracking": share(tracking, count),
-        "wrong": share(wrong, tracking),
+        "scans": sum(trial["scans"] for trial in trials),
+        "tracking": share_of_scans(trials, "tracking", "scans"),
+        "wrong": share_of_scans(trials, "wrong", "tracking"),
         "longest_wrong_s": max(longest),
+        "trials_wrong": share(sum(trial["wrong"] > 0 for trial in trials), len(trials)),
         "trials_wrong_longer": sum(value > MAX_WRONG_S for value in longest),
-        "correct": share(correct, in_map),
+        "correct": share_of_scans(trials, "correct", "in_map"),
         "nees_xy": _mean(scans.nees[scans.tracking, 0]),
         "nees_xy_median": _median(scans.nees[scans.tracking, 0]),
         "nees": _mean(scans.nees[scans.tracking, 1]),
         "error_median_m": _median(distance),
         "error_rms_m": float(np.sqrt(np.mean(distance**2))) if len(distance) else None,
-        "recovered": share(recovered, kidnapped),
+        "recovered": share(sum(trial["recovered"] for trial in trials), sum(trial["kidnapped"] for trial in trials)),
         "beyond_protection": [_mean((axis > 1)[np.isfinite(axis)]) for axis in scans.excess.T],
         "reliability": reliability(scans.probability, scans.correct),
         "update_ms": [1e3 * float(np.quantile(scans.update_s, q)) for q in (0.5, 0.95, 1.0)],
     }
 
 
+def share_of_scans(trials: Sequence[dict[str, Any]], name: str, of_name: str) -> dict[str, Any] | None:
+    """``count``, ``of`` and 95 % interval of a share of the scans of all trials; None if ``of`` is 0.
+
+    The interval is a bootstrap by building: None for fewer than `MIN_BUILDINGS`, or if all or none are counted.
+    """
+    buildings = list(dict.fromkeys(trial["seed"] for trial in trials))
+    counts = [
+        np.sum([(trial[name], trial[of_name]) for trial in trials if trial["seed"] == building], axis=0)[None]
+        for building in buildings
+    ]
+    count, of = map(int, np.sum(counts, axis=0)[0])
+    if not of:
+        return None
+    known = len(buildings) >= MIN_BUILDINGS and 0 < count < of
+    return {"count": count, "of": of, "interval_95": bootstrap_interval(counts, _ratio_of_sums) if known else None}
+
+
+def _ratio_of_sums(counts: Array) -> float:
+    count, of = counts.sum(axis=0)
+    return float(count / of) if of else 0.0
+
+
 def share(count: int, of: int) -> dict[str, Any] | None:
-    """``count``, ``of`` and Wilson's interval; None if ``of`` is 0."""
+    """``count``, ``of`` and Wilson's interval, for independent events; None if ``of`` is 0."""
     return {"count": count, "of": of, "interval_95": wilson_interval(count, of)} if of else None
 
 
 def reliability(probability: Array, correct: Mask) -> list[dict[str, Any]]:
-    """For each bin of reported probability that has scans: the mean of it, and how many of the scans were correct."""
+    """For each bin of reported probability that has scans: the mean of it, and how many of the scans were correct.
+
+    The intervals are as if the scans were independent.
+    """
     reported = np.isfinite(probability)
     probability, correct = probability[reported], correct[reported]
     index = np.clip(np.searchsorted(PROBABILITY_EDGES, probability, side="right") - 1, 0, len(PROBABILITY_EDGES) - 2)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lab.integrity.report import reliability_diagram, table
-from lab.integrity.scoring import Estimates, longest_run, reliability, score_case, score_trial
+from lab.integrity.scoring import Estimates, longest_run, reliability, score_case, score_trial, share_of_scans
 from services.estimator.shared.interface import Hypothesis, Posterior
 
 TRUTHS = np.tile([1.0, 2.0, np.pi - 0.01], (6, 1))
@@ -35,25 +35,35 @@ def test_correct_and_wrong(scans):
 
 def test_trial(scans):
     scores = score_trial(scans, 10.0, [1, 2], separate=False)
-    counts = {"scans": 6, "tracking": 4, "correct": 3, "wrong": 2, "kidnapped": 2, "recovered": 1}
+    counts = {"scans": 6, "in_map": 6, "tracking": 4, "correct": 3, "wrong": 2, "kidnapped": 2, "recovered": 1}
     assert scores == {**counts, "longest_wrong_s": 0.2}
     assert score_trial(scans, 10.0, [], separate=True)["longest_wrong_s"] == 0.1
 
 
 def test_case(scans):
-    trial = score_trial(scans, 1.0, [], separate=False)
+    trial = {"seed": 1, **score_trial(scans, 1.0, [], separate=False)}
     row = score_case([trial, trial], Estimates.joined([scans, scans]))
-    assert (row["wrong"]["count"], row["wrong"]["of"]) == (4, 8)
+    assert row["wrong"] == {"count": 4, "of": 8, "interval_95": None}
+    assert (row["trials_wrong"]["count"], row["trials_wrong"]["of"]) == (2, 2)
     assert row["trials_wrong_longer"] == 2
     assert row["nees_xy"] == pytest.approx((0 + 1 + 9 + 9) / 4)
     assert row["error_median_m"] == 0
     assert row["recovered"] is None
-    assert "| 50 (21.5 to 78.5); 2.0 s |" in table({"precise": {"unchanged": row}})
+    assert "| 50; 2.0 s; 2 of 2 |" in table({"precise": {"unchanged": row}})
+
+
+def test_interval_of_a_share_is_by_building():
+    """All wrong scans are in one of twenty buildings, so the interval reaches from none to several times the share."""
+    trials = [{"seed": seed, "wrong": 100 * (seed == 0), "tracking": 1000} for seed in range(20)]
+    wrong = share_of_scans(trials, "wrong", "tracking")
+    assert (wrong["count"], wrong["of"]) == (100, 20000)
+    assert wrong["interval_95"] == pytest.approx([0, 0.015], abs=0.0051)
+    assert share_of_scans(trials[1:], "wrong", "tracking")["interval_95"] is None
 
 
 def test_robot_outside_the_map(scans):
     away = replace(scans, error=np.full((6, 3), np.nan), nees=np.full((6, 2), np.nan))
-    row = score_case([score_trial(away, 1.0, [], separate=False)], away)
+    row = score_case([{"seed": 1, **score_trial(away, 1.0, [], separate=False)}], away)
     assert row["correct"] is None
     assert row["wrong"]["count"] == row["wrong"]["of"] == 4
 
@@ -81,7 +91,7 @@ def test_protection_in_base_link():
     made = posterior(np.array([0.0, 0.05, np.pi / 2]), "tracking", probability=0.99, protection=protection)
     scans = Estimates.of([made], facing_left[None], [0.001])
     assert scans.excess[0] == pytest.approx([0.5, 0.0, 0.0])
-    row = score_case([score_trial(scans, 1.0, [], separate=False)], scans)
+    row = score_case([{"seed": 1, **score_trial(scans, 1.0, [], separate=False)}], scans)
     assert row["beyond_protection"] == [0.0, 0.0, 0.0]
     assert reliability_diagram({"precise": {"all": row}}) is not None
 
