@@ -38,23 +38,22 @@ class Match:
     matched_fraction: float  # of the scan's points
     score: float  # mean weight of the scan's points, higher for closer matches
     degenerate: bool  # the points have almost no information along some direction
-    # Of the points on surfaces of the map alone:
+    # Of the points on surfaces of the map alone, without what errors of the lines' directions add:
     fixed_information: Array  # (3, 3)
     fixed_step: Array  # (3,) to the pose that fits them best
-    movable_surfaces: int  # those that the map lacks, and that show the direction of which the fixed ones say least
+    movable_surfaces: int  # those that the map lacks, and that show the direction of which the fixed points say least
 
     def covariance(self, if_moved: Array) -> Array:
         """Covariance (3, 3) of the pose.
 
         A mixture: if all movable surfaces have moved, only the fixed ones show the pose, besides its covariance
-        ``if_moved`` (3, 3) without any match.
+        ``if_moved`` (3, 3) without any match. That is certain if no surface shows the direction.
         """
-        covariance = np.asarray(np.linalg.inv(self.information + 1e-6 / CAUCHY_SCALE_M**2 * np.eye(3)), float)
-        if not self.movable_surfaces:
-            return covariance
+        covariance = np.linalg.inv(self.information + 1e-6 / CAUCHY_SCALE_M**2 * np.eye(3))
         by_fixed = np.linalg.inv(self.fixed_information + np.linalg.inv(if_moved))
         squared_error = by_fixed + np.outer(self.fixed_step, self.fixed_step)
-        return np.asarray(covariance + MOVED_PROBABILITY**self.movable_surfaces * squared_error)
+        moved = MOVED_PROBABILITY**self.movable_surfaces
+        return np.asarray((1 - moved) * covariance + moved * squared_error)
 
 
 @dataclass(frozen=True)
@@ -112,17 +111,17 @@ class SurfacePoints:
         error = self._distance_from_line(placed, nearest)
         score = ((distance < 2 * MATCHED_RADIUS_M) / (1 + (error / CAUCHY_SCALE_M) ** 2)).mean()
         matched_fraction = float((distance < MATCHED_RADIUS_M).mean())
+        low, high = np.linalg.eigvalsh(position_information(H))
+        fixed = self.mapped[index]
+        of_fixed = (J[fixed].T * weight[fixed]) @ J[fixed]
+        pull = J[fixed].T @ (weight * self._distance_from_line(placed[paired], index))[fixed]
         # Errors of the lines' directions pass for information along them, as in a corridor. They are subtracted.
         along = _pose_derivative(self.normals[index] @ np.array([[0.0, 1.0], [-1.0, 0.0]]), arm)
         lost = weight * self.direction_variances[index]
-        low, high = np.linalg.eigvalsh(position_information(H - (along.T * lost) @ along))
-        fixed = self.mapped[index]
-        all_of_fixed = (J[fixed].T * weight[fixed]) @ J[fixed]
-        pull = J[fixed].T @ (weight * self._distance_from_line(placed[paired], index))[fixed]
-        fixed_H = all_of_fixed - (along[fixed].T * lost[fixed]) @ along[fixed]
-        values, vectors = np.linalg.eigh(fixed_H)
+        shown_by_fixed = of_fixed - (along[fixed].T * lost[fixed]) @ along[fixed]
+        values, vectors = np.linalg.eigh(shown_by_fixed)
         # Along the direction of which the fixed points say least
-        weakest = np.linalg.eigh(position_information(fixed_H + TIE_BREAK * H))[1][:, 0]
+        weakest = np.linalg.eigh(position_information(shown_by_fixed + TIE_BREAK * H))[1][:, 0]
         shown = weight * (J[:, :2] @ weakest) ** 2 - lost * (along[:, :2] @ weakest) ** 2
         surface = np.cumsum(view.surfaces.starts)[view.returned][paired]
         movable = np.bincount(surface[~fixed], shown[~fixed]) > MIN_INFORMATION_RATIO * high
@@ -133,8 +132,8 @@ class SurfacePoints:
             float(score),
             bool(low < MIN_INFORMATION_RATIO * high),
             (vectors * np.maximum(values, 0.0)) @ vectors.T / CAUCHY_SCALE_M**2,
-            -np.linalg.solve(all_of_fixed + weak, pull),
-            0 if fixed.all() else max(1, int(movable.sum())),
+            -np.linalg.solve(of_fixed + weak, pull),
+            int(movable.sum()),
         )
 
     def find_near(self, points: Array, radius: float, tolerance: Array) -> npt.NDArray[np.bool_]:
