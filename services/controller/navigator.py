@@ -135,15 +135,21 @@ class Navigator:
             goal = self.explorer.next_goal(
                 viewpoint, exploration_state.field_of_view.sector.half, under_way=self.goal_state.active
             )
-            if goal is not None:
+            if not self.explorer.active:  # it has failed, so the robot must not drive on to the last viewpoint
+                self._cancel_goal()
+            elif goal is not None:
                 self._set_goal(goal)
 
-    def _set_goal(self, goal: Goal) -> None:
+    def _cancel_goal(self) -> None:
         self._docking = self._ride = None
+        self.goal_state.cancel()
+        self.policy.set_goal(None)
+
+    def _set_goal(self, goal: Goal) -> None:
         if goal.cancel:
-            self.goal_state.cancel()
-            self.policy.set_goal(None)
+            self._cancel_goal()
             return
+        self._docking = self._ride = None
         try:
             goal = goal.in_map(self.world)
         except UserError as error:

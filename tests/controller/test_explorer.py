@@ -216,6 +216,17 @@ def test_no_room_at_the_start_fails():
     assert robot.step().state == "idle"
 
 
+def test_the_robot_stops_when_the_exploration_fails():
+    robot = exploring_robot()
+    robot.explore((8.0, 2.5))
+    robot.until(lambda _: robot.pose[0] > 3.0)
+    robot.use_map(map_with((3.0, 2.5, 0.0), connected=[0, 1]))  # without the start
+    robot.explore(None)
+    status = robot.until(lambda _: not robot.navigator._command.velocity.any())
+    assert (status.exploration.phase, status.state, status.refused) == ("failed", "blocked", True)
+    assert robot.pose[0] < 4.0
+
+
 def test_after_the_way_back_there_may_be_more_room():
     robot = exploring_robot()
     robot.explore((5.0, 2.5))
