@@ -54,8 +54,9 @@ class PlannedMap:
         return bool(np.hypot(*(new.poses[in_new] - old.poses[in_old])[:, :2].T).max(initial=0.0) > JUMP_M)
 
     def anchor(self, pose: Array) -> AnchoredPose:
-        """Anchors a pose (3,) in map to the last key scan, to which the mapper relates the robot's pose."""
-        return AnchoredPose(int(self.message.numbers[-1]), se2.between(self.message.poses[-1], pose))
+        """Anchors a pose (3,) in map to the nearest key scan, with which its surroundings move."""
+        nearest = int(np.argmin(np.hypot(*(self.message.poses - pose)[:, :2].T)))
+        return AnchoredPose(int(self.message.numbers[nearest]), se2.between(self.message.poses[nearest], pose))
 
     def locate(self, anchored: Sequence[AnchoredPose]) -> Array:
         """The poses (N, 3) in this version of the map, without those whose key scan is not connected to it."""

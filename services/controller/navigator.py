@@ -109,7 +109,12 @@ class Navigator:
             self._exploration_request = None
 
     def on_map(self, planned: PlannedMap) -> None:
-        """Uses a new version of the mapper's map for exploration; the caller passes it to the policy."""
+        """Uses a new version of the mapper's map for exploration, unless it has no key scans.
+
+        The caller passes it to the policy.
+        """
+        if not len(planned.message.poses):
+            return
         self._map = planned
         if self.explorer is not None:
             self.explorer.use_map(planned)

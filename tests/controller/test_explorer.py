@@ -101,6 +101,20 @@ def test_exploration_waits_for_the_first_map():
     assert robot.step().exploration is None
 
 
+def test_a_map_without_key_scans_is_no_map_to_explore():
+    robot = PerfectRobot(mapped=False)
+    robot.navigator.on_goal(goal(0, 0, explore=True, seq=5))
+    empty = PlannedMap.of(Map(stamp_ns=0, grid=GRID, poses=np.zeros((0, 3))), 0.27)
+    robot.use_map(empty)
+    assert robot.step().reason == "waiting for the mapper's first map"
+    robot.use_map(map_with(START))
+    robot.step()
+    robot.explore((3.0, 2.5))
+    robot.use_map(empty)
+    robot.until(lambda _: robot.navigator.explorer.viewpoint_due)
+    assert len(robot.navigator.take_exploration_state().arrivals) == 1
+
+
 def test_kidnapped():
     robot = exploring_robot()
     robot.explore((8.0, 2.5))
@@ -286,3 +300,13 @@ def test_visited_and_given_up_places_move_with_the_map():
     exploration_state = robot.navigator.take_exploration_state()
     np.testing.assert_allclose(exploration_state.arrivals, arrival[None] + np.array([0.0, 0.4, 0.0]))
     np.testing.assert_allclose(exploration_state.unreachable, [[8.0, 2.9]])
+
+
+def test_a_given_up_place_moves_with_its_surroundings():
+    """Not with the robot, which is metres away."""
+    robot = exploring_robot()
+    robot.use_map(map_with((7.0, 2.5, 0.0), START))
+    robot.explore((8.0, 2.5))
+    robot.until(lambda _: robot.navigator.explorer.viewpoint_due, moves=False)
+    robot.use_map(map_with((7.0, 2.9, 0.0), START))
+    np.testing.assert_allclose(robot.navigator.take_exploration_state().unreachable, [[8.0, 2.9]])
