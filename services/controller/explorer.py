@@ -38,7 +38,7 @@ STALLED_NS = 8_000_000_000  # after this time without a motion of `STALLED_M`, t
 STALLED_M = 0.2
 VIEWPOINT_TOLERANCE_M = 0.1
 RETURN_TOLERANCE_M = 0.01  # of the goal at the start, so that the robot stands within 2 cm of it
-SAME_PLACE_M = 0.1  # a new viewpoint this close to the present goal does not replace it
+AT_START_M = 0.1  # a robot that cannot plan this close to the start gains no room by returning
 
 
 class Explorer:
@@ -172,7 +172,7 @@ class Explorer:
         self._can_plan = not isinstance(viewpoint, str)
         home = self.home
         if isinstance(viewpoint, str):
-            if home is None or np.hypot(*(self._pose - home)[:2]) <= SAME_PLACE_M:
+            if home is None or np.hypot(*(self._pose - home)[:2]) <= AT_START_M:
                 self._fail(viewpoint)
                 return None
             viewpoint = None  # after the way back, there may be more room
@@ -181,15 +181,15 @@ class Explorer:
         if pose is None:
             self._fail("cannot return to the start: nothing connects it to the present map")
             return None
-        same = self.goal is not None and np.hypot(*(self.goal.pose.array() - pose)[:2]) <= SAME_PLACE_M
-        if same and phase == self.phase and under_way:
-            return None
-        self.phase = phase
         goal = Goal(stamp_ns=0, seq=self.seq, pose=Pose.of(pose), tolerance=RETURN_TOLERANCE_M)
         if viewpoint is not None:
             yaw_tolerance = None if half_field_of_view >= np.pi else half_field_of_view / 2
             goal = goal.model_copy(update={"tolerance": VIEWPOINT_TOLERANCE_M, "yaw_tolerance": yaw_tolerance})
-        self.goal = goal
+        # A goal within its tolerance of the present one does not replace it.
+        same = self.goal is not None and np.hypot(*(self.goal.pose.array() - pose)[:2]) <= goal.tolerance
+        if same and phase == self.phase and under_way:
+            return None
+        self.phase, self.goal = phase, goal
         return goal
 
     def add_progress(self, status: Status) -> Status:

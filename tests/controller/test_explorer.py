@@ -155,6 +155,18 @@ def test_viewpoints_then_the_way_back():
     assert robot.navigator.take_exploration_state() is None
 
 
+def test_returns_to_a_start_that_moved_by_centimetres():
+    robot = exploring_robot()
+    robot.explore((5.0, 2.5))
+    robot.until(lambda _: robot.navigator.explorer.viewpoint_due)
+    robot.explore(None)
+    robot.until(lambda _: robot.pose[0] < 4.0)
+    robot.use_map(map_with((2.0, 2.58, 0.0)))
+    robot.explore(None)
+    robot.until(lambda status: status.exploration.phase == "finished")
+    assert np.hypot(*(robot.pose[:2] - [2.0, 2.58])) < 0.01
+
+
 def test_a_goal_of_a_user_takes_precedence():
     robot = exploring_robot()
     robot.explore((8.0, 2.5))
