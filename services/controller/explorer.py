@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 PAUSE_NS = 2_000_000_000  # how long the robot stands at a goal of a user before it goes on exploring
 STALLED_NS = 8_000_000_000  # after this time without a motion of `STALLED_M`, the goal counts as unreachable
 STALLED_M = 0.2
+MAX_GAP_NS = 1_000_000_000  # after a longer time without an update, the time without a motion starts again
 VIEWPOINT_TOLERANCE_M = 0.1
 RETURN_TOLERANCE_M = 0.01  # of the goal at the start, so that the robot stands within 2 cm of it
 AT_START_M = 0.1  # a robot that cannot plan this close to the start gains no room by returning
@@ -60,6 +61,7 @@ class Explorer:
         self._unreachable: list[AnchoredPose] = []  # viewpoints that were given up
         self._user_goal_over_since_ns: int | None = None
         self._last_moved = pose, 0  # pose and stamp in ns; the stamp is 0 before the first step towards a goal
+        self._last_update_ns = 0  # stamp of the last step towards a goal
 
     @property
     def active(self) -> bool:
@@ -129,9 +131,11 @@ class Explorer:
         return not self.paused
 
     def _record_motion(self, stamp_ns: int) -> None:
-        """Stores when the robot last moved by `STALLED_M`."""
+        """Stores when the robot last moved by `STALLED_M`, or was last driven by hand or without a belief."""
         place, since_ns = self._last_moved
-        if np.hypot(*(self._pose - place)[:2]) > STALLED_M or not 0 < since_ns <= stamp_ns:
+        gap = not 0 <= stamp_ns - self._last_update_ns <= MAX_GAP_NS
+        self._last_update_ns = stamp_ns
+        if np.hypot(*(self._pose - place)[:2]) > STALLED_M or since_ns == 0 or gap:
             self._last_moved = self._pose, stamp_ns
 
     def _update_return(self, state: GoalState, *, stalled: bool) -> bool:

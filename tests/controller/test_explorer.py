@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from common.geometry import se2
 from common.geometry.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
@@ -209,6 +210,23 @@ def test_a_place_without_progress_is_given_up():
     exploration_state = robot.navigator.take_exploration_state()
     assert exploration_state.unreachable.tolist() == [[8.0, 2.5]]
     assert not len(exploration_state.arrivals)
+
+
+@pytest.mark.parametrize("manual", [True, False])
+def test_no_place_is_given_up_for_the_time_without_updates(manual):
+    """The robot is driven by hand, or there are no beliefs."""
+    robot = exploring_robot()
+    robot.explore((8.0, 2.5))
+    robot.step()
+    if manual:
+        for _ in range(10 * SCANS_PER_S):
+            robot.navigator.on_drive(Drive(stamp_ns=0, twist=Twist(vx=0.1)))
+            assert robot.step(moves=False).state == "manual"
+    else:
+        robot.scans += 10 * SCANS_PER_S
+    for _ in range(SCANS_PER_S):
+        robot.step()
+    assert robot.navigator.explorer.goal.pose.x == 8.0
 
 
 def test_a_way_back_that_stays_refused_fails():
