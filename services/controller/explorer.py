@@ -15,7 +15,8 @@ given up only if both hold.
 A goal of a user pauses the exploration until `PAUSE_NS` after that goal was reached or refused. Cancelling a goal ends
 the exploration.
 
-While the robot is not localised in the map, it keeps its goal, and the controller first localises it.
+While the robot is not localised in the map, no viewpoint is chosen and a goal is kept: the controller first localises
+the robot.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ class Explorer:
         self.path_m = 0.0
         self._failure = ""  # why the exploration has failed
         self._can_plan = True  # whether the last choice of a viewpoint was possible
-        self._pose, self._located = pose, True
+        self._pose, self.located = pose, True  # the pose is in the map only if the robot is located in it
         self._home = planned.anchor(pose)
         self._arrivals: list[AnchoredPose] = []  # where the robot arrived at viewpoints
         self._unreachable: list[AnchoredPose] = []  # viewpoints that were given up
@@ -88,9 +89,9 @@ class Explorer:
 
     def move(self, pose: Array, *, located: bool) -> None:
         """Updates the robot's pose (3,), which is in the map only if the robot is ``located`` in it."""
-        if located == self._located:
+        if located == self.located:
             self.path_m += float(np.hypot(*(pose - self._pose)[:2]))
-        self._pose, self._located = pose, located
+        self._pose, self.located = pose, located
 
     def exploration_state(self, field_of_view: FieldOfView) -> ExplorationState:
         """The input for the choice of the next viewpoint."""
@@ -106,12 +107,12 @@ class Explorer:
 
     def update(self, state: GoalState, stamp_ns: int) -> None:
         """Processes the state of the robot's goal after a scan."""
-        if not self.active or not (self.paused or self.goal is not None):
+        if not self.active:
             return
-        if state.phase is Phase.UNLOCALISED:
-            self._last_moved = self._pose, 0  # the policy drives to localise
-        elif self.paused:
+        if self.paused:
             self.viewpoint_due |= self._resume_after_user_goal(state, stamp_ns)
+        elif not self.located:
+            self._last_moved = self._pose, 0  # the policy drives to localise
         elif self.goal is not None:
             self._record_motion(stamp_ns)
             stalled = stamp_ns - self._last_moved[1] > STALLED_NS
@@ -202,7 +203,12 @@ class Explorer:
         status = status.model_copy(update={"exploration": progress})
         if self.phase == "failed" and status.state not in {"lost", "manual"}:
             return status.model_copy(update={"state": "blocked", "reason": self._failure, "refused": True})
-        if not self.drives or not self._located or status.state in {"lost", "manual"}:
+        if not self.drives or status.state in {"lost", "manual"}:
+            return status
+        if not self.located:
+            if status.state in {"idle", "reached"} or status.refused:
+                reason = "the robot is not localised in the map"
+                return status.model_copy(update={"state": "lost", "reason": reason, "refused": False})
             return status
         if status.state == "blocked" and not status.refused:
             return status

@@ -66,6 +66,7 @@ class Navigator:
         self._floor: Floor | None = None  # of the robot when the destination was chosen; None if it was unknown
         self.explorer: Explorer | None = None  # the last exploration, unless it was cancelled
         self._exploration_request: Goal | None = None  # waits for the first map and a pose in it
+        self._open_choices: list[ExplorationState] = []  # for which viewpoints are being chosen
         self._scan: Scan | None = None
         self._scan_points = np.zeros((0, 2))  # m in base_link
 
@@ -82,7 +83,7 @@ class Navigator:
 
     def on_goal(self, goal: Goal) -> None:
         """Replaces, cancels or refuses the goal, or begins to explore. A goal known to be unreachable is refused."""
-        self._exploration_request = None
+        self._exploration_request, self._open_choices = None, []
         if goal.cancel or goal.explore or self.explorer is None or not self.explorer.active:
             self.explorer = None
         else:
@@ -125,25 +126,32 @@ class Navigator:
         The caller passes the viewpoint that was chosen to `use_viewpoint`.
         """
         explorer = self.explorer
-        if explorer is None or self.goal_state.phase is Phase.UNLOCALISED:  # the robot first has to be localised
-            return None
+        if explorer is None or not explorer.located or self.goal_state.phase is Phase.UNLOCALISED:
+            return None  # the robot first has to be localised
         due, explorer.viewpoint_due = explorer.viewpoint_due, False
         if not due or not explorer.drives or self._scan is None:
             return None
         from services.controller.policies.exploration import FieldOfView  # slow: numba
 
-        return explorer.exploration_state(FieldOfView.of(self._scan, explorer.map.message.grid.resolution))
+        exploration_state = explorer.exploration_state(FieldOfView.of(self._scan, explorer.map.message.grid.resolution))
+        self._open_choices.append(exploration_state)
+        return exploration_state
 
     def use_viewpoint(self, viewpoint: Viewpoint | str | None, exploration_state: ExplorationState) -> None:
         """Drives to the viewpoint that was chosen, or back to the start if there is none, or a reason against any."""
-        if self.explorer is not None and self.explorer.drives:
-            goal = self.explorer.next_goal(
-                viewpoint, exploration_state.field_of_view.sector.half, under_way=self.goal_state.active
-            )
-            if not self.explorer.active:  # it has failed, so the robot must not drive on to the last viewpoint
-                self._cancel_goal()
-            elif goal is not None:
-                self._set_goal(goal)
+        count = next((k for k, each in enumerate(self._open_choices, start=1) if each is exploration_state), 0)
+        if self.explorer is None or not self.explorer.drives or count == 0:  # 0: from before the last goal of a user
+            return
+        self._open_choices = self._open_choices[count:]  # older ones were dropped for this one
+        if not self.explorer.located:
+            self.explorer.viewpoint_due = True
+            return
+        half_field_of_view = exploration_state.field_of_view.sector.half
+        goal = self.explorer.next_goal(viewpoint, half_field_of_view, under_way=self.goal_state.active)
+        if not self.explorer.active:  # it has failed, so the robot must not drive on to the last viewpoint
+            self._cancel_goal()
+        elif goal is not None:
+            self._set_goal(goal)
 
     def _cancel_goal(self) -> None:
         self._docking = self._ride = None
@@ -235,6 +243,8 @@ class Navigator:
         desired = np.zeros(3)
         if goal is not None and distance is not None and self.goal_state.active:
             desired = self._goal_velocity(belief, pose, goal, distance)
+        elif self.explorer is not None and self.explorer.drives and not self.explorer.located:
+            desired = self._localising_velocity(belief)
         command, limited_by_scan = self._command.limit(belief.stamp_ns, desired, self._scan_points)
         moving = is_moving(self._command.velocity)
         self.goal_state.update_progress(
@@ -309,12 +319,7 @@ class Navigator:
     def _goal_velocity(self, belief: Belief, pose: Array, goal: Goal, distance: float) -> Array:
         """Velocity (3,) in base_link that the policy chooses, before any limit; updates the state of the goal."""
         if belief.state in {"lost", "localising", "ambiguous"}:
-            self.decision = self.policy.decide_unlocalised(
-                belief, self._command.velocity, self._motion_until_effect(belief.stamp_ns)
-            )
-            self.goal_state.lose_pose(self.decision.state, self.decision.reason)
-            self._interrupt_docking()
-            return self.decision.action
+            return self._localising_velocity(belief)
         self.goal_state.find_pose()
         if self._ride is not None:
             return self._lift_velocity(self._ride, belief, pose)
@@ -333,6 +338,14 @@ class Navigator:
             self.decision = Decision(turn, "at the goal: turning to its heading")
             return turn
         return self._policy_velocity(belief)
+
+    def _localising_velocity(self, belief: Belief) -> Array:
+        self.decision = self.policy.decide_unlocalised(
+            belief, self._command.velocity, self._motion_until_effect(belief.stamp_ns)
+        )
+        self.goal_state.lose_pose(self.decision.state, self.decision.reason)
+        self._interrupt_docking()
+        return self.decision.action
 
     def _policy_velocity(self, belief: Belief) -> Array:
         self.decision = self.policy.decide(belief, self._command.velocity, self._motion_until_effect(belief.stamp_ns))

@@ -134,6 +134,47 @@ def test_kidnapped():
     assert len(robot.navigator.take_exploration_state().unreachable) == 0
 
 
+@pytest.mark.parametrize("before_the_first", [True, False])
+def test_kidnapped_without_a_viewpoint(before_the_first):
+    """The robot drives until it is localised, and only then chooses a viewpoint."""
+    robot = exploring_robot()
+    if not before_the_first:
+        robot.explore((3.0, 2.5))
+        robot.until(lambda _: robot.navigator.explorer.viewpoint_due)
+    place = robot.pose
+    for _ in range(5 * SCANS_PER_S):
+        status = robot.step(state="lost")
+        assert (status.state, status.refused) == ("lost", False)
+        assert robot.navigator.take_exploration_state() is None
+    assert np.hypot(*(robot.pose - place)[:2]) > 0.2
+    robot.step()
+    robot.explore((5.0, 2.5))
+    assert robot.step().goal.x == 5
+
+
+def test_a_choice_is_repeated_if_the_robot_was_kidnapped_meanwhile():
+    robot = exploring_robot()
+    exploration_state = robot.navigator.take_exploration_state()
+    robot.step(state="lost")
+    robot.navigator.use_viewpoint("too little room", exploration_state)
+    robot.step()
+    robot.explore((5.0, 2.5))
+    assert robot.step().exploration.phase == "exploring"
+
+
+def test_choices_from_before_a_new_goal_are_ignored():
+    robot = exploring_robot()
+    of_earlier = robot.navigator.take_exploration_state()
+    robot.navigator.on_goal(goal(0, 0, explore=True, seq=6))
+    robot.navigator.use_viewpoint(None, of_earlier)
+    robot.step()
+    before_pause = robot.navigator.take_exploration_state()
+    robot.navigator.on_goal(goal(*START[:2], seq=7))
+    robot.until(lambda _: robot.navigator.explorer.viewpoint_due)
+    robot.navigator.use_viewpoint("too little room", before_pause)
+    assert robot.step().exploration.phase == "exploring"
+
+
 def test_viewpoints_then_the_way_back():
     robot = exploring_robot()
     robot.explore((5.0, 2.5))
