@@ -20,14 +20,14 @@ from common.robot.scanner import SCANNERS
 from lab.benchmarks.mapping import trajectory_errors
 from services.controller.growing_map import PlannedMap
 from services.controller.navigator import Navigator
-from services.controller.policies.exploration import ExplorationState, Viewpoint
+from services.controller.policies.exploration import ExplorationState, NoPath, Viewpoint
 from services.controller.policies.planner import GeodesicPolicy
 from services.mapper.service import belief_message, map_message
 from services.mapper.slam.drive import Laser
 from services.mapper.slam.mapper import Mapper
 from services.simulator.simulation import Simulation, SimulationSetup
 
-ChooseViewpoint = Callable[[ExplorationState], Viewpoint | str | None]
+ChooseViewpoint = Callable[[ExplorationState], Viewpoint | NoPath | None]
 CELL_M = 0.05  # of the map
 MAP_PERIOD_NS = 1_000_000_000  # between two versions of the map, as in the mapper's service
 LAST_SCANS = 15  # while the robot comes to a stand

@@ -5,7 +5,8 @@
 | - | a goal with `explore` | EXPLORING |
 | EXPLORING, RETURNING | a viewpoint is worth a visit | EXPLORING |
 | EXPLORING, RETURNING | no viewpoint is worth a visit | RETURNING |
-| EXPLORING, RETURNING | no viewpoint can be planned from where the robot is | RETURNING; FAILED at the start |
+| EXPLORING, RETURNING | no path can be planned from where the robot is | RETURNING; FAILED at the start |
+| EXPLORING, RETURNING | one of the last two, and the start is not connected to the map | FAILED |
 | RETURNING | the robot has arrived, and no viewpoint was worth a visit | FINISHED |
 | RETURNING | the way back stays refused, and the robot does not move | FAILED |
 
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from services.controller.goal_state import GoalState
     from services.controller.growing_map import AnchoredPose, PlannedMap
-    from services.controller.policies.exploration import ExplorationState, FieldOfView, Viewpoint
+    from services.controller.policies.exploration import ExplorationState, FieldOfView, NoPath, Viewpoint
 
 PAUSE_NS = 2_000_000_000  # how long the robot stands at a goal of a user before it goes on exploring
 STALLED_NS = 8_000_000_000  # after this time without a motion of `STALLED_M`, the goal counts as unreachable
@@ -55,7 +56,7 @@ class Explorer:
         self.viewpoint_due = True  # whether a viewpoint has to be chosen; cleared by the caller that chooses it
         self.path_m = 0.0
         self._failure = ""  # why the exploration has failed
-        self._can_plan = True  # whether the last choice of a viewpoint was possible
+        self._can_plan = True  # whether a path could be planned at the last choice of a viewpoint
         self._pose, self.located = pose, True  # the pose is in the map only if the robot is located in it
         self._home = planned.anchor(pose)
         self._arrivals: list[AnchoredPose] = []  # where the robot arrived at viewpoints
@@ -167,18 +168,20 @@ class Explorer:
         return True
 
     def next_goal(
-        self, viewpoint: Viewpoint | str | None, half_field_of_view: float, *, under_way: bool
+        self, viewpoint: Viewpoint | NoPath | None, half_field_of_view: float, *, under_way: bool
     ) -> Goal | None:
         """The goal for the result of `choose_viewpoint`: the viewpoint, or the way back if there is none.
 
         Returns None if the present goal is kept, or the exploration has failed. The scanner sees ``half_field_of_view``
         rad to either side. ``under_way``: the robot drives to the last goal.
         """
-        self._can_plan = not isinstance(viewpoint, str)
+        from services.controller.policies.exploration import NoPath  # slow: numba
+
+        self._can_plan = not isinstance(viewpoint, NoPath)
         home = self.home
-        if isinstance(viewpoint, str):
+        if isinstance(viewpoint, NoPath):
             if home is None or np.hypot(*(self._pose - home)[:2]) <= AT_START_M:
-                self._fail(viewpoint)
+                self._fail(viewpoint.reason)
                 return None
             viewpoint = None  # after the way back, there may be more room
         phase: Literal["exploring", "returning"] = "returning" if viewpoint is None else "exploring"

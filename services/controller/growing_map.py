@@ -27,7 +27,7 @@ JUMP_M = 0.05
 class AnchoredPose:
     """A pose that moves with the map when a loop closes."""
 
-    number: int  # of a key scan
+    key_scan: int  # its number
     relative: Array  # (3,) in the frame of that key scan
 
 
@@ -62,8 +62,8 @@ class PlannedMap:
         """The poses (N, 3) in this version of the map, without those whose key scan is not connected to it."""
         index = {number: k for k, number in enumerate(self.message.numbers.tolist())}
         placed = [
-            se2.compose(self.message.poses[index[each.number]], each.relative)
+            se2.compose(self.message.poses[index[each.key_scan]], each.relative)
             for each in anchored
-            if each.number in index
+            if each.key_scan in index
         ]
         return np.reshape(placed, (-1, 3))

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.geometry.world import World
     from services.controller.growing_map import PlannedMap
-    from services.controller.policies.exploration import ExplorationState, Viewpoint
+    from services.controller.policies.exploration import ExplorationState, NoPath, Viewpoint
 
 
 class Answer(NamedTuple):
@@ -137,8 +137,11 @@ class Navigator:
         self._open_choices.append(exploration_state)
         return exploration_state
 
-    def use_viewpoint(self, viewpoint: Viewpoint | str | None, exploration_state: ExplorationState) -> None:
-        """Drives to the viewpoint that was chosen, or back to the start if there is none, or a reason against any."""
+    def use_viewpoint(self, viewpoint: Viewpoint | NoPath | None, exploration_state: ExplorationState) -> None:
+        """Drives to the viewpoint that was chosen, or back to the start if there is none.
+
+        ``viewpoint`` may also be the reason why none can be planned.
+        """
         count = next((k for k, each in enumerate(self._open_choices, start=1) if each is exploration_state), 0)
         if self.explorer is None or not self.explorer.drives or count == 0:  # 0: from before the last goal of a user
             return

@@ -35,7 +35,7 @@ from services.controller.settings import ControllerSettings
 
 if TYPE_CHECKING:
     from services.controller.growing_map import PlannedMap
-    from services.controller.policies.exploration import ExplorationState, Viewpoint
+    from services.controller.policies.exploration import ExplorationState, NoPath, Viewpoint
     from services.controller.policies.geodesic_field import CostField
     from services.controller.policies.planner import GeodesicPolicy
 
@@ -91,7 +91,9 @@ class ControllerService(Service):
         self._last_map: Map | None = None  # from the mapper
         self._map: PlannedMap | None = None  # the mapper's, if the policy plans in it
         self._map_job: BackgroundJob[PlannedMap] = BackgroundJob(self._wake)
-        self._viewpoint_job: BackgroundJob[tuple[Viewpoint | str | None, ExplorationState]] = BackgroundJob(self._wake)
+        self._viewpoint_job: BackgroundJob[tuple[Viewpoint | NoPath | None, ExplorationState]] = BackgroundJob(
+            self._wake
+        )
         self.self_filter = settings.build_self_filter()
         self._wait: BeliefWait = NoBelief()
         self._belief_received_s = 0.0  # time.monotonic() of the latest belief

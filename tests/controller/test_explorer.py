@@ -11,7 +11,7 @@ from common.messages.definitions import Drive, Map, Twist
 from common.robot.robot import Robot
 from services.controller.growing_map import PlannedMap
 from services.controller.navigator import Navigator
-from services.controller.policies.exploration import Viewpoint
+from services.controller.policies.exploration import NoPath, Viewpoint
 from services.controller.policies.planner import GeodesicPolicy
 from tests.controller.driving import PERIOD_NS, belief, goal, room, scan
 
@@ -59,7 +59,7 @@ class PerfectRobot:
     def explore(self, *places) -> None:
         """Gives the robot viewpoints at these places in m, one after another.
 
-        None ends the exploration; a text is the reason why no viewpoint can be planned.
+        None ends the exploration; a `NoPath` is the reason why no viewpoint can be planned.
         """
         for place in places:
             viewpoint = place
@@ -156,7 +156,7 @@ def test_a_choice_is_repeated_if_the_robot_was_kidnapped_meanwhile():
     robot = exploring_robot()
     exploration_state = robot.navigator.take_exploration_state()
     robot.step(state="lost")
-    robot.navigator.use_viewpoint("too little room", exploration_state)
+    robot.navigator.use_viewpoint(NoPath("too little room"), exploration_state)
     robot.step()
     robot.explore((5.0, 2.5))
     assert robot.step().exploration.phase == "exploring"
@@ -171,7 +171,7 @@ def test_choices_from_before_a_new_goal_are_ignored():
     before_pause = robot.navigator.take_exploration_state()
     robot.navigator.on_goal(goal(*START[:2], seq=7))
     robot.until(lambda _: robot.navigator.explorer.viewpoint_due)
-    robot.navigator.use_viewpoint("too little room", before_pause)
+    robot.navigator.use_viewpoint(NoPath("too little room"), before_pause)
     assert robot.step().exploration.phase == "exploring"
 
 
@@ -292,7 +292,7 @@ def test_a_way_back_that_stays_refused_fails():
 
 def test_no_room_at_the_start_fails():
     robot = exploring_robot()
-    robot.explore("too little room")
+    robot.explore(NoPath("too little room"))
     status = robot.step()
     assert (status.exploration.phase, status.state, status.refused) == ("failed", "blocked", True)
     assert status.reason == "too little room"
@@ -316,7 +316,7 @@ def test_after_the_way_back_there_may_be_more_room():
     robot = exploring_robot()
     robot.explore((5.0, 2.5))
     robot.until(lambda _: robot.navigator.explorer.viewpoint_due)
-    robot.explore("too little room")
+    robot.explore(NoPath("too little room"))
     assert robot.step().exploration.phase == "returning"
     robot.until(lambda _: robot.navigator.explorer.viewpoint_due)
     assert np.hypot(*(robot.pose - START)[:2]) < 0.01

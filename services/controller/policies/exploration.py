@@ -91,6 +91,13 @@ class Viewpoint:
 
 
 @dataclass(frozen=True)
+class NoPath:
+    """Something is left to see, but no path can be planned from where the robot stands."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
 class Frontier:
     """Unknown cells beside known free ones."""
 
@@ -107,17 +114,14 @@ class CandidateViewpoints:
     target: int | None  # index of the present target; None if there is none, or it cannot be reached
 
 
-def choose_viewpoint(state: ExplorationState) -> Viewpoint | str | None:
-    """The first viewpoint of the tour of least expected free energy; None if no viewpoint is worth a visit.
-
-    If something is left to see, but no path can be planned from where the robot stands, returns the reason instead.
-    """
+def choose_viewpoint(state: ExplorationState) -> Viewpoint | NoPath | None:
+    """The first viewpoint of the tour of least expected free energy; None if no viewpoint is worth a visit."""
     frontier, known = find_frontier(state), known_space(state.graph)
-    room = known.min_clearance
-    if frontier.nats.sum() >= MIN_VIEWPOINT_NATS and known.nearest_free(state.pose[:2], room) is None:
-        return (
-            f"cannot plan a path from here: no place within {room:.2f} m of the robot is known to be free for "
-            f"{room:.2f} m around; drive the robot to where there is more room, and explore again"
+    min_clearance = known.min_clearance
+    if frontier.nats.sum() >= MIN_VIEWPOINT_NATS and known.nearest_free(state.pose[:2], min_clearance) is None:
+        return NoPath(
+            f"cannot plan a path from here: no place within {min_clearance:.2f} m of the robot is known to be free for "
+            f"{min_clearance:.2f} m around; drive the robot to where there is more room, and explore again"
         )
     candidates = find_candidates(state, frontier, known)
     selected = select_viewpoints(candidates.sees, frontier.nats, candidates.target)

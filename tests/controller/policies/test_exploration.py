@@ -12,6 +12,7 @@ from services.controller.policies.exploration import (
     MIN_VIEWPOINT_NATS,
     ExplorationState,
     FieldOfView,
+    NoPath,
     choose_viewpoint,
     find_candidates,
     find_frontier,
@@ -165,9 +166,9 @@ def test_nothing_is_left_to_see():
 
 
 def test_too_little_room_to_plan():
-    reason = choose_viewpoint(exploration_state_of(CORRIDOR, radius=0.35))
-    assert isinstance(reason, str)
-    assert "cannot plan a path from here: no place within 0.43 m" in reason
+    result = choose_viewpoint(exploration_state_of(CORRIDOR, radius=0.35))
+    assert isinstance(result, NoPath)
+    assert "cannot plan a path from here: no place within 0.43 m" in result.reason
     assert choose_viewpoint(exploration_state_of(CLOSED, radius=0.35)) is None  # nothing is left to see
 
 
