@@ -170,8 +170,9 @@ class PreciseEstimator:
         match = self._match_map(view, motions, period, with_odometry=odom is not None)
         # Local map
         if view.surface_evidence(match.poses).explained[0] < self.settings.min_explained_share:
+            predicted = expected_motion(motions[0]) if odom is not None else motions[0][-1]
             match = self._match_local_map(
-                view, match, self._predict_local_motion(period, odom, observation.command), motions[0][-1].covariance
+                view, match, self._predict_local_motion(period, odom, observation.command), predicted.covariance
             )
         if observation.time_increment and any(each.excess(match.poses[0]) == 0 for each in motions[0][:-1]):
             # Only if the match is one of the predicted motions: otherwise the robot may have been carried to another

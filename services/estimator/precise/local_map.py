@@ -69,7 +69,7 @@ class ChangeRate:
 
     The rate has a gamma distribution, so the number of changes in a given time has a negative binomial distribution.
     Its shape is Jeffreys' 0.5 plus the remembered changes, its rate parameter always `CHANGE_MEMORY_S`, as if there had
-    been that long a time without a change before the first scan. Periods must be much shorter.
+    been that long a time without a change before the first scan. Valid for periods that are much shorter.
     """
 
     remembered: float = 0.0  # changes, forgotten exponentially
@@ -160,7 +160,10 @@ class LocalMap:
         return free
 
     def match(self, starts: Array, view: View, prior: MotionCandidate) -> Match | None:
-        """Returns the pose at which a scan matches the key scans, or None if no pose matches.
+        """Returns the match of a scan with the key scans.
+
+        Returns None if less than half of its points match, or if they show almost nothing of the place along some
+        direction.
 
         ``starts`` (N, 3) and ``prior`` are poses in the local frame.
         """

@@ -1,7 +1,7 @@
 """Points on the surfaces of several scans, to which another scan is matched.
 
-Point-to-line scan matching (Censi, ICRA 2008). Errors of the lines' directions are no information (errors in
-variables), and what the map lacks may have moved.
+Point-to-line scan matching (Censi, ICRA 2008). Tilted lines add spurious information (errors in variables), which is
+subtracted. Surfaces that the map lacks may have moved.
 """
 
 from __future__ import annotations
@@ -21,33 +21,35 @@ CELL_M = 0.05  # points within one cell are averaged
 NEIGHBOURS, NEIGHBOUR_RADIUS_M = 10, 0.3  # points through which the line along a surface is fitted
 # Largest distance to the corresponding point, iteration by iteration.
 CORRESPONDENCE_RADII_M = (0.6, 0.6, 0.4, 0.4, 0.2, 0.2, 0.1, 0.1, 0.1, 0.1)
-CAUCHY_SCALE_M = 0.02  # of the Cauchy weight of a point by its distance from the line
+CAUCHY_SCALE_M = 0.02  # of the Cauchy weight of a point by its distance from the line, and standard deviation of that
 MATCHED_RADIUS_M = 0.08  # a point is matched if it is this near to one of another scan
 MIN_POINTS = 20  # of a scan that must have a corresponding point
 MIN_INFORMATION_RATIO = 0.02  # a direction is unobserved if its information, divided by that across it, is less
-TIE_BREAK = 1e-3  # weight of all points, where the fixed ones say as little of all directions
-MOVED_PROBABILITY = 0.2  # that a surface which the map lacks, such as a person, has moved since the last scan: a guess
+# Relative to that of all points; it decides which direction counts as the weakest if there are no fixed points.
+TIE_BREAK = 1e-3
+# That a surface which the map lacks, such as a person, has moved since the last key scan (a guess)
+MOVED_PROBABILITY = 0.2
 
 
 @dataclass(frozen=True)
 class Match:
-    """Pose of a scan among the points, and the information about it, in 1/m² and 1/rad²."""
+    """Pose of a scan among the points, and the information about it, by m and rad."""
 
     pose: Array  # (3,) base_link in the frame of the points
     information: Array  # (3, 3)
     matched_fraction: float  # of the scan's points
     score: float  # mean weight of the scan's points, higher for closer matches
     degenerate: bool  # the points have almost no information along some direction
-    # Of the points on surfaces of the map alone, without what errors of the lines' directions add:
+    # From the points on surfaces of the map, without the spurious information of tilted lines:
     fixed_information: Array  # (3, 3)
-    fixed_step: Array  # (3,) to the pose that fits them best
+    fixed_step: Array  # (3,) towards the pose that fits them best, of one Gauss-Newton iteration
     movable_surfaces: int  # those that the map lacks, and that show the direction of which the fixed points say least
 
     def covariance(self, if_moved: Array) -> Array:
         """Covariance (3, 3) of the pose.
 
-        A mixture: if all movable surfaces have moved, only the fixed ones show the pose, besides its covariance
-        ``if_moved`` (3, 3) without any match. That is certain if no surface shows the direction.
+        It is that of a mixture: all movable surfaces have moved, or none. If they have, or there are none, it follows
+        from the fixed points and from ``if_moved`` (3, 3), the mean squared error of the pose without a match.
         """
         covariance = np.linalg.inv(self.information + 1e-6 / CAUCHY_SCALE_M**2 * np.eye(3))
         by_fixed = np.linalg.inv(self.fixed_information + np.linalg.inv(if_moved))
@@ -63,8 +65,8 @@ class SurfacePoints:
     points: Array  # (K, 2) m
     mapped: npt.NDArray[np.bool_]  # (K,) whether the surface is in the map
     normals: Array  # (K, 2) of the line through the neighbours of a point; 0 where there are too few
-    # (K,) rad², variance of the direction of that line: that of the neighbours across it, divided by that along it.
-    # Near a corner, where it is large, their errors are alike, so their number does not matter.
+    # (K,) rad², variance of the direction of that line: the neighbours' variance across it, divided by that along it.
+    # Their number does not matter, because near a corner they lie off the line systematically.
     direction_variances: Array
     tree: cKDTree
 
@@ -89,7 +91,7 @@ class SurfacePoints:
 
         Returns None if too few points have a corresponding one.
         """
-        weak = CAUCHY_SCALE_M**2 * np.linalg.inv(prior.covariance)
+        prior_information = CAUCHY_SCALE_M**2 * np.linalg.inv(prior.covariance)
         pose = np.array(start)
         for radius in CORRESPONDENCE_RADII_M:
             placed = place_points(view, pose)
@@ -103,7 +105,8 @@ class SurfacePoints:
             J = _pose_derivative(self.normals[index], arm)
             weight = 1 / (1 + (error / CAUCHY_SCALE_M) ** 2)
             H = (J.T * weight) @ J
-            step = np.linalg.solve(H + weak, weak @ se2.difference(prior.mean, pose) - (J.T * weight) @ error)
+            pull = prior_information @ se2.difference(prior.mean, pose) - (J.T * weight) @ error
+            step = np.linalg.solve(H + prior_information, pull)
             pose = pose + step
             pose[2] = se2.wrap(pose[2])
         placed = place_points(view, pose)
@@ -114,15 +117,13 @@ class SurfacePoints:
         low, high = np.linalg.eigvalsh(position_information(H))
         fixed = self.mapped[index]
         of_fixed = (J[fixed].T * weight[fixed]) @ J[fixed]
-        pull = J[fixed].T @ (weight * self._distance_from_line(placed[paired], index))[fixed]
-        # Errors of the lines' directions pass for information along them, as in a corridor. They are subtracted.
+        pull = -J[fixed].T @ (weight * self._distance_from_line(placed[paired], index))[fixed]
+        # A tilted line adds information along itself.
         along = _pose_derivative(self.normals[index] @ np.array([[0.0, 1.0], [-1.0, 0.0]]), arm)
-        lost = weight * self.direction_variances[index]
-        shown_by_fixed = of_fixed - (along[fixed].T * lost[fixed]) @ along[fixed]
-        values, vectors = np.linalg.eigh(shown_by_fixed)
-        # Along the direction of which the fixed points say least
+        spurious = weight * self.direction_variances[index]
+        shown_by_fixed = subtract_spurious(of_fixed, (along[fixed].T * spurious[fixed]) @ along[fixed])
         weakest = np.linalg.eigh(position_information(shown_by_fixed + TIE_BREAK * H))[1][:, 0]
-        shown = weight * (J[:, :2] @ weakest) ** 2 - lost * (along[:, :2] @ weakest) ** 2
+        shown = weight * (J[:, :2] @ weakest) ** 2 - spurious * (along[:, :2] @ weakest) ** 2
         surface = np.cumsum(view.surfaces.starts)[view.returned][paired]
         movable = np.bincount(surface[~fixed], shown[~fixed]) > MIN_INFORMATION_RATIO * high
         return Match(
@@ -130,9 +131,9 @@ class SurfacePoints:
             H / CAUCHY_SCALE_M**2,
             matched_fraction,
             float(score),
-            bool(low < MIN_INFORMATION_RATIO * high),
-            (vectors * np.maximum(values, 0.0)) @ vectors.T / CAUCHY_SCALE_M**2,
-            -np.linalg.solve(of_fixed + weak, pull),
+            bool(low <= MIN_INFORMATION_RATIO * high),
+            shown_by_fixed / CAUCHY_SCALE_M**2,
+            np.linalg.solve(of_fixed + prior_information, pull),
             int(movable.sum()),
         )
 
@@ -152,6 +153,18 @@ class SurfacePoints:
 def place_points(view: View, pose: Array) -> Array:
     """End points (K, 2) m of the beams of a scan that returned, with base_link at ``pose`` (3,)."""
     return se2.transform(se2.compose(pose, view.mount), view.points)
+
+
+def subtract_spurious(information: Array, spurious: Array) -> Array:
+    """The ``information`` (3, 3) minus the ``spurious`` part of it (3, 3), but nowhere less than 0.
+
+    Their ratio is limited to 1 along the directions in which both are diagonal, so units do not matter.
+    """
+    root = np.linalg.cholesky(information + (1e-6 * np.trace(information) + 1e-9) * np.eye(3))
+    inverse = np.linalg.inv(root)
+    kept, directions = np.linalg.eigh(inverse @ (information - spurious) @ inverse.T)
+    half = root @ directions * np.sqrt(np.maximum(kept, 0.0))
+    return np.asarray(half @ half.T)
 
 
 def _average_in_cells(points: Array) -> Array:
