@@ -82,10 +82,13 @@ def _nees(error: Array, covariance: Array | None) -> list[float]:
     """NEES of x and y, and of x, y and yaw: error' covariance^-1 error (Bar-Shalom et al. 2001, section 5.4)."""
     if covariance is None or not np.isfinite(error).all():
         return [np.nan, np.nan]
-    sizes = (2, 3)
-    return [
-        min(float(error[:n] @ np.linalg.pinv(covariance[:n, :n], hermitian=True) @ error[:n]), MAX_NEES) for n in sizes
-    ]
+    return [_squared_mahalanobis(error[:n], covariance[:n, :n]) for n in (2, 3)]
+
+
+def _squared_mahalanobis(error: Array, covariance: Array) -> float:
+    if np.linalg.eigvalsh(covariance)[0] <= 0:  # claims to know a direction exactly
+        return MAX_NEES
+    return min(float(error @ np.linalg.solve(covariance, error)), MAX_NEES)
 
 
 def _excess(error: Array, posterior: Posterior) -> Array:
@@ -153,7 +156,8 @@ def score_case(trials: Sequence[dict[str, Any]], scans: Estimates) -> dict[str, 
 def share_of_scans(trials: Sequence[dict[str, Any]], name: str, of_name: str) -> dict[str, Any] | None:
     """``count``, ``of`` and 95 % interval of a share of the scans of all trials; None if ``of`` is 0.
 
-    The interval is a bootstrap by building: None for fewer than `MIN_BUILDINGS`, or if all or none are counted.
+    The interval is a bootstrap by building. It is None for fewer than `MIN_BUILDINGS`, or if all or none are counted,
+    because resampling cannot show how rare the others are.
     """
     buildings = list(dict.fromkeys(trial["seed"] for trial in trials))
     counts = [

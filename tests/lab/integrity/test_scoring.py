@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lab.integrity.report import reliability_diagram, table
-from lab.integrity.scoring import Estimates, longest_run, reliability, score_case, score_trial, share_of_scans
+from lab.integrity.scoring import MAX_NEES, Estimates, longest_run, reliability, score_case, score_trial, share_of_scans
 from services.estimator.shared.interface import Hypothesis, Posterior
 
 TRUTHS = np.tile([1.0, 2.0, np.pi - 0.01], (6, 1))
@@ -31,6 +31,12 @@ def test_correct_and_wrong(scans):
     assert scans.correct.tolist() == [True, True, False, False, False, True]
     assert scans.wrong.tolist() == [False, False, True, True, False, False]
     assert scans.nees[1] == pytest.approx([1.0, 2.0])
+
+
+def test_nees_of_a_covariance_that_claims_certainty():
+    certain = Hypothesis(TRUTHS[0] + ERRORS[1], np.diag([0.01, 0.0, 0.0004]), 1.0)
+    made = Posterior("tracking", (certain,), 0.0, 0.0, np.zeros(3), np.eye(3), np.zeros(1))
+    assert Estimates.of([made], TRUTHS[:1], [0.001]).nees.tolist() == [[MAX_NEES, MAX_NEES]]
 
 
 def test_trial(scans):
