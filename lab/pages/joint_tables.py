@@ -87,7 +87,7 @@ def _best_filter(rows: list[dict[str, Any]]) -> dict[str, Any]:
 def _integrity(row: dict[str, Any]) -> str:
     tracking, wrong = (100 * row[name]["count"] / row[name]["of"] for name in ("tracking", "wrong"))
     drives = f"{row['trials_wrong_longer']} of {row['trials']} drives"
-    return f"{tracking:.1f} % `tracking`, of which {wrong:.1f} % wrong; for more than 1 s in {drives}"
+    return f"{tracking:.1f} % `tracking`, of which {wrong:.2g} % wrong; for more than 1 s in {drives}"
 
 
 def measured_by(folder: Path) -> str:
