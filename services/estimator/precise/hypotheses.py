@@ -256,9 +256,11 @@ def constraining_beams(view: View, pose: Array, direction: Array) -> tuple[float
     Also returns the mask (B,) of the beams that the map predicts on such surfaces.
     """
     expected = view.expect(se2.compose(pose, view.mount)[None])
-    normal = expected.jacobian[0, :, :2]
+    normal, surface, scale = expected.jacobian[0, :, :2], expected.ranges[0], expected.scale[0]
     facing = np.abs(normal @ direction) > np.sin(CORNER_ANGLE_RAD) * np.hypot(*normal.T)
-    return float(view.surface_evidence(pose[None]).weights[0, facing].sum()), facing
+    used = facing & np.isfinite(view.ranges) & np.isfinite(surface)
+    count = view.likelihood.inlier(view.ranges[used], surface[used], scale[used], view.range_max).sum()
+    return float(count), facing
 
 
 def probability_of_being_near(covariance: Array) -> float:
