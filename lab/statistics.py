@@ -1,4 +1,4 @@
-"""95 % intervals of shares and of errors."""
+"""95 % intervals of shares and of errors, and errors relative to the stated covariance."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from common.geometry.se2 import Array
 
 RESAMPLES = 1000
+MAX_NEES = 1e6  # of a degenerate covariance
 
 
 def wilson_interval(count: int, of: int) -> list[float]:
@@ -32,6 +33,16 @@ def bootstrap_interval(groups: Sequence[Array], statistic: Callable[[Array], flo
         for _ in range(RESAMPLES)
     ]
     return [float(bound) for bound in np.quantile(found, (0.025, 0.975))]
+
+
+def squared_mahalanobis(error: Array, covariance: Array) -> float:
+    """Error' covariance^-1 error, at most `MAX_NEES`; this also if the covariance claims to know a direction exactly.
+
+    Its mean over scans is the NEES, ideally the number of components (Bar-Shalom et al. 2001, section 5.4).
+    """
+    if np.linalg.eigvalsh(covariance)[0] <= 0:
+        return MAX_NEES
+    return min(float(error @ np.linalg.solve(covariance, error)), MAX_NEES)
 
 
 def median(values: Array) -> float:

@@ -61,6 +61,15 @@ def compose_jacobians(a: npt.ArrayLike, b: npt.ArrayLike) -> tuple[Array, Array]
     return by_a, by_b
 
 
+def displacement_jacobian(offsets: Array, directions: Array) -> Array:
+    """Derivatives (K, 3) of points that a pose carries, along unit vectors ``directions`` (K, 2), by its x, y and yaw.
+
+    ``offsets`` (K, 2) m are the points relative to the position of the pose; both in the parent frame.
+    """
+    turned = directions[:, 1] * offsets[:, 0] - directions[:, 0] * offsets[:, 1]
+    return np.column_stack([directions, turned])
+
+
 def rotate(yaw: float, vector: npt.ArrayLike) -> Array:
     """Vectors (..., 2) rotated by ``yaw`` rad counter-clockwise."""
     v = np.asarray(vector, float)

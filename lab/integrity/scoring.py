@@ -13,12 +13,11 @@ import numpy.typing as npt
 from common.geometry import se2
 from common.geometry.se2 import Array
 from lab.accuracy.tasks import FOUND_DISTANCE, FOUND_YAW
-from lab.statistics import bootstrap_interval, wilson_interval
+from lab.statistics import bootstrap_interval, squared_mahalanobis, wilson_interval
 from services.estimator.shared.interface import Posterior
 
 Mask = npt.NDArray[np.bool_]
 
-MAX_NEES = 1e6  # of a degenerate covariance
 RECOVERY_SCANS = 20  # after a kidnapping, until the robot must be found
 MAX_WRONG_S = 1.0  # a longer wrong stretch fails a trial
 MIN_BUILDINGS = 10  # for an interval of a share of scans; fewer say too little about how buildings differ
@@ -79,16 +78,10 @@ class Estimates:
 
 
 def _nees(error: Array, covariance: Array | None) -> list[float]:
-    """NEES of x and y, and of x, y and yaw: error' covariance^-1 error (Bar-Shalom et al. 2001, section 5.4)."""
+    """NEES of x and y, and of x, y and yaw."""
     if covariance is None or not np.isfinite(error).all():
         return [np.nan, np.nan]
-    return [_squared_mahalanobis(error[:n], covariance[:n, :n]) for n in (2, 3)]
-
-
-def _squared_mahalanobis(error: Array, covariance: Array) -> float:
-    if np.linalg.eigvalsh(covariance)[0] <= 0:  # claims to know a direction exactly
-        return MAX_NEES
-    return min(float(error @ np.linalg.solve(covariance, error)), MAX_NEES)
+    return [squared_mahalanobis(error[:n], covariance[:n, :n]) for n in (2, 3)]
 
 
 def _excess(error: Array, posterior: Posterior) -> Array:
@@ -159,12 +152,12 @@ def share_of_scans(trials: Sequence[dict[str, Any]], name: str, of_name: str) ->
     The interval is a bootstrap by building. It is None for fewer than `MIN_BUILDINGS`, or if all or none are counted,
     because resampling cannot show how rare the others are.
     """
-    buildings = list(dict.fromkeys(trial["seed"] for trial in trials))
+    buildings = dict.fromkeys(trial["seed"] for trial in trials)
     counts = [
-        np.sum([(trial[name], trial[of_name]) for trial in trials if trial["seed"] == building], axis=0)[None]
+        np.array([(trial[name], trial[of_name]) for trial in trials if trial["seed"] == building])
         for building in buildings
     ]
-    count, of = map(int, np.sum(counts, axis=0)[0])
+    count, of = map(int, np.concatenate(counts).sum(axis=0))
     if not of:
         return None
     known = len(buildings) >= MIN_BUILDINGS and 0 < count < of

@@ -13,6 +13,7 @@ import numpy as np
 from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.world import load_world
+from lab.statistics import squared_mahalanobis
 from presage.learning.train_drive import drive_of, split
 from presage.logs.scan_files import read_scans
 from services.estimator.factory import EstimatorFactory, EstimatorOptions, ScannerGeometry, prepare_factory
@@ -111,14 +112,9 @@ def trial(job: StretchJob) -> dict[str, Any]:
         rows["error_m"].append(round(float(np.hypot(error[0], error[1])), 5))
         rows["yaw_error_rad"].append(round(abs(float(error[2])), 5))
         rows["state"].append(posterior.state)
-        rows["nees"].append(_nees(error, posterior.covariance))
+        covariance = posterior.covariance
+        rows["nees"].append(None if covariance is None else round(squared_mahalanobis(error, covariance), 3))
     return {"estimator": job.estimator, "task": job.task, "first": job.first, "to": job.to, **rows}
-
-
-def _nees(error: Array, covariance: Array | None) -> float | None:
-    if covariance is None:
-        return None
-    return round(min(float(error @ np.linalg.pinv(covariance, hermitian=True) @ error), 1e6), 3)
 
 
 def hide_kidnapping(odom: Array, carried: int) -> Array:

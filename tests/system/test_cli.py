@@ -103,7 +103,7 @@ def test_tools_beside_a_session(presage, process, bus, link, monkeypatch):
         ("echo belief -n 2", 0, '"estimator": "'),
         ("hz scan --seconds 1", 0, "presage/"),
         ("hz goal --seconds 0.1", 2, "goal within 0.1 s: `presage top` shows which services run"),
-        ("--robot nobody hz --seconds 0.1", 2, "no robot 'nobody' is running: choose one of"),
+        ("--robot other hz --seconds 0.1", 2, "no robot 'other' is running: choose one of"),
         ("teleport 3.5 1.5 -90", 0, ""),
         ("teleport 0.1 0.1", 2, "from a wall of 'corridor'"),
         ("obstacle add crate 12 1.5 --yaw 30", 0, ""),

@@ -160,12 +160,9 @@ class LocalMap:
         return free
 
     def match(self, starts: Array, view: View, prior: MotionCandidate) -> Match | None:
-        """Returns the match of a scan with the key scans.
+        """Returns the match of a scan with the key scans; ``starts`` (N, 3) and ``prior`` are in the local frame.
 
-        Returns None if less than half of its points match, or if they show almost nothing of the place along some
-        direction.
-
-        ``starts`` (N, 3) and ``prior`` are poses in the local frame.
+        Returns None if less than half of its points match, or if they have almost no information along some direction.
         """
         if not self.scans or len(view.points) < MIN_POINTS:
             return None

@@ -21,13 +21,13 @@ CELL_M = 0.05  # points within one cell are averaged
 NEIGHBOURS, NEIGHBOUR_RADIUS_M = 10, 0.3  # points through which the line along a surface is fitted
 # Largest distance to the corresponding point, iteration by iteration.
 CORRESPONDENCE_RADII_M = (0.6, 0.6, 0.4, 0.4, 0.2, 0.2, 0.1, 0.1, 0.1, 0.1)
-CAUCHY_SCALE_M = 0.02  # of the Cauchy weight of a point by its distance from the line, and standard deviation of that
+CAUCHY_SCALE_M = 0.02  # standard deviation of a point's distance from its line, and scale of its Cauchy weight
 MATCHED_RADIUS_M = 0.08  # a point is matched if it is this near to one of another scan
 MIN_POINTS = 20  # of a scan that must have a corresponding point
 MIN_INFORMATION_RATIO = 0.02  # a direction is unobserved if its information, divided by that across it, is less
-# Relative to that of all points; it decides which direction counts as the weakest if there are no fixed points.
+# Weight of all points in the choice of the weakest direction, which they decide if there are no fixed points
 TIE_BREAK = 1e-3
-# That a surface which the map lacks, such as a person, has moved since the last key scan (a guess)
+# Probability (a guess) that a surface which the map lacks, such as a person, has moved since the last key scan
 MOVED_PROBABILITY = 0.2
 
 
@@ -101,8 +101,8 @@ class SurfacePoints:
                 return None
             index = nearest[paired]
             error = self._distance_from_line(placed[paired], index)
-            arm = placed[paired] - pose[:2]
-            J = _pose_derivative(self.normals[index], arm)
+            offset = placed[paired] - pose[:2]
+            J = se2.displacement_jacobian(offset, self.normals[index])
             weight = 1 / (1 + (error / CAUCHY_SCALE_M) ** 2)
             H = (J.T * weight) @ J
             pull = prior_information @ se2.difference(prior.mean, pose) - (J.T * weight) @ error
@@ -119,7 +119,7 @@ class SurfacePoints:
         of_fixed = (J[fixed].T * weight[fixed]) @ J[fixed]
         pull = -J[fixed].T @ (weight * self._distance_from_line(placed[paired], index))[fixed]
         # A tilted line adds information along itself.
-        along = _pose_derivative(self.normals[index] @ np.array([[0.0, 1.0], [-1.0, 0.0]]), arm)
+        along = se2.displacement_jacobian(offset, se2.rotate(np.pi / 2, self.normals[index]))
         spurious = weight * self.direction_variances[index]
         shown_by_fixed = subtract_spurious(of_fixed, (along[fixed].T * spurious[fixed]) @ along[fixed])
         weakest = np.linalg.eigh(position_information(shown_by_fixed + TIE_BREAK * H))[1][:, 0]
@@ -176,8 +176,3 @@ def _average_in_cells(points: Array) -> Array:
     _, cell = np.unique(column * 2**32 + row, return_inverse=True)
     count = np.bincount(cell)
     return np.stack([np.bincount(cell, values) / count for values in points.T], axis=-1)
-
-
-def _pose_derivative(directions: Array, arms: Array) -> Array:
-    """Derivatives (K, 3) by x, y, yaw of the positions of points along unit vectors (K, 2), ``arms`` (K, 2) m away."""
-    return np.column_stack([directions, directions[:, 1] * arms[:, 0] - directions[:, 0] * arms[:, 1]])

@@ -80,8 +80,7 @@ def register(surface: Surface, elements: Elements, start: Array, prior: PosePrio
         nearest = nearest[paired]
         normal = surface.elements.normals[nearest]
         error = np.einsum("ni,ni->n", normal, placed.points[paired] - surface.elements.points[nearest])
-        arm = placed.points[paired] - pose[:2]
-        J = np.column_stack([normal, normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]])
+        J = se2.displacement_jacobian(placed.points[paired] - pose[:2], normal)
         weight = 1 / (1 + (error / RESIDUAL_M) ** 2) / RESIDUAL_M**2
         H = (J.T * weight) @ J
         off, squared = prior.difference(pose)

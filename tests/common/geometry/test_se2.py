@@ -50,6 +50,18 @@ def test_jacobians(a, b):
             assert found[:, axis] == pytest.approx(difference / (2 * h), abs=1e-4)
 
 
+@given(poses, poses, st.floats(-np.pi, np.pi))
+def test_displacement_jacobian_is_the_finite_difference(pose, point, heading):
+    direction, h = np.array([[np.cos(heading), np.sin(heading)]]), 1e-6
+    offset = se2.transform(pose, point[None, :2]) - pose[:2]
+    steps = [
+        (se2.transform(pose + axis, point[None, :2]) - se2.transform(pose - axis, point[None, :2])) @ direction[0]
+        for axis in h * np.eye(3)
+    ]
+    expected = np.concatenate(steps) / (2 * h)
+    assert se2.displacement_jacobian(offset, direction)[0] == pytest.approx(expected, abs=1e-4)
+
+
 @given(poses, poses)
 def test_points_transform_like_poses(a, b):
     assert se2.transform(a, b[None, :2])[0] == pytest.approx(se2.compose(a, b)[:2], abs=1e-9)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from lab.integrity.report import reliability_diagram, table
-from lab.integrity.scoring import MAX_NEES, Estimates, longest_run, reliability, score_case, score_trial, share_of_scans
+from lab.integrity.scoring import Estimates, longest_run, reliability, score_case, score_trial, share_of_scans
+from lab.statistics import MAX_NEES
 from services.estimator.shared.interface import Hypothesis, Posterior
 
 TRUTHS = np.tile([1.0, 2.0, np.pi - 0.01], (6, 1))

@@ -15,7 +15,7 @@ def test_error_for_an_unknown_robot(bus, link):
     bus.declare_alive("controller")
     with pytest.raises(UserError, match="no status"), session_bus(link):
         raise UserError("no status")
-    reason = f"no robot 'nobody' is running: choose .*{link.robot}"
-    link_of_nobody = dataclasses.replace(link, robot="nobody")
-    with pytest.raises(UserError, match=reason), session_bus(link_of_nobody):
+    reason = f"no robot 'other' is running: choose .*{link.robot}"
+    other_link = dataclasses.replace(link, robot="other")
+    with pytest.raises(UserError, match=reason), session_bus(other_link):
         raise UserError("no status")
