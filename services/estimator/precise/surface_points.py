@@ -160,11 +160,14 @@ def subtract_spurious(information: Array, spurious: Array) -> Array:
 
     Their ratio is limited to 1 along the directions in which both are diagonal, so units do not matter.
     """
-    root = np.linalg.cholesky(information + (1e-6 * np.trace(information) + 1e-9) * np.eye(3))
+    unit = np.sqrt(np.diag(information))
+    unit[unit == 0] = 1.0
+    units = np.outer(unit, unit)
+    root = np.linalg.cholesky(information / units + 1e-6 * np.eye(3))  # which exists without information too
     inverse = np.linalg.inv(root)
-    kept, directions = np.linalg.eigh(inverse @ (information - spurious) @ inverse.T)
+    kept, directions = np.linalg.eigh(inverse @ ((information - spurious) / units) @ inverse.T)
     half = root @ directions * np.sqrt(np.maximum(kept, 0.0))
-    return np.asarray(half @ half.T)
+    return np.asarray(half @ half.T * units)
 
 
 def _average_in_cells(points: Array) -> Array:
