@@ -108,7 +108,6 @@ class PanoramaModel:
     half: float  # m, half the world's longer side
     range_scale: float  # m
     bins: int
-    ripple: float = 0.0  # not measured for this model
 
     def expect(self, lasers: Array, angles: Array) -> Expected:
         """See GenerativeModel. Interpolates linearly between the directions of the network."""

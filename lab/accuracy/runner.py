@@ -22,7 +22,7 @@ from lab.statistics import bootstrap_interval, median, root_mean_square, wilson_
 from lab.workers import pool
 from services.estimator.factory import ScannerGeometry
 from services.estimator.precise.field import FieldModel
-from services.estimator.precise.learning.field_learning import Recipe, learn_field, learn_scales, measure_ripple
+from services.estimator.precise.learning.field_learning import Recipe, learn_field, learn_scales
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.interface import PoseEstimator
 
@@ -110,8 +110,7 @@ def quick_field(
         clean, noisy = (np.where(ranges > geometry.range_max, np.inf, ranges) for ranges in (clean, noisy))
     field = learn_field(Beams.of(poses[split:], geometry.mount, geometry.angles, noisy), Recipe(sweeps=6))
     scales = learn_scales(field, poses[:split], geometry.mount, geometry.angles, clean[:split], 0.0)
-    ripple = measure_ripple(field, se2.compose(poses[:split], geometry.mount), geometry.angles)
-    return FieldModel(field, scales, ripple)
+    return FieldModel(field, scales)
 
 
 def _row(job: AccuracyJob, world: str, task: str, outcome: tasks.TaskOutcome) -> dict[str, Any]:

@@ -45,7 +45,6 @@ class Part:
     phi: np.ndarray[tuple[int, ...], np.dtype[np.float32]]  # (ny, nx) m
     origin: Array  # (2,) m, of node (0, 0)
     scales: Array
-    ripple: float
     places: Array  # (S, 2) m
     area: float  # m²
 
@@ -118,13 +117,12 @@ def _part(out: Path, seed: int) -> Part:
             phi=field.phi,
             origin=field.origin,
             scales=model.scales,
-            ripple=model.ripple,
             places=places,
             area=world.free_area,
         )
     with np.load(file) as data:
         values = dict(data)
-    return Part(seed=seed, **values | {"ripple": float(values["ripple"]), "area": float(values["area"])})
+    return Part(seed=seed, **values | {"area": float(values["area"])})
 
 
 def site_of(parts: list[Part]) -> Site:
@@ -141,8 +139,7 @@ def site_of(parts: list[Part]) -> Site:
         phi[i : i + part.phi.shape[0], j : j + part.phi.shape[1]] = part.phi
     offsets = np.array(corners)[:, ::-1] * CELL_M - [part.origin for part in parts]
     scales = np.sqrt(np.mean([part.scales**2 for part in parts], axis=0))
-    ripple = float(np.mean([part.ripple for part in parts]))
-    model = FieldModel(DistanceField(phi, (0.0, 0.0), CELL_M), scales, ripple)
+    model = FieldModel(DistanceField(phi, (0.0, 0.0), CELL_M), scales)
     places = np.concatenate([part.places + offset for part, offset in zip(parts, offsets, strict=True)])
     return Site(parts, offsets, model, Seeds.at(model, places))
 

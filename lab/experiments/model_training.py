@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,7 +24,6 @@ from services.estimator.precise.learning.field_learning import (
     Recipe,
     learn_field,
     learn_scales,
-    measure_ripple,
     seed_places,
 )
 from services.estimator.precise.learning.surfaces import Beams
@@ -137,7 +136,6 @@ def learn_precise(scene: Scene, samples: int) -> TrainedField:
     field = learn_field(Beams.of(data.poses[split:], mount, angles, data.ranges[split:]), recipe)
     held, scans = data.poses[:split], data.ranges[:split]
     model = FieldModel(field, learn_scales(field, held, mount, angles, scans, scanner.sigma))
-    model = replace(model, ripple=measure_ripple(field, se2.compose(held, mount), angles))
     visited = se2.compose(data.poses, mount)[:, :2]
     places = seed_places(field, visited)
     return TrainedField(model, Seeds.at(model, places), time.process_time() - began)

@@ -206,7 +206,6 @@ def card_of(
         resolution=options.recipe.resolution,
         origin=learned.model.field.origin,
         sweeps=options.recipe.sweeps,
-        ripple=learned.model.ripple,
         inflation=calibration.inflation,
         test_samples=calibration.scans,
         test_range_error_median_m=float(np.median(errors)),

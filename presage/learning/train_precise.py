@@ -27,7 +27,6 @@ from services.estimator.precise.learning.field_learning import (
     Recipe,
     learn_field,
     learn_scales,
-    measure_ripple,
     seed_places,
 )
 from services.estimator.precise.learning.surfaces import Beams
@@ -126,8 +125,7 @@ def _train(
     report("standard deviations", 1.0)
     count = CALIBRATION_SAMPLES
     scales = learn_scales(learned, poses["held out"][:count], mount, angles, scans["held out"][:count], 0.0)
-    ripple = measure_ripple(learned, se2.compose(poses["held out"][:count], mount), angles)
-    model = FieldModel(learned, scales, ripple)
+    model = FieldModel(learned, scales)
     errors = evaluate_model(
         model,
         poses["held out"][count:],
@@ -153,7 +151,6 @@ def _card(
         resolution=options.recipe.resolution,
         origin=model.field.origin,
         sweeps=options.recipe.sweeps,
-        ripple=model.ripple,
         inflation=round(errors.inflation, 3),
         test_samples=TEST_SAMPLES,
         test_range_error_median_m=errors.range_error_median,

@@ -94,7 +94,6 @@ def save_learned(
         resolution=field.resolution,
         origin=field.origin,
         sweeps=RECIPE.sweeps,
-        ripple=version.model.ripple,
         inflation=1.0 if card_before is None else card_before.inflation,
         test_samples=len(version.key_poses) // HELD_OUT_EVERY,
         test_range_error_median_m=float(np.median(errors)),

@@ -103,8 +103,6 @@ class PaperGenerativeModel:
     It predicts at one heading, only the beams of its training, and without derivative by yaw.
     """
 
-    ripple = 0.0  # unknown
-
     def __init__(self, model: PaperModel, scanner: Scanner, heading: float, scale: float) -> None:
         """``scale`` m is the stated error of every beam, since the decoder has the same precision for all."""
         self.model, self.scanner, self.heading, self.scale = model, scanner, heading, scale

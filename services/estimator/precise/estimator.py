@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,11 +16,9 @@ from services.estimator.precise.hypotheses import (
     Mode,
     UnknownPlace,
     clip_to_map,
-    constraining_beams,
-    is_unobserved,
-    principal_directions,
     probability_of_being_near,
     project_evidence,
+    unobserved_directions,
     update_mode,
     weigh,
 )
@@ -83,11 +82,22 @@ TARGET_BEAMS = 2000  # a scan with at least twice as many is thinned, because th
 class ScanMatch:
     """The poses at which a scan fits the map, near the predicted pose of each hypothesis."""
 
+    view: View
     # For each hypothesis the ways it may have moved, the widest at the end; a single one if the local map shows it.
     motions: list[list[MotionCandidate]]
     poses: Array  # (N, 3), one per hypothesis
     evidence: Evidence  # at these poses
     local_pose: Array | None = None  # (3,) in the local frame, if the motion comes from the local map
+
+    @cached_property
+    def explained(self) -> Array:
+        """Fraction (N,) of the beams that end at surfaces of the map."""
+        return self.view.surface_evidence(self.poses).explained
+
+    @cached_property
+    def unobserved(self) -> list[Array]:
+        """The directions that the scan does not observe, see `unobserved_directions`."""
+        return unobserved_directions(self.view, self.poses, self.evidence.curvature)
 
 
 class PreciseEstimator:
@@ -169,7 +179,7 @@ class PreciseEstimator:
         # Optimisation
         match = self._match_map(view, motions, period, with_odometry=odom is not None)
         # Local map
-        if view.surface_evidence(match.poses).explained[0] < self.settings.min_explained_share:
+        if match.explained[0] < self.settings.min_explained_share or len(match.unobserved[0]):
             predicted = expected_motion(motions[0]) if odom is not None else motions[0][-1]
             match = self._match_local_map(
                 view, match, self._predict_local_motion(period, odom, observation.command), predicted.covariance
@@ -179,11 +189,7 @@ class PreciseEstimator:
             # place, and may have stood still during the scan.
             view, match = self._correct_motion_again(view, observation, match, period)
         # Fusion of match and motion prior
-        explained_at = view.surface_evidence(match.poses).explained
-        modes = [
-            self._fuse(view, k, match, float(explained_at[k]), motions[k][-1], observation)
-            for k in range(len(explained_at))
-        ]
+        modes = [self._fuse(k, match, motions[k][-1], observation) for k in range(len(match.poses))]
         modes += self._find_alternatives(view, modes[0], match.motions[0], motions[0][-1])
         # Weights, also of the unknown place
         self._weigh_hypotheses(view, modes, match.local_pose, period)
@@ -292,7 +298,7 @@ class PreciseEstimator:
             before, after = view.surface_evidence(np.stack([poses[0], wider_poses[0]])).log_likelihood
             if after > before:
                 poses, evidence = wider_poses, wider_evidence
-        return ScanMatch(motions, poses, evidence)
+        return ScanMatch(view, motions, poses, evidence)
 
     def _match_local_map(self, view: View, match: ScanMatch, motions: list[MotionCandidate], prior: Array) -> ScanMatch:
         """Matches the scan to the map again, near the motion that scan matching to the local map gives.
@@ -310,7 +316,7 @@ class PreciseEstimator:
         step = se2.between(self.modes[0].pose, moved.mean)
         moves = [replace(moved, mean=se2.compose(mode.pose, step)) for mode in self.modes]
         poses, evidence = view.descend(np.array([each.mean for each in moves]), _prior_of(moves))
-        by_local_map = ScanMatch([[each] for each in moves], poses, evidence, found.pose)
+        by_local_map = ScanMatch(view, [[each] for each in moves], poses, evidence, found.pose)
         # The local map is wrong where people move all around the robot, the map where much has changed.
         both = np.stack([match.poses[0], poses[0]])
         map_evidence, local_evidence = _log_at_poses(
@@ -326,18 +332,10 @@ class PreciseEstimator:
         velocity = -se2.between(match.poses[0], self.modes[0].pose) / period
         view = self._correct_motion(view, observation, velocity)
         poses, evidence = view.descend(match.poses, _prior_of([each[-1] for each in match.motions]))
-        return view, replace(match, poses=poses, evidence=evidence)
+        return view, replace(match, view=view, poses=poses, evidence=evidence)
 
-    def _fuse(
-        self,
-        view: View,
-        k: int,
-        match: ScanMatch,
-        explained: float,
-        widest: MotionCandidate,
-        observation: Observation,
-    ) -> Mode:
-        """Fuses the k-th hypothesis with the scan, of whose beams the map explains the fraction ``explained``.
+    def _fuse(self, k: int, match: ScanMatch, widest: MotionCandidate, observation: Observation) -> Mode:
+        """Fuses the k-th hypothesis with the scan.
 
         A motion of which the robot is hardly capable, according to the ``widest`` candidate, is evidence against the
         hypothesis: the robot may have been carried there instead. Where the stamp is earlier than that of the last
@@ -345,9 +343,10 @@ class PreciseEstimator:
         """
         mode, period = self.modes[k], self._period(observation.stamp)
         candidates, pose, evidence = match.motions[k], match.poses[k], match.evidence
-        unobserved = self._remove_unobserved(view, mode, pose, evidence, k)
+        unobserved = match.unobserved[k]
+        project_evidence(evidence, k, unobserved)
         # Where the map explains few beams, all of them may do so by chance, which is no information about the pose.
-        evidence.scale(k, _fraction_not_by_chance(explained))
+        evidence.scale(k, _fraction_not_by_chance(float(match.explained[k])))
         # A match with the local map gives the motion in the unobserved directions, too.
         unknown_motion = len(unobserved) > 0 and match.local_pose is None
         if unknown_motion and self._odometry_since_last_scan(observation) is None:
@@ -370,31 +369,6 @@ class PreciseEstimator:
         if observation.stamp is not None and self._stamp is not None and observation.stamp < self._stamp:
             return updated
         return replace(updated, log_evidence=updated.log_evidence - widest.excess(best.mean))
-
-    def _remove_unobserved(self, view: View, mode: Mode, pose: Array, evidence: Evidence, k: int) -> Array:
-        """Returns the unit vectors (K, 3) of x, y, yaw that a scan at ``pose`` (3,) does not observe.
-
-        There are usually none, one along a corridor, and three where hardly any beam meets a surface. Removes the k-th
-        ``evidence`` along them, and that of the few beams on surfaces across a corridor, in place.
-        """
-        min_beams = self.settings.min_constraining_share * len(view.angles)
-        (weakest, strongest), ratio = principal_directions(evidence.curvature[k])
-        if mode.unobserved_scans:
-            # The pose may be metres off, so a ripple or a beam that fits by chance must not count as a feature.
-            min_beams *= 3
-        elif not is_unobserved(ratio, self.model.ripple):
-            return np.zeros((0, 3))
-        count, facing = constraining_beams(view, pose, weakest)
-        if count > min_beams:
-            return np.zeros((0, 3))
-        unobserved = np.eye(3)
-        if constraining_beams(view, pose, strongest)[0] > min_beams:
-            attention = view.surface_evidence(pose[None]).weights * ~facing
-            evidence.replace(k, view.evidence(pose[None], 0.0, attention))
-            (weakest, _), _ = principal_directions(evidence.curvature[k])
-            unobserved = np.array([[*weakest, 0.0]])
-        project_evidence(evidence, k, unobserved)
-        return unobserved
 
     def _find_alternatives(
         self, view: View, best: Mode, candidates: list[MotionCandidate], widest: MotionCandidate
@@ -756,7 +730,7 @@ def _log_at_poses(view: View, poses: Array, skip: npt.NDArray[np.bool_], surroun
     map lacks, a scan is equally likely at all poses. ``surroundings`` (..., N, 3) are their probabilities at the
     previous key scan. Also returns those at this scan.
     """
-    mapped = view.surface_evidence(poses, skip=skip).log_likelihood - _log_reference(view, skip)
+    mapped = view.surface_evidence(poses).without(skip) - _log_reference(view, skip)
     unmapped = np.full_like(mapped, _log_unmapped_surfaces(view, skip))
     with np.errstate(divide="ignore"):
         logs = np.log(surroundings @ NEXT_SURROUNDINGS) + np.stack([mapped, unmapped, unmapped], axis=-1)

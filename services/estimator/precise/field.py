@@ -139,7 +139,6 @@ class FieldModel:
     field: DistanceField
     # m, standard deviation of the prediction error in each class
     scales: Array = dataclasses.field(default_factory=lambda: np.full(int(np.prod(CLASSES)), 1e-3))
-    ripple: float = 0.0  # rad, see GenerativeModel
     seen: SeenCells | None = None  # None if the whole grid counts as seen
 
     def expect(self, lasers: Array, angles: Array) -> Expected:

@@ -6,6 +6,7 @@ the density).
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
@@ -79,13 +80,16 @@ class _PredictedScans:
     with_map_error: Expected  # with the learned error of the map as well
     behind: Array  # (N, B) m, to the map's next surface where the scan passes through the first, else inf
     borders: npt.NDArray[np.bool_]  # (N, B) see find_borders
-    evidence: dict[tuple[float, bytes | None], SurfaceEvidence] = field(default_factory=dict)
+    evidence: dict[float, SurfaceEvidence] = field(default_factory=dict)  # by ``extra_sigma``
 
     def first(self, count: int) -> _PredictedScans:
         """The same at the first ``count`` poses."""
         rows = slice(count)
         expected, with_map_error = self.expected.part(rows), self.with_map_error.part(rows)
-        return _PredictedScans(self.poses[rows], expected, with_map_error, self.behind[rows], self.borders[rows])
+        evidence = {extra_sigma: each.first(count) for extra_sigma, each in self.evidence.items()}
+        return _PredictedScans(
+            self.poses[rows], expected, with_map_error, self.behind[rows], self.borders[rows], evidence
+        )
 
 
 @dataclass(frozen=True)
@@ -105,7 +109,7 @@ class View:
     map_cell: float = 0.0  # m, edge of the cells if the map is a grid
     map_offset: float = 0.0  # m, mean distance of the real surfaces behind those that the model predicts
     log_prior: float = 0.0  # nats, of the probability that the map's error is this large
-    _last: list[_PredictedScans] = field(default_factory=list, init=False, repr=False)
+    _last: deque[_PredictedScans] = field(default_factory=lambda: deque(maxlen=2), init=False, repr=False)
 
     def thinned(self, beams: int) -> View:
         """Returns a view with every k-th beam, so that about ``beams`` are left."""
@@ -176,13 +180,11 @@ class View:
         beams = max(1.0, CORRELATION_LENGTH_M / max(spacing, 1e-3))  # on one correlation length
         return 1 + self.correlated_fraction * (beams - 1)
 
-    def surface_evidence(
-        self, poses: Array, extra_sigma: float = 0.0, skip: npt.NDArray[np.bool_] | None = None
-    ) -> SurfaceEvidence:
-        """Returns the evidence by surfaces at base_link poses (N, 3), see `SurfaceEvidence.from_scan` for ``skip``."""
-        at, key = self._predicted(poses), (extra_sigma, None if skip is None else skip.tobytes())
-        if key not in at.evidence:
-            at.evidence[key] = SurfaceEvidence.from_scan(
+    def surface_evidence(self, poses: Array, extra_sigma: float = 0.0) -> SurfaceEvidence:
+        """Returns the evidence by surfaces at base_link poses (N, 3)."""
+        at = self._predicted(poses)
+        if extra_sigma not in at.evidence:
+            at.evidence[extra_sigma] = SurfaceEvidence.from_scan(
                 self.ranges,
                 self.range_max,
                 at.with_map_error,
@@ -192,9 +194,8 @@ class View:
                 self.likelihood,
                 self.changed_fraction,
                 extra_sigma,
-                skip,
             )
-        return at.evidence[key]
+        return at.evidence[extra_sigma]
 
     def expected(self, pose: Array) -> Expected:
         """The scan that the model predicts at one ``pose`` (3,)."""
@@ -203,19 +204,23 @@ class View:
     def _predicted(self, poses: Array) -> _PredictedScans:
         """The scans predicted at poses (N, 3).
 
-        Caches the last result, because several kinds of evidence are computed at the same poses, or at the first few.
+        Caches the last two results, because several kinds of evidence are computed at the same poses, or at the first
+        few.
         """
-        if not self._last or not np.array_equal(self._last[0].poses[: len(poses)], poses):
-            lasers = se2.compose(poses, self.mount)
-            expected = self.expect(lasers)
-            with_map_error = self._with_map_error(expected)
-            with np.errstate(invalid="ignore"):
-                passed = self.ranges > expected.ranges + self.likelihood.deviation(expected.ranges)
-            behind = self.model.expect_behind(lasers, self.angles, np.where(passed, expected.ranges, np.inf))
-            borders = find_borders(expected, lasers, self.angles)
-            self._last[:] = [_PredictedScans(np.array(poses), expected, with_map_error, behind, borders)]
-        elif len(poses) < len(self._last[0].poses):
-            self._last[:] = [self._last[0].first(len(poses))]
+        for at in self._last:
+            if np.array_equal(at.poses[: len(poses)], poses):
+                if len(poses) < len(at.poses):
+                    self._last.appendleft(at.first(len(poses)))
+                    return self._last[0]
+                return at
+        lasers = se2.compose(poses, self.mount)
+        expected = self.expect(lasers)
+        with_map_error = self._with_map_error(expected)
+        with np.errstate(invalid="ignore"):
+            passed = self.ranges > expected.ranges + self.likelihood.deviation(expected.ranges)
+        behind = self.model.expect_behind(lasers, self.angles, np.where(passed, expected.ranges, np.inf))
+        borders = find_borders(expected, lasers, self.angles)
+        self._last.appendleft(_PredictedScans(np.array(poses), expected, with_map_error, behind, borders))
         return self._last[0]
 
     def evidence(self, poses: Array, extra_sigma: float = 0.0, attention: Array | None = None) -> Evidence:

@@ -12,7 +12,6 @@ import numpy.typing as npt
 from common.geometry import se2
 from services.estimator.precise.gauss_newton import MAX_STEP, Prior, limit_steps, position_information
 from services.estimator.precise.motion_model import smooth_velocity
-from services.estimator.shared.generative_models import CORNER_ANGLE_RAD
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -22,9 +21,9 @@ if TYPE_CHECKING:
 
 NEAR_POSITION_M, NEAR_HEADING_RAD = 0.2, math.radians(5)  # a pose with a larger error is wrong
 SAME_POSITION_M, SAME_HEADING_RAD = 0.1, 0.1  # hypotheses nearer to one another than this are merged
-# A direction counts as unobserved if its information, divided by that across it, is less than the ratio plus the factor
-# times the squared ripple of the learned field.
-MIN_INFORMATION_RATIO, RIPPLE_FACTOR = 1e-4, 7.0
+# A direction counts as unobserved unless the scan is this much less probable, in nats, at both sides of the pose, this
+# far away. (Both are guesses.)
+MIN_FALL, AWAY_M = math.log(100), 0.1
 WEAK_PRIOR = np.eye(3)  # 1/m², 1/rad²: keeps the covariance finite along unobserved directions
 MIN_WEIGHT = 1e-9  # hypotheses with less weight are dropped
 # The surfaces that a key scan shows for the first time are as the map predicts (0), clutter (1), or in a room that the
@@ -100,19 +99,31 @@ class UnknownPlace:
         self.log_evidence = self.log_off_map
 
 
-def principal_directions(curvature: Array) -> tuple[Array, float]:
-    """The directions (2, 2), as rows, of least and most information in a scan, and the ratio of the two."""
-    values, vectors = np.linalg.eigh(position_information(curvature))
-    return vectors.T, float(values[0] / values[1]) if values[1] > 0 else 0.0
+def unobserved_directions(view: View, poses: Array, curvatures: Array) -> list[Array]:
+    """The unit vectors (K, 3) of x, y, yaw that a scan does not observe at each of the ``poses`` (N, 3).
 
-
-def is_unobserved(ratio: float, ripple: float) -> bool:
-    """Whether a scan does not observe a direction, by the ``ratio`` of its information to that across it.
-
-    In a corridor without features a learned field still has ripples: walls tilted by about ``ripple`` rad, which add
-    along the corridor about ripple² of the curvature across it. Only information that clearly exceeds this counts.
+    ``curvatures`` (N, 3, 3) are those of its accuracy. There are usually none, one along a corridor, and three where
+    hardly any beam meets a surface. The curvature does not tell, because it is that at one pose: in a corridor without
+    features, the ripples of a learned wall have some at each pose, and so has a rounded corner. What tells is how much
+    less probable the scan is a bit farther along.
     """
-    return ratio < MIN_INFORMATION_RATIO + RIPPLE_FACTOR * ripple**2
+    axes = [np.linalg.eigh(position_information(curvature))[1].T for curvature in curvatures]  # weakest first
+    unobserved = [np.zeros((0, 3))] * len(poses)
+    for k in np.flatnonzero(~_are_observed(view, poses, curvatures, np.array([weakest for weakest, _ in axes]))):
+        each, (weakest, strongest) = slice(k, k + 1), axes[k]
+        across = _are_observed(view, poses[each], curvatures[each], strongest[None])[0]
+        unobserved[k] = np.array([[*weakest, 0.0]]) if across else np.eye(3)
+    return unobserved
+
+
+def _are_observed(view: View, poses: Array, curvatures: Array, directions: Array) -> npt.NDArray[np.bool_]:
+    """Mask (N,) of the poses whose position along ``directions`` (N, 2) a scan shows, with the best heading there."""
+    turns = -np.einsum("ni,ni->n", curvatures[:, 2, :2], directions) / np.maximum(curvatures[:, 2, 2], 1e-12)
+    steps = AWAY_M * np.column_stack([directions, turns])
+    here, away = (
+        view.surface_evidence(at).log_likelihood for at in (poses, np.concatenate([poses + steps, poses - steps]))
+    )
+    return np.asarray(here - away.reshape(2, -1).max(axis=0) > MIN_FALL)
 
 
 def project_evidence(evidence: Evidence, k: int, unobserved: Array) -> None:
@@ -126,15 +137,14 @@ def project_evidence(evidence: Evidence, k: int, unobserved: Array) -> None:
 
 
 def mode_from_search(
-    pose: Array, evidence: Evidence, k: int, prior: Prior | None, volume: float, unknown: Array, ripple: float
+    view: View, pose: Array, evidence: Evidence, k: int, prior: Prior | None, volume: float, unknown: Array
 ) -> Mode:
-    """A hypothesis found by a search, from the k-th evidence at ``pose`` (3,).
+    """A hypothesis found by a search, from the k-th evidence of a scan at ``pose`` (3,).
 
     Without a prior, all poses in ``volume`` m² rad were equally likely. ``unknown`` (3, 3), the covariance of an
     unknown pose, remains along unobserved directions.
     """
-    (weakest, _), ratio = principal_directions(evidence.curvature[k])
-    project_evidence(evidence, k, np.array([[*weakest, 0.0]]) if is_unobserved(ratio, ripple) else np.zeros((0, 3)))
+    project_evidence(evidence, k, unobserved_directions(view, pose[None], evidence.curvature[k : k + 1])[0])
     information = prior.information[k] if prior else np.linalg.inv(unknown)
     inverse = np.linalg.inv(evidence.curvature[k] + information)
     slope = evidence.xi[k] + (prior.information[k] @ se2.difference(prior.mean[k], pose) if prior else 0)
@@ -248,19 +258,6 @@ def weigh(modes: list[Mode], log_unknown: float, count: int) -> tuple[list[Mode]
     known = known / known[known > MIN_WEIGHT].sum()
     weighted = [replace(modes[k], weight=float(w)) for k, w in zip(kept, known, strict=True) if w > MIN_WEIGHT]
     return weighted, float(weights[-1])
-
-
-def constraining_beams(view: View, pose: Array, direction: Array) -> tuple[float, npt.NDArray[np.bool_]]:
-    """Expected number of beams on surfaces of the map that face ``direction`` (2,), and so constrain the pose along it.
-
-    Also returns the mask (B,) of the beams that the map predicts on such surfaces.
-    """
-    expected = view.expect(se2.compose(pose, view.mount)[None])
-    normal, surface, scale = expected.jacobian[0, :, :2], expected.ranges[0], expected.scale[0]
-    facing = np.abs(normal @ direction) > np.sin(CORNER_ANGLE_RAD) * np.hypot(*normal.T)
-    used = facing & np.isfinite(view.ranges) & np.isfinite(surface)
-    count = view.likelihood.inlier(view.ranges[used], surface[used], scale[used], view.range_max).sum()
-    return float(count), facing
 
 
 def probability_of_being_near(covariance: Array) -> float:

@@ -52,11 +52,6 @@ class Evidence:
         """Returns the evidence at some of the poses."""
         return Evidence(*(values[rows] for values in vars(self).values()))
 
-    def replace(self, row: int, other: Evidence) -> None:
-        """Replaces the evidence at one pose by the first of another, in place."""
-        for values, replacement in zip(vars(self).values(), vars(other).values(), strict=True):
-            values[row] = replacement[0]
-
     def scale(self, row: int, factor: float) -> None:
         """Multiplies the derivatives at one pose, and the covariances of xi, by ``factor``, in place."""
         for values in (self.xi, self.curvature, self.xi_noise_covariance, self.xi_model_covariance):
@@ -118,8 +113,10 @@ class Likelihood:
         """Density p(o | g) (K,) in 1/m at measured (K,) m; its integral and the probability of no return sum to 1."""
         if expected >= range_max:
             return np.full(len(measured), self.unseen / range_max)
-        core, outliers = self._inlier_and_outlier_density(measured, expected, scale, range_max)
-        return np.asarray((1 - self.unseen) * (core + outliers))
+        variance = self.deviation(np.asarray(expected)) ** 2 + scale**2
+        core = np.exp(-0.5 * (measured - expected) ** 2 / variance) / np.sqrt(2 * np.pi * variance)
+        outliers = self.short / max(expected, 1e-3) * (measured < expected) + self.random / range_max
+        return np.asarray((1 - self.unseen) * ((1 - self.short - self.random) * core + outliers))
 
     def cumulative(self, measured: Array, expected: Array, scale: Array, range_max: float) -> Array:
         """Probability (K,) of a range of at most ``measured`` (K,) m, given that the beam returns."""
@@ -128,16 +125,3 @@ class Likelihood:
         early = np.minimum(measured / np.maximum(expected, 1e-3), 1.0)
         flat = np.minimum(measured / range_max, 1.0)
         return np.asarray((1 - self.short - self.random) * core + self.short * early + self.random * flat)
-
-    def inlier(self, measured: Array, expected: Array, scale: Array, range_max: float) -> Array:
-        """Probability (K,) that the beam ended at the expected surface; finite ranges (K,) m."""
-        core, outliers = self._inlier_and_outlier_density(measured, expected, scale, range_max)
-        return np.asarray(core / (core + outliers))
-
-    def _inlier_and_outlier_density(
-        self, measured: Array, expected: Array | float, scale: Array | float, range_max: float
-    ) -> tuple[Array, Array]:
-        variance = self.deviation(np.asarray(expected)) ** 2 + scale**2
-        core = np.exp(-0.5 * (measured - expected) ** 2 / variance) / np.sqrt(2 * np.pi * variance)
-        outliers = self.short / np.maximum(expected, 1e-3) * (measured < expected) + self.random / range_max
-        return (1 - self.short - self.random) * core, outliers

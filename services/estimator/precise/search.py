@@ -91,17 +91,18 @@ def _best_modes(
     view: View, poses: Array, evidence: Evidence, prior: Prior | None, seeds: Seeds, settings: PreciseSettings
 ) -> list[Mode]:
     """The hypotheses with most evidence by surfaces among ``poses`` (N, 3), best first."""
-    surfaces = view.surface_evidence(poses, skip=view.surfaces.small)
+    surfaces = view.surface_evidence(poses)
+    log_likelihood = surfaces.without(view.surfaces.small)
     log_prior = -prior.energy(poses) if prior else np.zeros(len(poses))
     modes = []
-    for k in select_distinct(poses, -surfaces.log_likelihood - log_prior, settings.max_hypotheses):
-        mode = mode_from_search(poses[k], evidence, k, prior, seeds.volume, seeds.spread, view.model.ripple)
+    for k in select_distinct(poses, -log_likelihood - log_prior, settings.max_hypotheses):
+        mode = mode_from_search(view, poses[k], evidence, k, prior, seeds.volume, seeds.spread)
         modes.append(
             replace(
                 mode,
                 explained=float(surfaces.explained[k]),
                 log_evidence=view.log_prior + mode.log_evidence + float(log_prior[k]),
-                present=float(surfaces.log_likelihood[k]),
+                present=float(log_likelihood[k]),
             )
         )
     return modes

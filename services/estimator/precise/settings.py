@@ -21,7 +21,6 @@ class PreciseSettings:
 
     # Following
     min_explained_share: float = 0.75  # if the map explains a smaller fraction of beams, recent scans give the motion
-    min_constraining_share: float = 0.004  # fraction of the beams needed to fix the position along a corridor
 
     # Belief. The probabilities are guesses.
     unknown_probability: float = 1e-5  # least probability that the robot is at none of the hypotheses

@@ -49,7 +49,7 @@ jit = numba.njit(cache=True, nogil=True, error_model="numpy")
 class SurfaceEvidence:
     """Evidence of one scan at N poses."""
 
-    log_likelihood: Array  # (N,) nats, of the beams that are not skipped
+    by_beam: Array  # (N, B) nats, log likelihood of each beam given those before it; 0 for a beam without a range
     explained: Array  # (N,) expected fraction of the beams that end at a surface of the map, the first or the next
     weights: Array  # (N, B) probability that a beam ends at the first surface of the map
 
@@ -65,18 +65,15 @@ class SurfaceEvidence:
         likelihood: Likelihood,
         changed_fraction: float,
         extra_sigma: float = 0.0,
-        skip: npt.NDArray[np.bool_] | None = None,
     ) -> SurfaceEvidence:
         """Compares a scan (B,) m with the scans that are expected at N poses.
 
         ``behind`` (N, B) m are the ranges to the map's next surface behind the expected one; ``borders`` (N, B) is true
-        where the map shows another surface than at the beam before. Beams in ``skip`` (B,) do not count for the
-        likelihood, but for ``explained`` and ``weights``. ``changed_fraction`` is the fraction of the beams that hit no
-        surface of the map.
+        where the map shows another surface than at the beam before. ``changed_fraction`` is the fraction of the beams
+        that hit no surface of the map.
         """
         count = len(expected.ranges)
-        total, explained, weights = np.empty(count), np.empty(count), np.empty(expected.ranges.shape)
-        skipped = np.zeros(len(ranges), np.bool_) if skip is None else skip
+        by_beam, explained, weights = np.empty(expected.ranges.shape), np.empty(count), np.empty(expected.ranges.shape)
         sigma = math.hypot(likelihood.sigma, extra_sigma)
         prior = changed_fraction * CHANGED_STATE_PRIOR
         prior[0] = 1 - changed_fraction
@@ -93,14 +90,26 @@ class SurfaceEvidence:
             surfaces.known_log_density,
             surfaces.starts,
             surfaces.edge_tolerance,
-            skipped,
             prior,
             surfaces.switch_probability,
-            total,
+            by_beam,
             explained,
             weights,
         )
-        return cls(total, explained, weights)
+        return cls(by_beam, explained, weights)
+
+    @property
+    def log_likelihood(self) -> Array:
+        """Log likelihood (N,) in nats of all beams."""
+        return np.asarray(self.by_beam.sum(axis=1))
+
+    def without(self, skip: npt.NDArray[np.bool_]) -> Array:
+        """Log likelihood (N,) in nats of the beams that are not in ``skip`` (B,)."""
+        return np.asarray(self.by_beam[:, ~skip].sum(axis=1))
+
+    def first(self, count: int) -> SurfaceEvidence:
+        """The evidence at the first ``count`` poses."""
+        return SurfaceEvidence(self.by_beam[:count], self.explained[:count], self.weights[:count])
 
 
 @jit
@@ -188,10 +197,9 @@ def _forward_backward(
     known_log_density: Array,
     starts: npt.NDArray[np.bool_],
     edge_tolerance: npt.NDArray[np.int64],
-    skip: npt.NDArray[np.bool_],
     prior: Array,
     switch_probability: float,
-    total: Array,
+    by_beam: Array,
     explained: Array,
     weights: Array,
 ) -> None:
@@ -200,7 +208,8 @@ def _forward_backward(
     size, states = len(used), len(prior)
     forward, emitted, keep = np.empty((size, states)), np.empty((size, states)), np.empty((size, states))
     for k in range(expected.shape[0]):
-        total[k], explained[k] = 0.0, 0.0
+        explained[k] = 0.0
+        by_beam[k] = 0.0
         weights[k] = 0.0
         for n in range(size):
             b = used[n]
@@ -222,9 +231,7 @@ def _forward_backward(
                 starts[b],
                 emitted[n],
             )
-            norm = _step_forward(forward, emitted, prior, keep[n], n)
-            if not skip[b]:
-                total[k] += norm
+            by_beam[k, b] = _step_forward(forward, emitted, prior, keep[n], n)
         backward = np.ones(states)
         for n in range(size - 1, -1, -1):
             b = used[n]

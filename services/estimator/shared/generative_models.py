@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.geometry.world import World
 
-CORNER_ANGLE_RAD = 0.3  # a surface tilted by more is a corner, and not a ripple caused by learning
 PASSED_M = 1e-3  # distance behind a surface from which a ray is continued, so that it does not hit the same surface
 EXACT_SCALE_M = 1e-4  # standard deviation stated for exact rays: their rounding errors
 
@@ -49,14 +48,6 @@ class Expected:
 class GenerativeModel(Protocol):
     """Predicts scans at poses of the laser."""
 
-    @property
-    def ripple(self) -> float:
-        """Standard deviation in rad of the normals that the model predicts for flat surfaces.
-
-        Such ripples look like information about the position along a wall, but they are errors.
-        """
-        ...
-
     def expect(self, lasers: Array, angles: Array) -> Expected:
         """Predicts scans at laser poses (N, 3) in map, along beams at ``angles`` (B,) rad in the laser frame."""
         ...
@@ -74,7 +65,6 @@ class RayCaster:
     """The exact model, which casts rays in the world: the limit of what learning can reach."""
 
     world: World
-    ripple: float = 0.0
     offset: float = 0.0  # m, distance of the real surfaces behind those of the world, as in a map of cells
 
     def expect(self, lasers: Array, angles: Array) -> Expected:

@@ -45,7 +45,6 @@ class HalfLearned:
     """A model of the hall that was learned only in its western half."""
 
     world: World = HALL
-    ripple: float = 0.0
 
     def expect(self, lasers, angles):
         whole = RayCaster(self.world).expect(lasers, angles)

@@ -165,6 +165,18 @@ def straight(x, y, yaw, length, speed=1.0):
     return np.array([x, y, yaw]) + along * np.array([np.cos(yaw), np.sin(yaw), 0.0])
 
 
+def test_motion_along_a_hall_by_what_the_map_lacks():
+    """The map explains most of the scan, but only new columns show the motion along it."""
+    made, _ = estimator(HALL, 360)
+    columns = [{"circle": {"center": (25.0 + 3 * k, 0.3 + 1.4 * (k % 2)), "radius": 0.1}} for k in range(6)]
+    scene = Scene.of(World(name="hall", boundary=HALL.boundary, obstacles=columns), 360, 4)
+    path = straight(27.0, 1.0, 0.0, 3.0, speed=0.8)
+    found = drive(made, scene, path)
+    assert made.modes[0].explained > made.settings.min_explained_share
+    error, stated = off(found[-1], path[-1]), np.sqrt(np.diag(found[-1].covariance))
+    assert abs(error[0]) < min(0.2, 3 * stated[0])
+
+
 def test_slip_where_nothing_is_in_range():
     """The error of slipping wheels grows with the distance; the belief does not presume that it averages out."""
     made, scene = estimator(WIDE_HALL, range_max=4.0)

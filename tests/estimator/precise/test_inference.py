@@ -15,7 +15,7 @@ from common.geometry.world import World
 from services.estimator.precise import beam_sums, global_seeds
 from services.estimator.precise.gauss_newton import MAX_STEP, Prior, View
 from services.estimator.precise.global_seeds import Seeds, thin_places
-from services.estimator.precise.hypotheses import Mode, constraining_beams, select_distinct, weigh
+from services.estimator.precise.hypotheses import Mode, select_distinct, unobserved_directions, weigh
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.motion_model import (
     MotionCandidate,
@@ -281,19 +281,19 @@ def test_hypothesis_weights():
     assert best.weight == unknown == 1
 
 
-def test_constraining_beams():
-    """Along a hall only the beams that reach its ends fix the position, unless something hides the ends."""
+def test_unobserved_directions():
+    """Along a hall, the ends show the position, unless something hides them."""
     hall = RayCaster(World(name="hall", boundary=[(0, 0), (20, 0), (20, 2), (0, 2)]))
-    pose, (along, across) = np.array([10.0, 1.0, 0.0]), np.eye(2)
+    pose = np.array([10.0, 1.0, 0.3])
     clean = hall.expect(pose[None], ANGLES).ranges[0]
-    at_ends = np.abs(np.sin(ANGLES)) * clean < 0.99
     seen = View(hall, Likelihood(), np.zeros(3), ANGLES, clean, 25.0)
-    count, facing = constraining_beams(seen, pose, along)
-    assert count == pytest.approx(at_ends.sum(), rel=0.1)
-    assert facing.tolist() == at_ends.tolist()
-    assert constraining_beams(seen, pose, across)[0] > 10 * at_ends.sum()
-    hidden = replace(seen, ranges=np.where(at_ends, 0.8, clean))
-    assert constraining_beams(hidden, pose, along)[0] < 0.1
+    curvature = seen.evidence(pose[None]).curvature
+    assert unobserved_directions(seen, pose[None], curvature)[0].shape == (0, 3)
+    hidden = replace(seen, ranges=np.where(clean > 6, 0.8, clean))
+    ((along,),) = unobserved_directions(hidden, pose[None], curvature)
+    assert np.abs(along) == pytest.approx([1.0, 0.0, 0.0], abs=0.01)
+    nothing = replace(seen, ranges=np.full_like(clean, 0.8))
+    assert unobserved_directions(nothing, pose[None], curvature)[0] == pytest.approx(np.eye(3))
 
 
 def test_headings_across_pi():

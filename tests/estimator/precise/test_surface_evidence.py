@@ -156,9 +156,10 @@ def test_forward_and_backward_algorithm(seed):
     made = ScanSurfaces(density, starts, ideal, np.zeros(BEAMS, np.bool_), edges, change)
     expected = Expected(surface[None], scale[None], np.zeros((1, BEAMS, 3)))
     found = SurfaceEvidence.from_scan(
-        ranges, RANGE_MAX, expected, behind[None], borders[None], made, likelihood, CHANGED_FRACTION, skip=skip
+        ranges, RANGE_MAX, expected, behind[None], borders[None], made, likelihood, CHANGED_FRACTION
     )
-    assert found.log_likelihood[0] == pytest.approx(total, abs=1e-9)
+    assert found.without(skip)[0] == pytest.approx(total, abs=1e-9)
+    assert found.log_likelihood[0] == pytest.approx(found.without(np.zeros(BEAMS, np.bool_))[0])
     assert found.weights[0] == pytest.approx(weights, abs=1e-9)
 
 

@@ -22,7 +22,6 @@ from services.estimator.precise.learning.field_learning import (
     Recipe,
     learn_field,
     learn_scales,
-    measure_ripple,
     seed_places,
     seen_cells,
 )
@@ -65,16 +64,15 @@ def learn_drive(
         lambda done: report("first field, without the held-out scans", 0.4 * done),
         replayed=replayed,
     )
-    lasers = se2.compose(held_out.poses, held_out.mount)
     scales = learn_scales(trial.field, held_out.poses, held_out.mount, held_out.angles, held_out.ranges, sigma)
-    trial = replace(trial, scales=scales, ripple=measure_ripple(trial.field, lasers, held_out.angles))
+    trial = replace(trial, scales=scales)
     report("calibration", 0.45)
     motion = learn_motion(drive.stamps, drive.poses, drive.odom)
     calibration = calibrate(trial, held_out, motion, sigma)
     final = _learn_model(
         drive, recipe, simulated, lambda done: report("final field", 0.55 + 0.4 * done), replayed=replayed
     )
-    final = replace(final, scales=scales, ripple=trial.ripple)
+    final = replace(final, scales=scales)
     visited = se2.compose(drive.poses, drive.mount)[:, :2]
     if simulated is not None:  # rooms that the drive did not enter, perhaps because a door was closed
         visited = np.concatenate([visited, free_places(final, np.unique(simulated.starts, axis=0))])

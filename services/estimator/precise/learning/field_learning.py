@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from common.geometry.se2 import Array, compose, wrap
+from common.geometry.se2 import Array, compose
 from common.robot.stray_beams import has_neighbours
 from services.estimator.precise.field import CLASSES, SEEN_CELL_M, DistanceField, Floats, SeenCells
 from services.estimator.precise.global_seeds import SEED_SPACING_M, thin_places
@@ -30,7 +30,6 @@ from services.estimator.precise.learning.surfaces import (
     are_mostly_passed,
     field_of_surfaces,
 )
-from services.estimator.shared.generative_models import CORNER_ANGLE_RAD
 
 CARVED_DISTANCE_CELLS = 0.5  # minimum of phi at a node through which beams pass
 PASSING_CELLS = 0.25  # a beam passes a node within this distance
@@ -41,7 +40,6 @@ MIN_FACING = 0.15  # minimum |n . u| of a beam that shapes the field: cosine of 
 PRIOR_COUNT, PRIOR_SCALE_M = 20, 0.05  # pseudo-count of each class, and its error, for classes that are seldom seen
 MIN_SCALE_M = 1e-3
 SEED_CLEARANCE_M = 0.1  # minimum distance from surfaces of a place where a search begins
-RIPPLE_BEAMS = 10  # a beam's normal is compared with those of the beams this many beams to either side
 
 
 @dataclass(frozen=True)
@@ -105,23 +103,6 @@ def reachable(field: DistanceField, visited: Array, seen: SeenCells | None = Non
     column, row = np.round((visited - field.origin) / field.resolution).astype(int).T
     i, j = np.nonzero(free & np.isin(region, region[row, column]))
     return np.asarray(np.array(field.origin) + field.resolution * np.column_stack([j, i]))
-
-
-def measure_ripple(field: DistanceField, lasers: Array, angles: Array) -> float:
-    """Standard deviation in rad of the normals of flat surfaces in the field.
-
-    Compares the normal at a beam's end with the mean of the normals `RIPPLE_BEAMS` to its left and right. Differences
-    of more than `CORNER_ANGLE_RAD` are corners and do not count.
-    """
-    normal = field.trace(lasers, angles).jacobian[..., :2]
-    yaw = np.arctan2(normal[..., 1], normal[..., 0])
-    left, right = (
-        wrap(yaw[:, shift : yaw.shape[1] - 2 * RIPPLE_BEAMS + shift] - yaw[:, RIPPLE_BEAMS:-RIPPLE_BEAMS])
-        for shift in (0, 2 * RIPPLE_BEAMS)
-    )
-    flat = (np.abs(left) < CORNER_ANGLE_RAD) & (np.abs(right) < CORNER_ANGLE_RAD)
-    # A mean of two errors minus a third error has 1.5 times the variance of one error.
-    return float(np.sqrt(np.mean(((left + right)[flat] / 2) ** 2) / 1.5)) if flat.any() else 0.0
 
 
 def _clear_passed_nodes(field: DistanceField, beams: Beams, threads: int) -> Floats:

@@ -25,7 +25,6 @@ from services.estimator.precise.learning.field_learning import (
     MAX_ERROR_M,
     Recipe,
     learn_scales,
-    measure_ripple,
     seed_places,
     seen_cells,
 )
@@ -103,12 +102,11 @@ def learn_version(
     if mean_error(errors) > MAX_WORSENING * mean_error(present_errors):
         return None
     scales = learn_scales(trial.field, held_out.poses, held_out.mount, held_out.angles, held_out.ranges, sigma)
-    ripple = measure_ripple(trial.field, se2.compose(held_out.poses, held_out.mount), held_out.angles)
     final = _learn(aligned, overlapping.joined(elsewhere), recipe, EPOCHS)
     visited = se2.compose(aligned.poses, aligned.mount)[:, :2]
     starts = seed_places(final.field, np.concatenate([visited, free_places(final, places)]), final.seen)
     starts, scales = (values.astype(np.float32).astype(np.float64) for values in (starts, scales))  # as published
-    model = replace(final, field=final.field.with_solids(starts), scales=scales, ripple=ripple)
+    model = replace(final, field=final.field.with_solids(starts), scales=scales)
     return ModelVersion(model, Seeds.at(model, starts), aligned.poses, errors, present_errors)
 
 

@@ -31,7 +31,7 @@ Tensors = dict[str, np.ndarray[tuple[int, ...], np.dtype[np.generic]]]
 class FieldCard(BaseModel):
     """Model card of a field: how it was made, and its errors on test scans."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="ignore")  # older model cards have more fields
 
     preset: str = PRESET
     world: World
@@ -41,7 +41,6 @@ class FieldCard(BaseModel):
     resolution: float  # m
     origin: tuple[float, float]  # m
     sweeps: int  # steps of gradient descent, each on a sample of the beams
-    ripple: float  # rad, see GenerativeModel
     inflation: float  # factor on the covariance, because errors of the model are correlated between beams
     test_samples: int
     test_range_error_median_m: float
@@ -90,7 +89,7 @@ def write(path: Path, model: FieldModel, seeds: Seeds, card: FieldCard) -> None:
 
 def encode(model: FieldModel, places: Array) -> bytes:
     """The field, and the ``places`` (S, 2) m of the seeds of a search, as compressed bytes without a card."""
-    grid = {"grid": np.array([*model.field.origin, model.field.resolution, model.ripple])}
+    grid = {"grid": np.array([*model.field.origin, model.field.resolution])}
     return zlib.compress(safetensors.numpy.save({**_tensors(model, places), **grid}))
 
 
@@ -99,13 +98,13 @@ def decode(data: bytes) -> tuple[FieldModel, Seeds]:
     try:
         tensors = safetensors.numpy.load(zlib.decompressobj().decompress(data, MAX_DECODED_BYTES))
         _check_arrays(tensors)
-        x, y, resolution, ripple = tensors["grid"].astype(float).tolist()
+        x, y, resolution = tensors["grid"][:3].astype(float).tolist()  # older models have one number more
     except (zlib.error, safetensors.SafetensorError, KeyError) as error:
         raise ValueError(f"not a field: {error}") from None
-    if not (np.isfinite([x, y, resolution, ripple]).all() and resolution > 0):
+    if not (np.isfinite([x, y, resolution]).all() and resolution > 0):
         raise ValueError("the grid of the field is not valid")
     field = DistanceField(tensors["phi"].astype(np.float32), (x, y), resolution)
-    model = FieldModel(field, tensors["scales"].astype(np.float64), ripple, _seen(tensors))
+    model = FieldModel(field, tensors["scales"].astype(np.float64), _seen(tensors))
     return model, Seeds.at(model, tensors["places"].astype(np.float64))
 
 
@@ -167,7 +166,7 @@ def load(path: Path) -> tuple[FieldModel, Seeds, FieldCard]:
     field, places = DistanceField(phi.astype(np.float32), card.origin, card.resolution), places.astype(np.float64)
     if panoramas is None:
         field = field.with_solids(places)
-    model = FieldModel(field, scales.astype(np.float64), card.ripple, _seen(tensors))
+    model = FieldModel(field, scales.astype(np.float64), _seen(tensors))
     return model, Seeds.at(model, places) if panoramas is None else Seeds(places, panoramas), card
 
 

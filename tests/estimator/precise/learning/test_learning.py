@@ -105,7 +105,7 @@ PLACES = np.stack(np.meshgrid(np.arange(0.25, 6, 0.5), np.arange(0.25, 4, 0.5)),
 def card(model, **changes):
     values = {
         "world": ROOM, "scanner": SCANNER, "samples": 400, "seed": 0, "resolution": model.field.resolution,
-        "origin": model.field.origin, "sweeps": 4, "ripple": 0.01, "inflation": 1.1, "test_samples": 60,
+        "origin": model.field.origin, "sweeps": 4, "inflation": 1.1, "test_samples": 60,
         "test_range_error_median_m": 0.001, "test_range_error_mean_m": 0.01, "test_share_above_5_cm": 0.01,
         "test_position_error_rms_m": 0.001, "learning_s": 1.0, "commit": "c", "command": "presage train",
         "versions": {},
