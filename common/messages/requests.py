@@ -87,7 +87,7 @@ class PredictRequest(Request):
     """Predict scans from given poses with the estimator's model."""
 
     poses: Poses  # (N, 3) base_link in map, N ≤ 1000
-    beams: Annotated[int, Field(ge=2, le=MAX_BEAMS)] | None = None  # evenly spaced among the scanner's; nil: all
+    beams: Annotated[int, Field(ge=2, le=MAX_BEAMS)] | None = None  # at most; evenly spaced; nil: all
 
 
 class PredictReply(Reply):

@@ -24,7 +24,8 @@ def answer_prediction(
 
     Raises UserError if the request is too large, or the model cannot predict the poses.
     """
-    chosen = angles[evenly_spaced_indices(len(angles), request.beams)]
+    beams = min(request.beams or len(angles), len(angles))
+    chosen = angles[np.round(np.linspace(0, len(angles) - 1, beams)).astype(np.intp)]
     count = len(request.poses)
     if count > MAX_POSES:
         raise UserError(f"{count} poses are too many to predict at once: ask for {MAX_POSES} at most")
@@ -41,15 +42,3 @@ def answer_prediction(
         ranges=ranges.ravel().astype(np.float32),
         sigma=found.sigma.ravel().astype(np.float32),
     )
-
-
-def evenly_spaced_indices(count: int, selected: int | None) -> np.ndarray[tuple[int, ...], np.dtype[np.intp]]:
-    """Indices (selected,) of evenly spaced beams out of ``count``, including the first and the last.
-
-    If ``selected`` is None, all indices. Raises UserError if there are fewer beams.
-    """
-    if selected is None:
-        return np.arange(count)
-    if selected > count:
-        raise UserError(f"the scanner has {count} beams, not {selected}: ask for that many at most")
-    return np.round(np.linspace(0, count - 1, selected)).astype(np.intp)
