@@ -50,6 +50,7 @@ MIN_SHORTENING_M = 0.5  # by which a tour must be shorter to replace the present
 UNREACHABLE_RANGE_M = 0.4  # no viewpoint is this close to a place that could not be reached
 ARRIVAL_SCANS = 4  # an arrival at a viewpoint counts as this many scans, because more would show nothing new
 ARRIVAL_RANGE_M = 0.2  # a viewpoint this close to an arrival shows nothing new of what was in sight there
+HEADINGS = 72  # at a viewpoint, of which the robot takes that from which a scan shows most
 MAX_MOVED_VIEWPOINTS = 3  # length of the parts of a tour that are tried at other places in it
 
 
@@ -289,7 +290,11 @@ def _in_sector(state: ExplorationState, poses: Array, cells: Cells) -> Mask:
 
 def _viewpoint(state: ExplorationState, tour: Array, frontier: Frontier, sees: Mask) -> Viewpoint:
     """The first place of a tour (V, 2) m as a viewpoint; it sees the frontier cells in the mask ``sees`` (F,)."""
-    place, nats = tour[0], frontier.nats[sees]
-    middle = (nats[:, None] * (state.graph.grid.centres(frontier.cells[sees]) - place)).sum(axis=0)
-    heading = float(se2.wrap(np.arctan2(middle[1], middle[0]) - state.field_of_view.sector.centre))
-    return Viewpoint(np.array([*place, heading]), float(nats.sum()), tour)
+    place, cells, nats = tour[0], frontier.cells[sees], frontier.nats[sees]
+    middle = (nats[:, None] * (state.graph.grid.centres(cells) - place)).sum(axis=0)
+    towards_middle = np.arctan2(middle[1], middle[0]) - state.field_of_view.sector.centre
+    headings = se2.wrap(towards_middle + np.linspace(0, 2 * np.pi, HEADINGS, endpoint=False))
+    poses = np.column_stack([np.tile(place, (HEADINGS, 1)), headings])
+    shown = _in_sector(state, poses, cells) @ nats
+    best = int(np.argmax(shown))  # the first, towards the middle, if the scanner sees all around
+    return Viewpoint(poses[best], float(shown[best]), tour)

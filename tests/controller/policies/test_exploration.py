@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise, permutations
 
 import numpy as np
@@ -61,6 +62,12 @@ CLOSED = """
 #####
 #...#
 #####"""
+BEND = """
+#?####
+#.####
+#.####
+#....?
+######"""
 # From the start in the middle, there is more to see on the left, behind a longer way.
 CROSSROADS = """
 #?########
@@ -154,6 +161,15 @@ def test_choice_is_the_first_place_of_the_tour_of_least_expected_free_energy():
 
     orders = list(permutations(range(1, len(stops) - 1)))
     assert length(orders[0]) <= min(map(length, orders)) + 1e-6
+
+
+def test_heading_between_two_frontiers():
+    """A narrow view from the corner of a bend shows one of the two ends, and nothing from between the headings."""
+    bend = exploration_state_of(BEND, sector=Sector(0.3, np.pi / 5))
+    viewpoint = choose_viewpoint(bend)
+    assert MIN_VIEWPOINT_NATS < viewpoint.nats < find_frontier(bend).nats.sum()
+    other = choose_viewpoint(replace(bend, arrivals=viewpoint.pose[None]))
+    assert abs(np.sin(other.pose[2] - viewpoint.pose[2])) > 0.5
 
 
 def test_nothing_is_left_to_see():
