@@ -9,8 +9,8 @@ import yaml
 
 MAX_NODES = 1_000_000  # 10 000 obstacles need about 200 000
 MAX_DEPTH = 100  # much deeper nesting crashes the C parser
-# PyYAML's C parser is ten times as fast, but missing if PyYAML was built without libyaml.
 NOT_YAML = (yaml.YAMLError, ValueError)  # raised by `parse_yaml`
+# PyYAML's C parser is ten times as fast, but missing if PyYAML was built without libyaml.
 LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 

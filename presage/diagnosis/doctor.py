@@ -1,4 +1,4 @@
-"""`presage doctor`."""
+"""`presage doctor`: checks the installation, this machine and a session."""
 
 from __future__ import annotations
 

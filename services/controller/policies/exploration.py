@@ -7,11 +7,12 @@ unknown space, and back to where exploration began. The expected free energy of 
 
 A scan shows whether a frontier cell is free or occupied, which is worth ln 2, times `MISS_PROBABILITY` for each earlier
 scan that should have shown it and did not. At `MIN_VIEWPOINT_NATS` a viewpoint is worth a detour of 150 m, so the tour
-has all that are worth a stop, by the shortest path (as Kulich, Faigl & Preucil 2011 choose goals). The robot drives
-only to its first viewpoint, as the next map has another frontier.
+has all that are worth a stop (up to `MAX_VIEWPOINTS`), by a short path (as Kulich, Faigl & Preucil 2011 choose goals).
+The robot drives only to its first viewpoint, as the next map has another frontier.
 
-Approximations: the viewpoints are chosen greedily by their information; what lies beyond the frontier is not predicted;
-and a scan shows nothing of cells so far away that its beams are farther apart than the cells of the map.
+Approximations: the viewpoints are chosen greedily by their information, as if the scanner saw all around; what lies
+beyond the frontier is not predicted; and a scan shows nothing of cells so far away that its beams are farther apart
+than the cells of the map.
 """
 
 from __future__ import annotations
@@ -48,9 +49,9 @@ EXTRA_CLEARANCE_M = 0.05  # around the robot, because walls that are seen later 
 MAX_VIEWPOINTS = 12  # of a tour: those with most information
 MIN_SHORTENING_M = 0.5  # by which a tour must be shorter to replace the present target, so that the robot goes on
 UNREACHABLE_RANGE_M = 0.4  # no viewpoint is this close to a place that could not be reached
-ARRIVAL_SCANS = 4  # an arrival at a viewpoint counts as this many scans, because more would show nothing new
-ARRIVAL_RANGE_M = 0.2  # a viewpoint this close to an arrival shows nothing new of what was in sight there
-HEADINGS = 72  # at a viewpoint, of which the robot takes that from which a scan shows most
+ARRIVAL_SCANS = 4  # an arrival at a viewpoint counts as this many scans: the cells in sight of it are given up
+ARRIVAL_RANGE_M = 0.2  # a place this close to an arrival shows nothing in the directions that the scanner saw there
+HEADINGS = 72  # tried at a viewpoint; the robot takes the one at which a scan shows most
 MAX_MOVED_VIEWPOINTS = 3  # length of the parts of a tour that are tried at other places in it
 
 
@@ -79,14 +80,14 @@ class ExplorationState:
     pose: Array  # (3,) of the robot in map
     home: Array  # (2,) m in map, where the tour ends
     target: Array | None  # (2,) m in map, the viewpoint to which the robot drives now
-    unreachable: Array  # (N, 2) m in map, places to which no path was found
+    unreachable: Array  # (N, 2) m in map, viewpoints that were given up
 
 
 @dataclass(frozen=True)
 class Viewpoint:
     """A place from which a scan shows something new."""
 
-    pose: Array  # (3,) in map, facing the frontier
+    pose: Array  # (3,) in map, with the heading at which a scan shows most
     nats: float  # expected information of a scan from there
     tour: Array  # (V, 2) m in map, all viewpoints of the tour from this one on
 
@@ -111,12 +112,12 @@ class CandidateViewpoints:
     """Places that may become viewpoints."""
 
     places: Array  # (P, 2) m in map
-    sees: Mask  # (P, F) whether a scan from a place would show a frontier cell
+    sees: Mask  # (P, F) whether a frontier cell is in sight of a place, in any direction
     target: int | None  # index of the present target; None if there is none, or it cannot be reached
 
 
 def choose_viewpoint(state: ExplorationState) -> Viewpoint | NoPath | None:
-    """The first viewpoint of the tour of least expected free energy; None if no viewpoint is worth a visit."""
+    """The first viewpoint of a short tour; None if returning at once has less expected free energy."""
     frontier, known = find_frontier(state), known_space(state.graph)
     min_clearance = known.min_clearance
     if frontier.nats.sum() >= MIN_VIEWPOINT_NATS and known.nearest_free(state.pose[:2], min_clearance) is None:
@@ -149,8 +150,9 @@ def find_frontier(state: ExplorationState) -> Frontier:
     beside[:, 1:] |= passable[:, :-1]
     beside[:, :-1] |= passable[:, 1:]
     cells = np.flatnonzero(free.unknown & beside & (free.clearance > 0))
-    scans = np.concatenate([state.scans, np.repeat(state.arrivals, ARRIVAL_SCANS, axis=0)])
-    misses = np.sum(_in_sight(state, scans[:, :2], cells) & _in_sector(state, scans, cells), axis=0)
+    scans = np.concatenate([state.scans, state.arrivals])
+    counts = np.repeat([1, ARRIVAL_SCANS], [len(state.scans), len(state.arrivals)])
+    misses = counts @ (_in_sight(state, scans[:, :2], cells) & _in_sector(state, scans, cells))
     nats = np.log(2) * MISS_PROBABILITY**misses
     return Frontier(cells[nats >= MIN_CELL_NATS], nats[nats >= MIN_CELL_NATS])
 
@@ -263,11 +265,11 @@ def _travel_costs(graph: FreeSpaceGraph, places: Sequence[Array]) -> Array:
         field = graph.cost_field(place, 1.0)
         rows.append(np.full(len(cells), longest) if field is None else np.minimum(field.cost.ravel()[cells], longest))
     cost = np.array(rows)
-    return np.asarray(np.minimum(cost, cost.T))  # a place may lie beside the known space, in one direction only
+    return np.asarray(np.minimum(cost, cost.T))  # an end outside the known space costs inf, a start does not
 
 
 def _opaque(free: FreeSpace) -> Mask:
-    """Cells (rows, columns) through which nothing is known to be seen: walls, and unknown ones."""
+    """Cells (rows, columns) that may block a beam: walls and unknown ones."""
     return np.asarray(free.unknown | (free.clearance < free.grid.resolution / 2 - 1e-9))
 
 

@@ -29,11 +29,11 @@ MAX_STEP = np.array([0.5, 0.5, 0.3])  # m, m, rad: beyond this distance the line
 SETTLED_STEP = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: after a smaller step, a descent ends
 # Added in quadrature to every beam's standard deviation during a descent, so that the minimum is wide at first.
 COARSE_SIGMA_M, MEDIUM_SIGMA_M = 0.3, 0.1
-FOLLOWING_SCHEDULE_M = (0.05, 0.0, 0.0, 0.0, 0.0)  # the same for each step of a descent from a predicted pose
+FOLLOWING_SCHEDULE_M = (0.05, 0.0, 0.0, 0.0, 0.0)  # its values, step by step, in a descent from near the minimum
 MAX_POLISHING_STEPS = 4
 # The errors of a map are counted as equal over this length of a surface, and as independent beyond (a guess).
 CORRELATION_LENGTH_M = 2.0
-DAMPING = np.diag([1.0, 1.0, 1.0]) * 1e-6  # 1/m², 1/rad²: no step along directions without information
+DAMPING = 1e-6 * np.eye(3)  # 1/m², 1/rad²: no step along directions without information
 
 
 class Optimiser(Protocol):
@@ -112,7 +112,7 @@ class View:
     _last: deque[_PredictedScans] = field(default_factory=lambda: deque(maxlen=2), init=False, repr=False)
 
     def thinned(self, beams: int) -> View:
-        """Returns a view with every k-th beam, so that about ``beams`` are left."""
+        """Returns a view with every k-th beam, so that ``beams`` or more (or all) are left, less than twice as many."""
         k = max(1, len(self.angles) // beams)
         # numba would compile every loop once more for strided arrays, so these are contiguous.
         angles, ranges = np.ascontiguousarray(self.angles[::k]), np.ascontiguousarray(self.ranges[::k])
@@ -305,11 +305,10 @@ def limit_steps(steps: npt.NDArray[np.floating[Any]], largest: Array) -> Array:
 
 
 def polish(view: View, poses: Array) -> tuple[Array, Evidence]:
-    """Finds the minimum to a fraction of a millimetre with full steps, from poses (N, 3) already near it.
+    """Finds the minimum of the accuracy to a fraction of a millimetre, from poses (N, 3) already near it.
 
-    Near the minimum F has ripples, because beams jump between surfaces, and a line search would stop there. Each step
-    minimises F with the beams' weights held constant (iteratively reweighted least squares). Returns the last poses
-    that were evaluated, at most ``SETTLED_STEP`` from the minimum, and the evidence there.
+    Takes at most `MAX_POLISHING_STEPS` Gauss-Newton steps, without a prior and without evidence by surfaces, until the
+    next one would be less than `SETTLED_STEP`. Returns the last poses that were evaluated, and the evidence there.
     """
     poses = np.array(poses, float)
     evidence = view.evidence(poses)

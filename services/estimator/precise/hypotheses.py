@@ -1,4 +1,4 @@
-"""Creates, moves, merges, weighs and drops hypotheses."""
+"""Creates, updates, weighs and drops hypotheses."""
 
 from __future__ import annotations
 
@@ -20,9 +20,8 @@ if TYPE_CHECKING:
     from services.estimator.precise.motion_model import FusedMotion
 
 NEAR_POSITION_M, NEAR_HEADING_RAD = 0.2, math.radians(5)  # a pose with a larger error is wrong
-SAME_POSITION_M, SAME_HEADING_RAD = 0.1, 0.1  # hypotheses nearer to one another than this are merged
-# A direction counts as unobserved unless the scan is this much less probable, in nats, at both sides of the pose, this
-# far away. (Both are guesses.)
+SAME_POSITION_M, SAME_HEADING_RAD = 0.1, 0.1  # of hypotheses nearer to one another, the best is kept
+# A scan observes a direction if it is this much less probable, in nats, this far to both sides of the pose (guesses).
 MIN_FALL, AWAY_M = math.log(100), 0.1
 WEAK_PRIOR = np.eye(3)  # 1/m², 1/rad²: keeps the covariance finite along unobserved directions
 MIN_WEIGHT = 1e-9  # hypotheses with less weight are dropped
@@ -102,10 +101,10 @@ class UnknownPlace:
 def unobserved_directions(view: View, poses: Array, curvatures: Array) -> list[Array]:
     """The unit vectors (K, 3) of x, y, yaw that a scan does not observe at each of the ``poses`` (N, 3).
 
-    ``curvatures`` (N, 3, 3) are those of its accuracy. There are usually none, one along a corridor, and three where
-    hardly any beam meets a surface. The curvature does not tell, because it is that at one pose: in a corridor without
-    features, the ripples of a learned wall have some at each pose, and so has a rounded corner. What tells is how much
-    less probable the scan is a bit farther along.
+    ``curvatures`` (N, 3, 3) are those of its accuracy. There are usually none, and one along a corridor: that in which
+    the curvature is weakest. If the scan does not show the position across it either, it observes nothing, not even the
+    heading. Curvature alone cannot decide this, because it is local: ripples of a learned wall and rounded corners have
+    some at every pose. So the scan must be less probable a bit farther along.
     """
     axes = [np.linalg.eigh(position_information(curvature))[1].T for curvature in curvatures]  # weakest first
     unobserved = [np.zeros((0, 3))] * len(poses)
@@ -120,9 +119,8 @@ def _are_observed(view: View, poses: Array, curvatures: Array, directions: Array
     """Mask (N,) of the poses whose position along ``directions`` (N, 2) a scan shows, with the best heading there."""
     turns = -np.einsum("ni,ni->n", curvatures[:, 2, :2], directions) / np.maximum(curvatures[:, 2, 2], 1e-12)
     steps = AWAY_M * np.column_stack([directions, turns])
-    here, away = (
-        view.surface_evidence(at).log_likelihood for at in (poses, np.concatenate([poses + steps, poses - steps]))
-    )
+    here = view.surface_evidence(poses).log_likelihood
+    away = view.surface_evidence(np.concatenate([poses + steps, poses - steps])).log_likelihood
     return np.asarray(here - away.reshape(2, -1).max(axis=0) > MIN_FALL)
 
 
@@ -137,15 +135,15 @@ def project_evidence(evidence: Evidence, k: int, unobserved: Array) -> None:
 
 
 def mode_from_search(
-    view: View, pose: Array, evidence: Evidence, k: int, prior: Prior | None, volume: float, unknown: Array
+    view: View, pose: Array, evidence: Evidence, k: int, prior: Prior | None, volume: float, spread: Array
 ) -> Mode:
-    """A hypothesis found by a search, from the k-th evidence of a scan at ``pose`` (3,).
+    """A hypothesis found by a search: one more step from ``pose`` (3,), where the scan has the k-th evidence.
 
-    Without a prior, all poses in ``volume`` m² rad were equally likely. ``unknown`` (3, 3), the covariance of an
-    unknown pose, remains along unobserved directions.
+    The evidence is set to zero along unobserved directions, in place. Without a prior, all poses in ``volume`` m² rad
+    were equally likely, and ``spread`` (3, 3), the covariance of an unknown pose, remains along these directions.
     """
     project_evidence(evidence, k, unobserved_directions(view, pose[None], evidence.curvature[k : k + 1])[0])
-    information = prior.information[k] if prior else np.linalg.inv(unknown)
+    information = prior.information[k] if prior else np.linalg.inv(spread)
     inverse = np.linalg.inv(evidence.curvature[k] + information)
     slope = evidence.xi[k] + (prior.information[k] @ se2.difference(prior.mean[k], pose) if prior else 0)
     pose = pose + limit_steps(inverse @ slope, MAX_STEP)
@@ -179,12 +177,12 @@ def _log_volume_of_place(curvature: Array) -> float:
 
 
 def update_mode(mode: Mode, fused: FusedMotion, evidence: Evidence, k: int, period: float, *, unobserved: bool) -> Mode:
-    """The hypothesis after a scan, from its fused prior and the k-th evidence.
+    """The hypothesis after a scan, from its motion fused with the scan, and from the k-th evidence.
 
     The scan's information reduces the noise covariance. The model's errors are alike from scan to scan, so their
     standard deviations are averaged instead of their variances, weighted by each scan's information. ``unobserved`` is
-    true if neither the scan nor the local map shows the motion along some direction. The scan corrects the pose, but
-    not the drift.
+    true if neither the scan nor the local map shows the motion along some direction. The drift is not estimated, but
+    its covariance with the pose shrinks.
     """
     inverse = np.linalg.inv(fused.information)
     prior_information = fused.information - evidence.curvature[k]
@@ -192,7 +190,7 @@ def update_mode(mode: Mode, fused: FusedMotion, evidence: Evidence, k: int, peri
     deviation_before = _root(mode.model_covariance)
     scan_deviation = _root(inverse_of_scan @ evidence.xi_model_covariance[k] @ inverse_of_scan)
     model_deviation = deviation_before + inverse @ evidence.curvature[k] @ (scan_deviation - deviation_before)
-    # A velocity is dropped unless it was observed in every direction.
+    # A velocity is dropped unless it was observed in every direction, at this scan and the one before.
     velocity = None
     if not unobserved and not mode.unobserved_scans:
         velocity = smooth_velocity(mode.velocity, se2.between(mode.pose, fused.mean) / period, period)
@@ -261,7 +259,7 @@ def weigh(modes: list[Mode], log_unknown: float, count: int) -> tuple[list[Mode]
 
 
 def probability_of_being_near(covariance: Array) -> float:
-    """Probability that a pose with ``covariance`` (3, 3) is within 0.2 m and 5 degrees of the truth."""
+    """Probability that a pose with ``covariance`` (3, 3) is within 0.2 m and 5 degrees of the truth; never too high."""
     variance = float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
     position = 1 - math.exp(-0.5 * NEAR_POSITION_M**2 / max(variance, 1e-12))
     heading = math.erf(NEAR_HEADING_RAD / math.sqrt(2 * max(float(covariance[2, 2]), 1e-12)))

@@ -43,7 +43,7 @@ class Match:
     # From the points on surfaces of the map, without the spurious information of tilted lines:
     fixed_information: Array  # (3, 3)
     fixed_step: Array  # (3,) towards the pose that fits them best, of one Gauss-Newton iteration
-    movable_surfaces: int  # those that the map lacks, and that show the direction of which the fixed points say least
+    movable_surfaces: int  # those that the map lacks, and that show the direction which the fixed points show worst
 
     def covariance(self, if_moved: Array) -> Array:
         """Covariance (3, 3) of the pose.
