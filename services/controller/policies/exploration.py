@@ -47,6 +47,7 @@ MIN_VIEWPOINT_NATS = 3.0  # a viewpoint that sees less than half a metre of the 
 VIEWPOINT_SPACING_M = 0.4  # of the candidate viewpoints
 EXTRA_CLEARANCE_M = 0.05  # around the robot, because walls that are seen later may be nearer
 MAX_VIEWPOINTS = 12  # of a tour: those with most information
+MAX_SHIFT_M = 1.0  # from a place to the free cell from which its paths are planned
 MIN_SHORTENING_M = 0.5  # by which a tour must be shorter to replace the present target, so that the robot goes on
 UNREACHABLE_RANGE_M = 0.4  # no viewpoint is this close to a place that could not be reached
 ARRIVAL_SCANS = 4  # an arrival at a viewpoint counts as this many scans: the cells in sight of it are given up
@@ -135,7 +136,7 @@ def choose_viewpoint(state: ExplorationState) -> Viewpoint | NoPath | None:
         tour = _prefer_target(tour, cost)
     information = float(frontier.nats[candidates.sees[selected].any(axis=0)].sum())
     returning_at_once = NATS_PER_METRE * cost[0, -1]
-    if NATS_PER_METRE * _length(cost, tour) - information >= returning_at_once:
+    if NATS_PER_METRE * _cost_of(cost, tour) - information >= returning_at_once:
         return None
     return _viewpoint(state, candidates.places[selected][tour], frontier, candidates.sees[selected[tour[0]]])
 
@@ -222,11 +223,11 @@ def shortest_tour(cost: Array) -> list[int]:
             if place not in tour
             for at in range(len(tour) + 1)
         ]
-        tour = min(options, key=lambda option: _length(cost, option))
+        tour = min(options, key=lambda option: _cost_of(cost, option))
     while True:
         options = [tour, *_variations(tour)]
-        best = min(options, key=lambda option: _length(cost, option))
-        if _length(cost, best) >= _length(cost, tour) - 1e-9:
+        best = min(options, key=lambda option: _cost_of(cost, option))
+        if _cost_of(cost, best) >= _cost_of(cost, tour) - 1e-9:
             return tour
         tour = best
 
@@ -248,11 +249,11 @@ def _prefer_target(tour: list[int], cost: Array) -> list[int]:
     if tour[0] == 0:
         return tour
     target_first = [0, *(place + 1 for place in shortest_tour(cost[1:, 1:]))]
-    return target_first if _length(cost, target_first) < _length(cost, tour) + MIN_SHORTENING_M else tour
+    return target_first if _cost_of(cost, target_first) < _cost_of(cost, tour) + MIN_SHORTENING_M else tour
 
 
-def _length(cost: Array, tour: Sequence[int]) -> float:
-    """Length in m of a tour, from the start to the end."""
+def _cost_of(cost: Array, tour: Sequence[int]) -> float:
+    """Cost in m of a tour, from the start to the end."""
     return float(sum(cost[a, b] for a, b in pairwise([0, *(place + 1 for place in tour), len(cost) - 1])))
 
 
@@ -262,7 +263,7 @@ def _travel_costs(graph: FreeSpaceGraph, places: Sequence[Array]) -> Array:
     cells = graph.grid.cell_of(np.array(places))
     rows = []
     for place in places:
-        field = graph.cost_field(place, 1.0)
+        field = graph.cost_field(place, MAX_SHIFT_M)
         rows.append(np.full(len(cells), longest) if field is None else np.minimum(field.cost.ravel()[cells], longest))
     cost = np.array(rows)
     return np.asarray(np.minimum(cost, cost.T))  # an end outside the known space costs inf, a start does not
