@@ -59,8 +59,10 @@ def test_predictions(estimator, bus):
     assert all(isinstance(each, RequestResult) and each.reply() == waited for each in answers)
     assert sorted(each.number for each in answers) == list(range(5))
 
-    for hostile in (PredictRequest(poses=np.zeros((1001, 3))), PredictRequest(poses=poses, beams=181)):
-        assert not bus.query(PREDICT, hostile, PredictReply, timeout=WAIT_TIMEOUT_S).ok
+    too_many = PredictRequest(poses=np.zeros((1001, 3)))
+    assert not bus.query(PREDICT, too_many, PredictReply, timeout=WAIT_TIMEOUT_S).ok
+    all_beams = PredictRequest(poses=poses, beams=181)  # one more than the scanner has
+    assert len(bus.query(PREDICT, all_beams, PredictReply, timeout=WAIT_TIMEOUT_S).angles) == 180
     walls = PredictRequest(poses=np.array([[0.0, 0.0, 0.0], [1e4, -5.0, 7.0], [4.6, 0.9, 1.0]]))
     assert bus.query(PREDICT, walls, PredictReply, timeout=WAIT_TIMEOUT_S).ok
     not_finite = PredictRequest.model_construct(poses=np.full((1, 3), np.nan), beams=None)

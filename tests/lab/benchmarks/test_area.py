@@ -16,7 +16,7 @@ def room(width, height, origin):
     y, x = CELL_M * np.mgrid[: round(height / CELL_M), : round(width / CELL_M)]
     phi = np.minimum.reduce([x - 0.1, y - 0.1, width - 0.1 - x, height - 0.1 - y]).astype(np.float32)
     scales = np.full(int(np.prod(CLASSES)), 1e-3)
-    return Part(1, phi, np.array(origin), scales, 0.0, PLACES + origin, width * height)
+    return Part(1, phi, np.array(origin), scales, PLACES + origin, width * height)
 
 
 def test_site():
