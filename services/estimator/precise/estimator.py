@@ -182,13 +182,14 @@ class PreciseEstimator:
         if match.explained[0] < self.settings.min_explained_share or len(match.unobserved[0]):
             predicted = expected_motion(motions[0]) if odom is not None else motions[0][-1]
             match = self._match_local_map(
-                view, match, self._predict_local_motion(period, odom, observation.command), predicted.covariance
+                match, self._predict_local_motion(period, odom, observation.command), predicted.covariance
             )
         if observation.time_increment and any(each.excess(match.poses[0]) == 0 for each in motions[0][:-1]):
             # Only if the match is one of the predicted motions: otherwise the robot may have been carried to another
             # place, and may have stood still during the scan.
-            view, match = self._correct_motion_again(view, observation, match, period)
+            match = self._correct_motion_again(match, observation, period)
         # Fusion of match and motion prior
+        view = match.view
         modes = [self._fuse(k, match, motions[k][-1], observation) for k in range(len(match.poses))]
         modes += self._find_alternatives(view, modes[0], match.motions[0], motions[0][-1])
         # Weights, also of the unknown place
@@ -300,13 +301,14 @@ class PreciseEstimator:
                 poses, evidence = wider_poses, wider_evidence
         return ScanMatch(view, motions, poses, evidence)
 
-    def _match_local_map(self, view: View, match: ScanMatch, motions: list[MotionCandidate], prior: Array) -> ScanMatch:
+    def _match_local_map(self, match: ScanMatch, motions: list[MotionCandidate], prior: Array) -> ScanMatch:
         """Matches the scan to the map again, near the motion that scan matching to the local map gives.
 
         ``motions`` are predicted in the local frame, so that an error of the pose in the map does not bias them; the
         pose that fits the map is only a further start; ``prior`` (3, 3) is the covariance of the predicted pose in map.
         Returns ``match`` unchanged if the local map gives no motion, or if the scan fits the map far better there.
         """
+        view = match.view
         starts = np.array([*(each.mean for each in motions), self._local_map.to_local(match.poses[0])])
         found = self._local_map.match(starts, view, motions[-1])
         if found is None:
@@ -324,15 +326,13 @@ class PreciseEstimator:
         )[0]
         return match if map_evidence + np.log(LOCAL_MISMATCH_PROBABILITY) > local_evidence else by_local_map
 
-    def _correct_motion_again(
-        self, view: View, observation: Observation, match: ScanMatch, period: float
-    ) -> tuple[View, ScanMatch]:
+    def _correct_motion_again(self, match: ScanMatch, observation: Observation, period: float) -> ScanMatch:
         """Corrects the scan for the motion that the match has shown, and matches it again."""
         # Not `between(last, this)`: beams are moved in base_link at this scan.
         velocity = -se2.between(match.poses[0], self.modes[0].pose) / period
-        view = self._correct_motion(view, observation, velocity)
+        view = self._correct_motion(match.view, observation, velocity)
         poses, evidence = view.descend(match.poses, _prior_of([each[-1] for each in match.motions]))
-        return view, replace(match, view=view, poses=poses, evidence=evidence)
+        return replace(match, view=view, poses=poses, evidence=evidence)
 
     def _fuse(self, k: int, match: ScanMatch, widest: MotionCandidate, observation: Observation) -> Mode:
         """Fuses the k-th hypothesis with the scan.

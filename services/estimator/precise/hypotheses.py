@@ -106,12 +106,14 @@ def unobserved_directions(view: View, poses: Array, curvatures: Array) -> list[A
     heading. Curvature alone cannot decide this, because it is local: ripples of a learned wall and rounded corners have
     some at every pose. So the scan must be less probable a bit farther along.
     """
-    axes = [np.linalg.eigh(position_information(curvature))[1].T for curvature in curvatures]  # weakest first
+    axes = np.array([np.linalg.eigh(position_information(curvature))[1].T for curvature in curvatures])
+    weakest, strongest = axes[:, 0], axes[:, 1]
     unobserved = [np.zeros((0, 3))] * len(poses)
-    for k in np.flatnonzero(~_are_observed(view, poses, curvatures, np.array([weakest for weakest, _ in axes]))):
-        each, (weakest, strongest) = slice(k, k + 1), axes[k]
-        across = _are_observed(view, poses[each], curvatures[each], strongest[None])[0]
-        unobserved[k] = np.array([[*weakest, 0.0]]) if across else np.eye(3)
+    rows = np.flatnonzero(~_are_observed(view, poses, curvatures, weakest))
+    if len(rows):
+        across = _are_observed(view, poses[rows], curvatures[rows], strongest[rows])
+        for k, observed in zip(rows, across, strict=True):
+            unobserved[k] = np.array([[*weakest[k], 0.0]]) if observed else np.eye(3)
     return unobserved
 
 
@@ -135,14 +137,13 @@ def project_evidence(evidence: Evidence, k: int, unobserved: Array) -> None:
 
 
 def mode_from_search(
-    view: View, pose: Array, evidence: Evidence, k: int, prior: Prior | None, volume: float, spread: Array
+    pose: Array, evidence: Evidence, k: int, prior: Prior | None, volume: float, spread: Array
 ) -> Mode:
     """A hypothesis found by a search: one more step from ``pose`` (3,), where the scan has the k-th evidence.
 
-    The evidence is set to zero along unobserved directions, in place. Without a prior, all poses in ``volume`` m² rad
-    were equally likely, and ``spread`` (3, 3), the covariance of an unknown pose, remains along these directions.
+    Without a prior, all poses in ``volume`` m² rad were equally likely, and ``spread`` (3, 3), the covariance of an
+    unknown pose, remains along the directions in which the evidence is zero.
     """
-    project_evidence(evidence, k, unobserved_directions(view, pose[None], evidence.curvature[k : k + 1])[0])
     information = prior.information[k] if prior else np.linalg.inv(spread)
     inverse = np.linalg.inv(evidence.curvature[k] + information)
     slope = evidence.xi[k] + (prior.information[k] @ se2.difference(prior.mean[k], pose) if prior else 0)

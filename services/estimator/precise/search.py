@@ -14,7 +14,13 @@ from services.estimator.precise.gauss_newton import (
     Prior,
     View,
 )
-from services.estimator.precise.hypotheses import Mode, mode_from_search, select_distinct
+from services.estimator.precise.hypotheses import (
+    Mode,
+    mode_from_search,
+    project_evidence,
+    select_distinct,
+    unobserved_directions,
+)
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -94,9 +100,10 @@ def _best_modes(
     surfaces = view.surface_evidence(poses)
     log_likelihood = surfaces.without(view.surfaces.small)
     log_prior = -prior.energy(poses) if prior else np.zeros(len(poses))
-    modes = []
-    for k in select_distinct(poses, -log_likelihood - log_prior, settings.max_hypotheses):
-        mode = mode_from_search(view, poses[k], evidence, k, prior, seeds.volume, seeds.spread)
+    modes, kept = [], select_distinct(poses, -log_likelihood - log_prior, settings.max_hypotheses)
+    for k, unobserved in zip(kept, unobserved_directions(view, poses[kept], evidence.curvature[kept]), strict=True):
+        project_evidence(evidence, k, unobserved)
+        mode = mode_from_search(poses[k], evidence, k, prior, seeds.volume, seeds.spread)
         modes.append(
             replace(
                 mode,

@@ -113,6 +113,10 @@ def card(model, **changes):
     return weights.FieldCard(**{**values, **changes})
 
 
+def test_older_card(model):
+    assert card(model, ripple=0.01) == card(model)
+
+
 def saved(model, folder):
     path = weights.path_of(folder, "room")
     weights.save(path, model, PLACES, card(model))

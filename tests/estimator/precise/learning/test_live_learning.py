@@ -190,7 +190,12 @@ def test_encoded_field(version):
     assert np.array_equal(decoded.field.phi, version.model.field.phi)
     assert np.array_equal(decoded.scales, version.model.scales)
     assert np.array_equal(decoded.seen.cells, version.model.seen.cells)
-    assert decoded.field.origin == version.model.field.origin
+    grid = (version.model.field.origin, version.model.field.resolution)
+    assert (decoded.field.origin, decoded.field.resolution) == grid
+    tensors = weights.safetensors.numpy.load(weights.zlib.decompress(data))
+    tensors["grid"] = np.append(tensors["grid"], 0.01)  # older fields state the error of their normals
+    older, _ = weights.decode(weights.zlib.compress(weights.safetensors.numpy.save(tensors)))
+    assert (older.field.origin, older.field.resolution) == grid
     assert np.array_equal(seeds.panoramas, version.seeds.panoramas)
     for damaged in (b"", data[:-100], data[100:], weights.zlib.compress(b"no arrays")):
         with pytest.raises(ValueError, match=r"field|array"):
