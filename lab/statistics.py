@@ -36,7 +36,7 @@ def bootstrap_interval(groups: Sequence[Array], statistic: Callable[[Array], flo
 
 
 def squared_mahalanobis(error: Array, covariance: Array) -> float:
-    """Error' covariance^-1 error, at most `MAX_NEES`; this also if the covariance claims to know a direction exactly.
+    """Error' covariance^-1 error. Returns `MAX_NEES` if it is larger, or if a direction has no variance.
 
     Its mean over scans is the NEES, ideally the number of components (Bar-Shalom et al. 2001, section 5.4).
     """
