@@ -28,6 +28,7 @@ import numpy as np
 
 from common.messages.definitions import Exploration, Goal, Pose, Status
 from services.controller.goal_state import Phase
+from services.controller.policies.recovery import MAX_GAP_NS
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
 PAUSE_NS = 2_000_000_000  # how long the robot stands at a goal of a user before it goes on exploring
 STALLED_NS = 8_000_000_000  # after this time without a motion of `STALLED_M`, the goal counts as unreachable
 STALLED_M = 0.2
-MAX_GAP_NS = 1_000_000_000  # after a longer time without an update, the time without a motion starts again
 VIEWPOINT_TOLERANCE_M = 0.1
 RETURN_TOLERANCE_M = 0.01  # of the goal at the start, so that the robot stands within 2 cm of it
 AT_START_M = 0.1  # a robot that cannot plan this close to the start gains no room by returning

@@ -27,7 +27,7 @@ from services.controller.policies.motion_model import (
 )
 from services.controller.policies.motion_selection import PoseBelief, Surroundings, least_distance, select_motion
 from services.controller.policies.obstacles import TemporaryObstacles
-from services.controller.policies.recovery import BACKING_OFF, STUCK_AFTER_NS, Recovery, back_off
+from services.controller.policies.recovery import BACKING_OFF, MAX_GAP_NS, STUCK_AFTER_NS, Recovery, back_off
 from services.controller.policies.scan_information import ScanInformation
 
 if TYPE_CHECKING:
@@ -84,6 +84,7 @@ class GeodesicPolicy:
         self._field_of_view = ALL_ROUND
         # Least distance from the goal in m, and the stamp at which the robot got there; None until it is near the goal.
         self._closest_approach: tuple[float, int] | None = None
+        self._decided_ns = 0  # stamp of the last belief for which it decided
         self._obstacle_near_ns = -STUCK_AFTER_NS  # when an obstacle was last near the robot or the goal
 
     def refusal(self, goal: Array) -> str | None:
@@ -170,6 +171,9 @@ class GeodesicPolicy:
     def decide(self, belief: Belief, velocity: Array, ahead: Array) -> Decision:
         """Chooses the velocity of least expected free energy; arguments as for `Policy.decide`."""
         pose, stamp_ns = se2.compose(belief.pose.array(), ahead), belief.stamp_ns
+        if not 0 <= stamp_ns - self._decided_ns <= MAX_GAP_NS:  # without beliefs, the robot stood
+            self.interrupt()
+        self._decided_ns = stamp_ns
         if (refusal := self._refusal_from_here()) is not None:
             return Decision(reason=refusal, state="blocked", refused=True)
         points, moving = self.obstacles.points(), self.obstacles.moving(stamp_ns)
@@ -320,11 +324,7 @@ class GeodesicPolicy:
         distance, shift = float(np.hypot(*to_goal)), float(np.hypot(*(place - self._goal)))
         if distance > shift + 2 * self.robot.radius:
             self._closest_approach = None
-        elif (
-            self._closest_approach is None
-            or stamp_ns < self._closest_approach[1]
-            or distance < self._closest_approach[0] - MIN_PROGRESS_M
-        ):
+        elif self._closest_approach is None or distance < self._closest_approach[0] - MIN_PROGRESS_M:
             self._closest_approach = (distance, stamp_ns)
         # Other free places may be as near to the goal as this one, so the robot need not stand exactly here.
         arrived = shift > 0 and distance < shift + self.free.grid.resolution

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from common.robot.robot import Robot
 
 STUCK_AFTER_NS = 3_000_000_000  # time without motion after which the robot backs off
+MAX_GAP_NS = 1_000_000_000  # after a longer time without a belief, the time without motion starts again
 BACK_OFF_NS = 3_000_000_000  # how long it backs off
 BACK_OFF_M = 0.4  # distance at which the gap to obstacles is compared between directions
 BACKING_OFF = "stuck: backing off"  # status text

@@ -69,6 +69,16 @@ def test_stops_short_of_the_goal(kind, goal_y, changed, reason):
     assert np.ptp(poses[-60:, :2], axis=0).max() < 0.01
 
 
+@pytest.mark.parametrize(("pause_s", "refused"), [(0.0, True), (4.0, False)])
+def test_time_without_beliefs_is_not_time_without_progress(pause_s, refused):
+    """A robot that stood near its goal because no beliefs came, as on a busy machine, is not stuck."""
+    policy, pose = GeodesicPolicy(Robot(), HALL), np.array([7.5, 2.35, 1.5])
+    policy.set_goal(np.array([7.5, 2.5]))
+    stamps_s = np.arange(50) * 0.066 + np.where(np.arange(50) > 25, pause_s, 0.0)
+    decisions = [policy.decide(belief(int(1e9 * stamp), pose), np.zeros(3), np.zeros(3)) for stamp in stamps_s]
+    assert any(decision.refused for decision in decisions) == refused
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_goal_beside_a_wall(kind):
     """The scanner's noise does not stop the robot before a goal 4 cm farther from a wall than its radius."""
