@@ -405,7 +405,7 @@ class PreciseEstimator:
         poses = np.array([mode.pose for mode in modes])
         states = view.surface_evidence(poses)
         self._last_log_fit = _log_fit(view, states)
-        seen, appeared = self._local_map.find_seen_and_appeared(local, view, states.weights[0] > 0.5)
+        seen, appeared = self._local_map.find_seen_and_appeared(local, view)
         small = view.surfaces.small
         ignored = seen | appeared | small
 

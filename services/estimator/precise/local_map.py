@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from common.geometry import se2
 from common.geometry.se2 import Array
@@ -100,12 +99,11 @@ class LocalMap:
     # (3, 3) of the pose in map at the last key scan, with the drift that this scan contributes
     covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
     _points: SurfacePoints | None = None
-    _unmapped: cKDTree | None = None  # of the points that are not on surfaces of the map
 
     def clear(self) -> None:
         """Removes all scans."""
         self.scans.clear()
-        self._points = self._unmapped = None
+        self._points = None
 
     def to_local(self, pose: Array) -> Array:
         """A pose (3,) in map, in the local frame."""
@@ -124,16 +122,13 @@ class LocalMap:
         self.scans.append(key)
         self.place(key.pose, pose)
         self.covariance = covariance + np.diag(DRIFT_PER_SCAN**2)
-        self._points = self._unmapped = None
+        self._points = None
 
-    def find_seen_and_appeared(
-        self, local: Array, view: View, mapped: npt.NDArray[np.bool_]
-    ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    def find_seen_and_appeared(self, local: Array, view: View) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
         """Masks (B,) of two kinds of beams of a scan at ``local`` (3,).
 
         - Seen before: they end at surfaces of the key scans. Beams without return also count as seen once there are key
-          scans. A beam that does not end at a surface of the map (``mapped`` (B,) is false) only counts as seen near a
-          point of a key scan that does not either.
+          scans. Which surfaces are seen must not depend on a hypothesis: the same ones would be new at each other.
         - Appeared: they end where a key scan saw free space, so the surface came since then, wherever the robot is.
         """
         seen, appeared = np.zeros(len(view.ranges), np.bool_), np.zeros(len(view.ranges), np.bool_)
@@ -145,9 +140,6 @@ class LocalMap:
         free = np.zeros(len(near), np.bool_)
         free[~near] = self._in_free_space(placed[~near])
         appeared[view.returned] = free
-        unmapped = near & ~mapped[view.returned]
-        distance, _ = self._tree_of_unmapped_points().query(placed[unmapped], distance_upper_bound=SEEN_RADIUS_M)
-        near[unmapped] = np.isfinite(distance)
         seen[:] = ~view.returned
         seen[view.returned] = near
         return seen, appeared
@@ -199,13 +191,6 @@ class LocalMap:
                 points, np.concatenate([each.mapped[each.view.returned] for each in self.scans])
             )
         return self._points
-
-    def _tree_of_unmapped_points(self) -> cKDTree:
-        """Index of the points of all scans that are not on surfaces of the map; kept until the scans change."""
-        if self._unmapped is None:
-            unmapped = [each.points[~each.mapped[each.view.returned]] for each in self.scans]
-            self._unmapped = cKDTree(np.concatenate(unmapped))
-        return self._unmapped
 
 
 def count_changes(last: LocalScan, now: LocalScan) -> int:

@@ -14,6 +14,7 @@ from common.geometry import se2
 from common.geometry.world import World, load_world
 from lab.accuracy import tasks
 from lab.accuracy.scenes import Scene
+from lab.integrity.cases import CASES, make_trial
 from lab.integrity.maps import noisy_grid, scaled_map
 from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.precise.estimator import PreciseEstimator
@@ -130,6 +131,14 @@ def test_wrong_map():
         made.restart()
         found = drive(made, scene, scene.path(0.7, start=start))
         assert "tracking" not in {posterior.state for posterior in found}
+
+
+def test_slow_robot_in_the_wrong_map():
+    """The same surfaces from almost the same place are no new evidence, although each search finds another pose."""
+    trial = make_trial(CASES["wrong-map"], 54002, 0.55)  # the robot moves 0.12 m
+    made = prepare_factory(EstimatorOptions(trial.map_world, "precise", "exact"))(ScannerGeometry.of(trial.scanner))
+    found = [made.update(observation) for observation in trial.observations]
+    assert max(posterior.probability for posterior in found) < 1e-3
 
 
 @pytest.fixture(scope="module")

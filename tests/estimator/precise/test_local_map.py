@@ -119,37 +119,22 @@ def changed(scan, beams, factor):
 def test_seen_surfaces():
     scene = Scene.of(ROOM, 361, 1)
     scan = view(scene, HERE)
-    mapped = np.ones(len(scan.ranges), np.bool_)
-    seen, appeared = LocalMap().find_seen_and_appeared(HERE, scan, mapped)
+    seen, appeared = LocalMap().find_seen_and_appeared(HERE, scan)
     assert not seen.any()
     assert not appeared.any()
     made = local_map(scene, HERE)
     here = made.to_local(HERE)
     assert made.is_key_scan_due(made.to_local(HERE + np.array([1.01 * MIN_DISTANCE_M, 0.0, 0.0])))
     assert not made.is_key_scan_due(here)
-    assert made.find_seen_and_appeared(here, view(scene, HERE), mapped)[0].all()
-    seen, appeared = made.find_seen_and_appeared(here, changed(scan, slice(100, 150), 0.5), mapped)  # a person
+    assert made.find_seen_and_appeared(here, view(scene, HERE))[0].all()
+    seen, appeared = made.find_seen_and_appeared(here, changed(scan, slice(100, 150), 0.5))  # a person
     assert np.flatnonzero(~seen).tolist() == np.flatnonzero(appeared).tolist() == list(range(100, 150))
-    seen, appeared = made.find_seen_and_appeared(here, changed(scan, slice(100, 150), 1.5), mapped)  # a door was opened
+    seen, appeared = made.find_seen_and_appeared(here, changed(scan, slice(100, 150), 1.5))  # a door was opened
     assert np.flatnonzero(~seen).tolist() == list(range(100, 150))
     assert not appeared.any()
     behind = replace(scan, ranges=scan.ranges + 0.14)  # another room, whose walls are near those of this one
-    seen, _ = made.find_seen_and_appeared(here, behind, mapped)
+    seen, _ = made.find_seen_and_appeared(here, behind)
     assert seen.mean() < 0.5  # only beams that meet walls at a shallow angle
-
-
-def test_surface_in_place_of_another():
-    """What ends where the map's surface was seen, but not at that surface, was not seen before."""
-    scene = Scene.of(ROOM, 361, 1)
-    scan, made = view(scene, HERE), local_map(scene, HERE)
-    here, nothing = made.to_local(HERE), np.zeros(len(scan.ranges), np.bool_)
-    mapped = ~nothing
-    mapped[100:150] = False
-    seen, appeared = made.find_seen_and_appeared(here, scan, mapped)
-    assert np.flatnonzero(~seen).tolist() == list(range(100, 150))
-    assert not appeared.any()
-    made.add(LocalMapScan(here, scan, nothing, mapped, 0.0, 0.0), HERE, np.diag([1e-4, 1e-4, 1e-5]))
-    assert made.find_seen_and_appeared(here, view(scene, HERE), mapped)[0].all()
 
 
 def test_changes_between_scans():
