@@ -105,7 +105,7 @@ class View:
     optimiser: Optimiser = field(default_factory=GaussNewton)
     map_error: float = 0.0  # m, standard deviation of the map's error beyond what the model states
     correlated_fraction: float = 0.0  # of the variance of the map's error: alike for beams on the same segment
-    changed_fraction: float = 0.25  # fraction of the beams that hit no surface of the map
+    changed_fraction: float = 0.25  # fraction of the beams that do not end at the map's first surface
     map_cell: float = 0.0  # m, edge of the cells if the map is a grid
     map_offset: float = 0.0  # m, mean distance of the real surfaces behind those that the model predicts
     log_prior: float = 0.0  # nats, of the probability that the map's error is this large

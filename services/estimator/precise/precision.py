@@ -50,7 +50,7 @@ class Precision:
     """Precision learned so far."""
 
     noise_factor: float = 1.0  # standard deviation of the scanner's noise, relative to the configured one
-    changed_fraction: float = 0.25  # fraction of the beams that hit no surface of the map
+    changed_fraction: float = 0.25  # fraction of the beams that do not end at the map's first surface
     cell: float = 0.0  # m, edge of the cells if the map is a grid
     offset: float = 0.0  # m, mean distance of the real surfaces behind the front of the cells, where the robot is
     offset_variance: float = 0.0  # m²
@@ -119,9 +119,10 @@ class Precision:
         self.scans = 0
 
     def learn_changes(self, view: View, pose: Array) -> None:
-        """Learns the fraction of beams that hit no surface of the map from a key scan at ``pose`` (3,)."""
-        explained = float(view.surface_evidence(pose[None]).explained[0])
-        self.changed_fraction += MIN_UPDATE_WEIGHT * (1 - explained - self.changed_fraction)
+        """Learns the fraction of beams that do not end at the map's first surface, from a key scan at ``pose`` (3,)."""
+        used = view.ranges > -np.inf  # not NaN either
+        mapped = float(view.surface_evidence(pose[None]).weights.sum()) / max(1, int(used.sum()))
+        self.changed_fraction += MIN_UPDATE_WEIGHT * (1 - mapped - self.changed_fraction)
         self.changed_fraction = float(np.clip(self.changed_fraction, MIN_CHANGED_FRACTION, MAX_CHANGED_FRACTION))
 
     def learn_map_error(self, view: View, pose: Array) -> None:

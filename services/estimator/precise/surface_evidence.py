@@ -3,8 +3,8 @@
 Each beam is in one of four states:
 
 - 0, mapped: it ends at the surface that the map shows;
-- 1, new: at something in front of that surface;
-- 2, unmapped: at something behind that surface which the map lacks;
+- 1, in front: at something in front of that surface;
+- 2, behind: at something behind that surface which the map lacks;
 - 3, removed: at the map's next surface, because the first one was removed.
 
 The states are a Markov chain along the scan, since neighbouring beams mostly meet the same surface. Where another
@@ -70,7 +70,7 @@ class SurfaceEvidence:
 
         ``behind`` (N, B) m are the ranges to the map's next surface behind the expected one; ``borders`` (N, B) is true
         where the map shows another surface than at the beam before. ``changed_fraction`` is the fraction of the beams
-        that hit no surface of the map.
+        that do not end at the map's first surface.
         """
         count = len(expected.ranges)
         by_beam, explained, weights = np.empty(expected.ranges.shape), np.empty(count), np.empty(expected.ranges.shape)
