@@ -14,8 +14,8 @@ from common.robot.robot import Robot
 
 ARRIVAL_DISTANCE = 0.8  # m; closer than this counts as arrived, as in the paper
 MIN_DISTANCE = 12.0  # m, between start and goal
-# m between the robot and any obstacle along the line. The obstacle stop (`safety`) checks 1 cm beside the robot and
-# keeps 5 cm ahead of it; the rest is seven times the scanner's noise, so that it never triggers on this line.
+# m between the robot and any obstacle along the line. The obstacle stop (`safety`) keeps a gap of 2 cm (`robot.margin`)
+# beside and ahead of the robot; the rest is six times the scanner's noise, so that it never triggers on this line.
 CLEARANCE = 0.15
 MAX_DRAWS = 20_000
 

@@ -4,7 +4,7 @@ The robot drives to a goal that asks for 3 mm, 0.5 degrees and an approach direc
 latency, a dead band, and wheels that slip. As in `experiment`, the real processes run in lockstep over zenoh. The
 errors are those of the true pose, 1 s after the controller has reported that the goal is reached.
 
-Goals have room for the robot along the whole approach, more than the obstacle stop keeps ahead of it. In every second
+Goals have room for the robot along the whole approach, more than the obstacle stop keeps around it. In every second
 trial the robot docks backwards.
 """
 
@@ -38,7 +38,7 @@ from services.controller.docking import Docking
 
 EXPERIMENT_ID = 12  # part of the random seeds
 TOLERANCE_M, YAW_TOLERANCE_RAD = 0.003, float(np.deg2rad(0.5))
-LINE_CLEARANCE_M = 0.13  # beside the footprint: the obstacle stop's gap and four times the scanner's noise
+LINE_CLEARANCE_M = 0.13  # beside the footprint: the obstacle stop's gap and five times the scanner's noise
 
 
 @dataclass(frozen=True)
