@@ -1,4 +1,4 @@
-"""Packages that need not be installed, and the command that installs them."""
+"""Packages that may be missing, and the command that installs them."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ IN_CHECKOUT = (Path(__file__).resolve().parents[1] / "pyproject.toml").is_file()
 
 
 def install_command(package: str) -> str:
-    """The command that installs a package which presage can use."""
+    """The command that installs a missing package, by import name."""
     if IN_CHECKOUT:
         return "make install"
-    return f"pip install 'presage[{EXTRAS[package]}]'" if package in EXTRAS else f"pip install {package}"
+    return f"pip install 'presage[{EXTRAS[package]}]'" if package in EXTRAS else "pip install presage"
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""What made a result: package versions, the protocol version, the commit of a checkout, and the command."""
+"""Provenance of a result: package versions, the protocol version, the commit of a checkout, and the command."""
 
 from __future__ import annotations
 
@@ -15,7 +15,19 @@ from pathlib import Path
 # do not run together (common/runtime/protocol_check.py).
 PROTOCOL = 1
 
-PACKAGES = ("presage", "eclipse-zenoh", "msgpack", "numpy", "pydantic", "mcap", "torch", "pybullet")
+PACKAGES = (
+    "presage",
+    "eclipse-zenoh",
+    "msgpack",
+    "numpy",
+    "scipy",
+    "numba",
+    "shapely",
+    "pydantic",
+    "mcap",
+    "torch",
+    "pybullet",
+)
 
 
 @functools.cache

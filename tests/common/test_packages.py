@@ -24,7 +24,7 @@ def test_commands_without_torch(arguments, tmp_path):
     assert done.stderr == "presage: the package torch is not installed; install it with: make install\n"
 
 
-@pytest.mark.parametrize(("package", "command"), [("torch", "'presage[paper]'"), ("numba", "numba")])
+@pytest.mark.parametrize(("package", "command"), [("torch", "'presage[paper]'"), ("yaml", "pip install presage")])
 def test_command_outside_a_checkout(monkeypatch, package, command):
     monkeypatch.setattr(packages, "IN_CHECKOUT", False)
     with pytest.raises(UserError, match="install it with: pip install ") as error, packages.explain_missing_packages():
