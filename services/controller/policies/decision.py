@@ -57,12 +57,12 @@ class Policy(Protocol):
     def observe(self, scan: Scan | None, belief: Belief) -> None:
         """Processes a belief and the scan from which it was computed, or None if that is no longer the latest scan."""
 
-    def decide(self, belief: Belief, velocity: Array, ahead: Array) -> Decision:
+    def decide(self, belief: Belief, velocity: Array, motion_until_effect: Array) -> Decision:
         """Chooses a velocity towards the goal when the pose is known.
 
-        ``velocity`` (3,) is the latest command. ``ahead`` (3,) is the motion from the belief's pose until the chosen
-        velocity takes effect. Both are in base_link.
+        ``velocity`` (3,) is the latest command. ``motion_until_effect`` (3,) is the motion from the belief's pose until
+        the chosen velocity takes effect. Both are in base_link.
         """
 
-    def decide_unlocalised(self, belief: Belief, velocity: Array, ahead: Array) -> Decision:
+    def decide_unlocalised(self, belief: Belief, velocity: Array, motion_until_effect: Array) -> Decision:
         """Chooses a velocity when the belief is lost, localising or ambiguous; arguments as for `decide`."""

@@ -168,9 +168,9 @@ class GeodesicPolicy:
         if (cell := self.graph.nearest_free(pose[:2], self.graph.min_clearance, map_only=True)) is not None:
             self._component = int(self.graph.component[cell])
 
-    def decide(self, belief: Belief, velocity: Array, ahead: Array) -> Decision:
+    def decide(self, belief: Belief, velocity: Array, motion_until_effect: Array) -> Decision:
         """Chooses the velocity of least expected free energy; arguments as for `Policy.decide`."""
-        pose, stamp_ns = se2.compose(belief.pose.array(), ahead), belief.stamp_ns
+        pose, stamp_ns = se2.compose(belief.pose.array(), motion_until_effect), belief.stamp_ns
         if not 0 <= stamp_ns - self._decided_ns <= MAX_GAP_NS:  # without beliefs, the robot stood
             self.interrupt()
         self._decided_ns = stamp_ns
@@ -235,10 +235,11 @@ class GeodesicPolicy:
             return np.full(points.shape[:-1], MAX_COST_TO_GOAL_M)
         return np.minimum(self.field.cost.ravel()[self.free.grid.cell_of(points)], MAX_COST_TO_GOAL_M)
 
-    def decide_unlocalised(self, belief: Belief, velocity: Array, ahead: Array) -> Decision:
+    def decide_unlocalised(self, belief: Belief, velocity: Array, motion_until_effect: Array) -> Decision:
         """Chooses a velocity with which the pose becomes known.
 
-        Without `epistemic`, an ambiguous belief leads to the goal, as if its best hypothesis were true.
+        Without `epistemic`, an ambiguous belief leads to the goal, as if its best hypothesis were true. Only then
+        ``motion_until_effect`` is used: the localiser plans from the pose of the belief.
         """
         if self._scan is None:
             return Decision(reason=f"standing until localised: the belief is {belief.state}")
@@ -247,7 +248,7 @@ class GeodesicPolicy:
             points = safety.scan_points(self._scan)
             points = points[np.hypot(*points.T) < OBSTACLE_RANGE_M]
             return self.localiser.decide(belief, self._scan, points, velocity, self._field_of_view)
-        decision = self.decide(belief, velocity, ahead)
+        decision = self.decide(belief, velocity, motion_until_effect)
         decision.reason = decision.reason or f"the belief is {belief.state}: assuming its best hypothesis"
         return decision
 

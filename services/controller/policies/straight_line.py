@@ -54,7 +54,7 @@ class StraightLinePolicy:
     def observe(self, scan: Scan | None, belief: Belief) -> None:
         """Does nothing: this policy uses the belief alone."""
 
-    def decide(self, belief: Belief, velocity: Array, ahead: Array) -> Decision:  # noqa: ARG002
+    def decide(self, belief: Belief, velocity: Array, motion_until_effect: Array) -> Decision:  # noqa: ARG002
         """Adds one step of equation 4; its sum replaces the latest command."""
         if self._goal is None:
             return Decision()
@@ -64,7 +64,7 @@ class StraightLinePolicy:
         self._action = next_action(self._action, observed, preferred, float(pose[2]), self.parameters)
         return Decision(np.array([self._action[0], self._action[1], 0.0]))
 
-    def decide_unlocalised(self, belief: Belief, velocity: Array, ahead: Array) -> Decision:  # noqa: ARG002
+    def decide_unlocalised(self, belief: Belief, velocity: Array, motion_until_effect: Array) -> Decision:  # noqa: ARG002
         """Stands until the pose is known."""
         self._action = np.zeros(2)
         state: DecisionState = "lost" if belief.state == "lost" else "navigating"
