@@ -57,7 +57,7 @@ class Explorer:
         self.path_m = 0.0
         self._failure = ""  # why the exploration has failed
         self._can_plan = True  # whether a path could be planned at the last choice of a viewpoint
-        self._pose, self.located = pose, True  # the pose is in the map only if the robot is located in it
+        self._pose, self.tracking = pose, True  # the pose is in the map only while the belief is in that state
         self._home = planned.anchor(pose)
         self._arrivals: list[AnchoredPose] = []  # where the robot arrived at viewpoints
         self._unreachable: list[AnchoredPose] = []  # viewpoints that were given up
@@ -71,7 +71,7 @@ class Explorer:
         return self.phase in {"exploring", "returning"}
 
     @property
-    def drives(self) -> bool:
+    def sets_goals(self) -> bool:
         """Whether the robot's goals are those of the exploration."""
         return self.active and not self.paused
 
@@ -82,20 +82,20 @@ class Explorer:
 
     def use_map(self, planned: PlannedMap) -> None:
         """Uses a new version of the map, in which another viewpoint may be better."""
-        self.map, self.viewpoint_due = planned, self.drives
+        self.map, self.viewpoint_due = planned, self.sets_goals
 
     def pause(self) -> None:
         """Pauses the exploration, because a user has set a goal."""
         self.goal, self.paused, self._user_goal_over_since_ns = None, True, None
 
-    def move(self, pose: Array, *, located: bool) -> None:
-        """Updates the robot's pose (3,), which is in the map only if the robot is ``located`` in it."""
-        if located == self.located:
+    def move(self, pose: Array, *, tracking: bool) -> None:
+        """Updates the robot's pose (3,), which is in the map only if the belief is in state `tracking`."""
+        if tracking == self.tracking:
             self.path_m += float(np.hypot(*(pose - self._pose)[:2]))
-        self._pose, self.located = pose, located
+        self._pose, self.tracking = pose, tracking
 
-    def exploration_state(self, field_of_view: FieldOfView) -> ExplorationState:
-        """The input for the choice of the next viewpoint."""
+    def exploration_state(self, field_of_view: FieldOfView, goal_count: int) -> ExplorationState:
+        """The input for the choice of the next viewpoint, after ``goal_count`` goals of users."""
         from services.controller.policies.exploration import ExplorationState  # slow: numba
 
         target = None
@@ -104,7 +104,9 @@ class Explorer:
         poses, home = self.map.message.poses, self.home
         end = (self._pose if home is None else home)[:2]
         arrivals, unreachable = self.map.locate(self._arrivals), self.map.locate(self._unreachable)[:, :2]
-        return ExplorationState(self.map.graph, poses, arrivals, field_of_view, self._pose, end, target, unreachable)
+        return ExplorationState(
+            self.map.graph, poses, arrivals, field_of_view, self._pose, end, target, unreachable, goal_count
+        )
 
     def update(self, state: GoalState, stamp_ns: int) -> None:
         """Processes the state of the robot's goal after a scan."""
@@ -112,7 +114,7 @@ class Explorer:
             return
         if self.paused:
             self.viewpoint_due |= self._resume_after_user_goal(state, stamp_ns)
-        elif not self.located:
+        elif not self.tracking:
             self._last_moved = self._pose, 0  # the policy drives to localise
         elif self.goal is not None:
             self._record_motion(stamp_ns)
@@ -206,9 +208,9 @@ class Explorer:
         status = status.model_copy(update={"exploration": progress})
         if self.phase == "failed" and status.state not in {"lost", "manual"}:
             return status.model_copy(update={"state": "blocked", "reason": self._failure, "refused": True})
-        if not self.drives or status.state in {"lost", "manual"}:
+        if not self.sets_goals or status.state in {"lost", "manual"}:
             return status
-        if not self.located:
+        if not self.tracking:
             if status.state in {"idle", "reached"} or status.refused:
                 reason = "the robot is not localised in the map"
                 return status.model_copy(update={"state": "lost", "reason": reason, "refused": False})

@@ -49,7 +49,7 @@ class Navigator:
 
     robot: Robot = field(default_factory=Robot)
     parameters: ActionParameters = field(default_factory=ActionParameters)  # of preset `paper`
-    world: World | None = None  # for floors, and to refuse goals inside walls; without it any goal is accepted
+    world: World | None = None  # the map; None while the mapper builds it, or if preset `paper` drives without a map
     chosen_policy: Policy | None = None  # defaults to the straight-line policy, preset `paper`
 
     def __post_init__(self) -> None:
@@ -64,9 +64,9 @@ class Navigator:
         self._pose: Array | None = None  # (3,) base_link in map, of the latest belief in state `tracking`
         self._tracking = False  # whether the latest belief is in that state
         self._floor: Floor | None = None  # of the robot when the destination was chosen; None if it was unknown
-        self.explorer: Explorer | None = None  # the last exploration, unless it was cancelled
+        self.explorer: Explorer | None = None  # None after it was cancelled, or when a goal follows its end
         self._exploration_request: Goal | None = None  # waits for the first map and a pose in it
-        self._open_choices: list[ExplorationState] = []  # for which viewpoints are being chosen
+        self._goal_count = 0  # goals of users so far; a viewpoint that was requested before the last is not used
         self._scan: Scan | None = None
         self._scan_points = np.zeros((0, 2))  # m in base_link
 
@@ -78,12 +78,13 @@ class Navigator:
 
     def on_drive(self, drive: Drive) -> None:
         """Stores a manual velocity command, which has priority over the goal."""
-        # Not the later of the two: the command keeps its stamp when time goes back.
+        # The scan's stamp first: after a simulation reset, the command still has a stamp from before.
         self._manual.update(drive, self.scan_stamp or self._command.stamp_ns or 0)
 
     def on_goal(self, goal: Goal) -> None:
         """Replaces, cancels or refuses the goal, or begins to explore. A goal known to be unreachable is refused."""
-        self._exploration_request, self._open_choices = None, []
+        self._exploration_request = None
+        self._goal_count += 1
         if goal.cancel or goal.explore or self.explorer is None or not self.explorer.active:
             self.explorer = None
         else:
@@ -95,9 +96,12 @@ class Navigator:
 
     def _explore(self, request: Goal) -> None:
         self.policy.set_goal(None)
-        if self.chosen_policy is None or self.world is not None:
-            reason = "cannot explore in a known world: start with `presage up --mapping`"
+        if self.chosen_policy is None:
+            reason = "preset paper cannot explore: use preset geodesic, and start with `presage up --mapping`"
             self.goal_state.start(request, reason)
+            return
+        if self.world is not None:
+            self.goal_state.start(request, "cannot explore in a known world: start with `presage up --mapping`")
             return
         self.goal_state.cancel()
         self._exploration_request = request
@@ -126,27 +130,25 @@ class Navigator:
         The caller passes the viewpoint that was chosen to `use_viewpoint`.
         """
         explorer = self.explorer
-        if explorer is None or not explorer.located or self.goal_state.phase is Phase.UNLOCALISED:
+        if explorer is None or not explorer.tracking or self.goal_state.phase is Phase.UNLOCALISED:
             return None  # the robot first has to be localised
         due, explorer.viewpoint_due = explorer.viewpoint_due, False
-        if not due or not explorer.drives or self._scan is None:
+        if not due or not explorer.sets_goals or self._scan is None:
             return None
         from services.controller.policies.exploration import FieldOfView  # slow: numba
 
-        exploration_state = explorer.exploration_state(FieldOfView.of(self._scan, explorer.map.message.grid.resolution))
-        self._open_choices.append(exploration_state)
-        return exploration_state
+        field_of_view = FieldOfView.of(self._scan, explorer.map.message.grid.resolution)
+        return explorer.exploration_state(field_of_view, self._goal_count)
 
     def use_viewpoint(self, viewpoint: Viewpoint | NoPath | None, exploration_state: ExplorationState) -> None:
         """Drives to the viewpoint that was chosen, or back to the start if there is none.
 
         ``viewpoint`` may also be the reason why none can be planned.
         """
-        count = next((k for k, each in enumerate(self._open_choices, start=1) if each is exploration_state), 0)
-        if self.explorer is None or not self.explorer.drives or count == 0:  # 0: from before the last goal of a user
+        outdated = exploration_state.goal_count != self._goal_count
+        if self.explorer is None or not self.explorer.sets_goals or outdated:
             return
-        self._open_choices = self._open_choices[count:]  # older ones were dropped for this one
-        if not self.explorer.located:
+        if not self.explorer.tracking:
             self.explorer.viewpoint_due = True
             return
         half_field_of_view = exploration_state.field_of_view.sector.half
@@ -231,7 +233,7 @@ class Navigator:
             self._pose = pose
         self._begin_exploration()
         if self.explorer is not None:
-            self.explorer.move(pose, located=belief.state == "tracking")
+            self.explorer.move(pose, tracking=self._tracking)
         has_its_scan = self._scan is not None and self._scan.stamp_ns == belief.stamp_ns
         self.policy.observe(self._scan if has_its_scan else None, belief)
         self._follow_floor()
@@ -246,7 +248,7 @@ class Navigator:
         desired = np.zeros(3)
         if goal is not None and distance is not None and self.goal_state.active:
             desired = self._goal_velocity(belief, pose, goal, distance)
-        elif self.explorer is not None and self.explorer.drives and not self.explorer.located:
+        elif self.explorer is not None and self.explorer.sets_goals and not self.explorer.tracking:
             desired = self._localising_velocity(belief)
         command, limited_by_scan = self._command.limit(belief.stamp_ns, desired, self._scan_points)
         moving = is_moving(self._command.velocity)
@@ -321,7 +323,7 @@ class Navigator:
 
     def _goal_velocity(self, belief: Belief, pose: Array, goal: Goal, distance: float) -> Array:
         """Velocity (3,) in base_link that the policy chooses, before any limit; updates the state of the goal."""
-        if belief.state in {"lost", "localising", "ambiguous"}:
+        if not self._tracking:
             return self._localising_velocity(belief)
         self.goal_state.find_pose()
         if self._ride is not None:

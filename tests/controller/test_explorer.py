@@ -81,7 +81,16 @@ def test_no_exploration_in_a_known_world():
     navigator.on_goal(goal(0, 0, explore=True, seq=5))
     status = navigator.goal_state.status(0, None)
     assert status.refused
-    assert "presage up --mapping" in status.reason
+    assert "in a known world: start with `presage up --mapping`" in status.reason
+
+
+@pytest.mark.parametrize("world", [HALL, None])
+def test_no_exploration_with_preset_paper(world):
+    navigator = Navigator(Robot(), world=world)
+    navigator.on_goal(goal(0, 0, explore=True, seq=5))
+    status = navigator.goal_state.status(0, None)
+    assert status.refused
+    assert "preset paper cannot explore: use preset geodesic" in status.reason
 
 
 def test_exploration_waits_for_the_first_map():
