@@ -199,14 +199,14 @@ class ControllerService(Service):
     def _process(self, belief: Belief) -> None:
         """Answers a belief, or requests predictions first if the policy needs them."""
         self._wait = Answered()  # set first, so that a belief whose step raises an exception is not processed again
-        start_ns, drives = time.thread_time_ns(), None
+        start_ns, paths = time.thread_time_ns(), None
         if self.geodesic is not None and self.navigator.goal_state.active:
-            drives = self.geodesic.prediction_request(belief)
+            paths = self.geodesic.prediction_request(belief)
         cpu_ns = time.thread_time_ns() - start_ns
-        if drives is None:
+        if paths is None:
             self._step(belief, cpu_ns)
             return
-        request = PredictRequest(poses=drives.poses().reshape(-1, 3), beams=PREDICTED_BEAMS)
+        request = PredictRequest(poses=paths.poses().reshape(-1, 3), beams=PREDICTED_BEAMS)
         self._latest_request = self.send_request(PREDICT, request, PREDICTION_TIMEOUT_S)
         self._wait = AwaitsPredictions(belief, cpu_ns)
 

@@ -16,14 +16,14 @@ from common.messages.requests import PredictReply, Reply
 from common.messages.topics import BELIEF, CMD_VEL, MAP, MAX_BYTES, PREDICT, SCAN
 from common.runtime.service import ServiceLoop
 from services.controller import service as shell
-from services.controller.policies.active_localisation import CandidateDrives
+from services.controller.policies.active_localisation import CandidatePaths
 from services.controller.service import ControllerService
 from services.controller.settings import ControllerSettings
 from tests.controller.driving import PERIOD_NS, belief, goal, room, scan
 from tests.process_replay.harness import FakeBus
 
 ROOM, POSE = room(10, 4), np.array([2.0, 2.0, 0.0])
-DRIVES = CandidateDrives(POSE[None], np.ones(1), POSE[None], np.ones(1))
+PATHS = CandidatePaths(POSE[None], np.ones(1), POSE[None], np.ones(1))
 
 
 class Clock:
@@ -43,7 +43,7 @@ class Predicting:
         self.numbers, self.used, self.failed = numbers, 0, 0
 
     def prediction_request(self, message):
-        return DRIVES if message.stamp_ns // PERIOD_NS in self.numbers else None
+        return PATHS if message.stamp_ns // PERIOD_NS in self.numbers else None
 
     def use_predictions(self, reply):
         self.used += 1

@@ -1,10 +1,17 @@
 """Chooses where to drive while the pose is ambiguous or unknown.
 
-The candidates are drives to places. The expected free energy of a drive (see `expected_free_energy`) is the length of
-the path to the place and from there to the goal, minus the expected information of a scan from there. With several
-possible poses, this information is how well predicted scans distinguish the poses; with an unknown pose, any scan is
-assumed to give the pose. In both cases a scan near a place where the robot has already been gives less information,
-because scans from one place are not independent.
+The candidates are paths to places. With several possible poses, the expected free energy of a path in nats is
+
+    G(path) = NATS_PER_METRE * (cost to the place + cost from there to the goal)
+              + entropy of a beam there - novelty * information of a scan there
+
+The cost to the goal and the entropy are means over the possible poses. The information is how well predicted scans
+distinguish the poses. Its novelty is less than 1 near a place where the robot has already been, because scans from one
+place are not independent.
+
+With an unknown pose there is no path to the goal, and no scan can be predicted. The candidates are then straight lines
+to free places in the present scan, the cost is that of the line and of the turn towards it, and any scan is assumed to
+give the pose, times its novelty.
 """
 
 from __future__ import annotations
@@ -24,6 +31,7 @@ from services.controller.policies.expected_free_energy import NATS_PER_METRE, Ex
 from services.controller.policies.motion_model import turn_to_lookahead
 from services.controller.policies.motion_selection import Surroundings, select_motion
 from services.controller.policies.recovery import BACKING_OFF, back_off
+from services.controller.policies.scan_information import DEFAULT_SIGMA_M
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -40,7 +48,8 @@ MIN_WEIGHT = 1e-3  # hypotheses with less weight do not keep a belief from `trac
 MIN_COUNTED_WEIGHT = 0.05
 MAX_HYPOTHESES = 6  # scans are predicted for each
 PLACE_SPACING_M = 1.0  # of the places that are compared
-MIN_PATH_M, MAX_PATH_M = 0.8, 12.0  # cost of the path to a place; a metre costs 1 where nothing is near
+# Cost of the path to a place; a metre costs 1 where nothing is near and scans give the pose.
+MIN_PATH_COST_M, MAX_PATH_COST_M = 0.8, 12.0
 MAX_PLACES = 60
 CHOICE_PERIOD_NS = 1_000_000_000  # minimum time between two choices of a place
 MAX_SPEED = 0.5  # m/s, because it is not known what is behind and beside the robot
@@ -50,24 +59,26 @@ MAX_VISITED = 100  # positions kept, VISITED_SPACING_M apart
 VISITED_SPACING_M = 0.25
 STALLED_NS = 3_000_000_000  # after this time without progress, the robot gives up the place
 REACHED_M = 0.1  # a place nearer than this was reached
-PROGRESS_RAD = 0.5  # a turn by this, or a motion by `VISITED_SPACING_M`, is progress; turning to and fro by less is not
+PROGRESS_M, PROGRESS_RAD = 0.25, 0.5  # a motion or turn by this is progress; turning to and fro by less is not
 MAX_USEFUL_ROOM_M = 5.0  # more free distance than this is no advantage
 WINDOW_RAD = 0.35  # the room (free distance) in a direction is the shortest range this far to either side of it
 MIN_ROOM_M = 0.7  # if every direction has less, the robot turns on the spot
+TURN_RATE = 0.5  # rad/s, of a turn on the spot to look elsewhere
+MAX_LOOKAHEAD_M = 2.0  # distance of the lookahead point while the pose is unknown
 NOMINAL_SIGMA_M = 0.02  # standard deviation of a beam at which its entropy counts as 0
 
 
 @dataclass(frozen=True)
-class CandidateDrives:
-    """Drives to places, compared under one belief. The first hypothesis is the best one."""
+class CandidatePaths:
+    """Paths to places, compared under one belief. The first hypothesis is the best one."""
 
     hypotheses: Array  # (K, 3) base_link in map
     weights: Array  # (K,)
-    displacements: Array  # (M, 3) of each drive, in base_link; the same from each hypothesis
-    lengths: Array  # (M,) m to drive there
+    displacements: Array  # (M, 3) from start to end, in base_link; the same from each hypothesis
+    path_costs: Array  # (M,) m
 
     def poses(self) -> Array:
-        """Poses (K, M, 3) in map after each drive from each hypothesis."""
+        """Poses (K, M, 3) in map at the end of each path from each hypothesis."""
         return se2.compose(self.hypotheses[:, None, :], self.displacements[None, :, :])
 
 
@@ -77,44 +88,50 @@ class VisitedPlaces:
     def __init__(self) -> None:
         self.positions = np.zeros((1, 2))  # (V, 2) m
         self._stamp_ns: int | None = None
-        self._progress = np.zeros(3), 0  # pose in base_link and stamp in ns at which the robot last made progress
 
     def move(self, stamp_ns: int, velocity: Array) -> Array:
         """Integrates the latest command (3,) up to a stamp; returns the motion (3,) since the stamp before."""
         seconds = 0.0 if self._stamp_ns is None else max(0.0, (stamp_ns - self._stamp_ns) * 1e-9)
         motion = velocity * seconds
         self.positions = se2.rotate(-motion[2], self.positions - motion[:2])
-        first, self._stamp_ns = self._stamp_ns is None, stamp_ns
-        pose = se2.between(motion, self._progress[0])
-        self._progress = pose, self._progress[1]
-        if first or np.hypot(*pose[:2]) > VISITED_SPACING_M or abs(pose[2]) > PROGRESS_RAD:
-            self.restart_clock()
+        self._stamp_ns = stamp_ns
         if np.hypot(*self.positions.T).min() > VISITED_SPACING_M:
-            self._add(np.zeros(2))
+            self.add(np.zeros(2))
         return motion
 
-    def restart_clock(self) -> None:
-        """Waits for progress from now on."""
-        self._progress = np.zeros(3), self._stamp_ns or 0
-
-    def give_up_if_stalled(self, place: Array) -> bool:
-        """Counts the place (2,) m that the robot drives to as visited, if there was no progress for `STALLED_NS`.
-
-        Returns whether it was given up.
-        """
-        if self._stamp_ns is None or self._stamp_ns - self._progress[1] <= STALLED_NS:
-            return False
-        self.restart_clock()
-        self._add(place)
-        return True
-
-    def _add(self, place: Array) -> None:
+    def add(self, place: Array) -> None:
+        """Counts a place (2,) m in base_link as visited."""
         self.positions = np.concatenate([self.positions, place[None]])[-MAX_VISITED:]
 
     def novelty(self, places: Array) -> Array:
         """Share (M,) of the information of a scan that is new at places (M, 2) m in base_link."""
         distance = np.hypot(*np.moveaxis(places[:, None] - self.positions, -1, 0)).min(axis=1)
         return np.asarray(-np.expm1(-(distance**2) / (2 * CORRELATION_LENGTH_M**2)))
+
+
+class StallTimer:
+    """Measures the time without progress of a robot that paths."""
+
+    def __init__(self) -> None:
+        self._pose = np.zeros(3)  # in the present base_link, where the robot last made progress
+        self._progress_ns: int | None = None  # stamp of the last progress; None before the first one
+        self._stamp_ns = 0
+
+    def move(self, stamp_ns: int, motion: Array) -> None:
+        """Processes the motion (3,) since the stamp before."""
+        self._stamp_ns, self._pose = stamp_ns, se2.between(motion, self._pose)
+        moved = np.hypot(*self._pose[:2]) > PROGRESS_M or abs(self._pose[2]) > PROGRESS_RAD
+        if moved or self._progress_ns is None:
+            self.restart()
+
+    def restart(self) -> None:
+        """Measures from now on."""
+        self._pose, self._progress_ns = np.zeros(3), self._stamp_ns
+
+    @property
+    def expired(self) -> bool:
+        """Whether there was no progress for `STALLED_NS`."""
+        return self._progress_ns is not None and self._stamp_ns - self._progress_ns > STALLED_NS
 
 
 class ActiveLocaliser:
@@ -149,15 +166,15 @@ class ActiveLocaliser:
 
     def reset(self) -> None:
         """Forgets everything. Call it when the pose is known, or the goal has changed."""
-        self._visited = VisitedPlaces()
-        self._requested: tuple[int, CandidateDrives] | None = None  # stamp in ns and drives of the last request
+        self._visited, self._stall_timer = VisitedPlaces(), StallTimer()
+        self._requested: tuple[int, CandidatePaths] | None = None  # stamp in ns and paths of the last request
         self._prediction_failure = ""  # why the last request was not answered
         self._place: tuple[Array, dict[str, float]] | None = None  # (3,) in base_link, and its expected free energy
         self._field: tuple[Array, CostField | None] | None = None  # a place (2,) m in map and its field
         self._unknown_since_ns: int | None = None  # stamp since which there are no likely hypotheses
 
-    def prediction_request(self, belief: Belief) -> CandidateDrives | None:
-        """Candidate drives; scans must be predicted for their end poses and passed to `use_predictions`.
+    def prediction_request(self, belief: Belief) -> CandidatePaths | None:
+        """Candidate paths; scans must be predicted for their end poses and passed to `use_predictions`.
 
         Returns None if no predictions are needed now.
         """
@@ -165,13 +182,19 @@ class ActiveLocaliser:
         stamp = belief.stamp_ns
         if len(poses) < 2 or (self._requested is not None and 0 <= stamp - self._requested[0] < CHOICE_PERIOD_NS):
             return None
-        displacements, lengths = self._candidate_places(poses[0])
-        if self._place is not None:
-            displacements = np.concatenate([self._place[0][None], displacements])
-            lengths = np.concatenate([[np.hypot(*self._place[0][:2])], lengths])
-        if not len(lengths):
+        field = self.graph.cost_field(poses[0][:2], self.min_point_distance + PLACE_SPACING_M)
+        if field is None:
             return None
-        self._requested = (stamp, CandidateDrives(poses, weights, displacements, lengths))
+        displacements, path_costs = self._candidate_places(field, poses[0])
+        if self._place is not None:
+            present, _ = self._place
+            cost = field.cost_from(se2.compose(poses[0], present)[:2])
+            if np.isfinite(cost):
+                displacements = np.concatenate([present[None], displacements])
+                path_costs = np.concatenate([[cost], path_costs])
+        if not len(path_costs):
+            return None
+        self._requested = (stamp, CandidatePaths(poses, weights, displacements, path_costs))
         return self._requested[1]
 
     def use_predictions(self, reply: PredictReply, range_max: float, cost_to_goal: Callable[[Array], Array]) -> None:
@@ -182,13 +205,15 @@ class ActiveLocaliser:
         self._prediction_failure = ""
         if self._requested is None:
             return
-        _, drives = self._requested
-        shape = (len(drives.hypotheses), len(drives.displacements), -1)
+        _, paths = self._requested
+        shape = (len(paths.hypotheses), len(paths.displacements), -1)
         ranges = reply.ranges.astype(np.float64).reshape(shape)
-        sigma = reply.sigma.astype(np.float64).reshape(shape) if len(reply.sigma) else np.full_like(ranges, 0.05)
-        energy = drive_energy(drives, ranges, sigma, range_max, cost_to_goal, self._visited.novelty)
+        sigma = np.full_like(ranges, DEFAULT_SIGMA_M)
+        if len(reply.sigma):
+            sigma = reply.sigma.astype(np.float64).reshape(shape)
+        energy = path_energy(paths, ranges, sigma, range_max, cost_to_goal, self._visited.novelty)
         best = int(np.argmin(energy.total))
-        self._place = drives.displacements[best], energy.of(best, energy.total)
+        self._place = paths.displacements[best], energy.of(best, energy.total)
 
     def fail_prediction(self, reason: str) -> None:
         """Stores why the last request was not answered. The next one follows after `CHOICE_PERIOD_NS`."""
@@ -197,19 +222,20 @@ class ActiveLocaliser:
     def decide(self, belief: Belief, scan: Scan, points: Array, velocity: Array, field_of_view: Sector) -> Decision:
         """Chooses a velocity; ``points`` (K, 2) m in base_link are obstacles."""
         motion = self._visited.move(belief.stamp_ns, velocity)
+        self._stall_timer.move(belief.stamp_ns, motion)
         if self._place is not None:
             self._place = (se2.between(motion, self._place[0]), self._place[1])
-            # A place that was reached has told what it can. Were it kept, the robot would stay there for as long as no
-            # other place is worth its path.
+            # A further scan from a place that was reached gives no information. If it were kept, the robot would stay
+            # until another place is worth its path.
             if np.hypot(*self._place[0][:2]) < REACHED_M:
                 self._place = None
-        self._recovery.watch(belief.stamp_ns, moving=True)  # here, progress decides when the robot backs off
+        self._recovery.restart_timer()  # here, progress decides when the robot backs off
         static = np.zeros(len(points), bool)
         surroundings = Surroundings(
             _no_walls, points, static, 0.0, self.min_point_distance, field_of_view=field_of_view, may_turn=self.may_turn
         )
         if self._recovery.is_active(belief.stamp_ns):
-            self._visited.restart_clock()
+            self._stall_timer.restart()
             action = back_off(velocity, surroundings, self.robot).action
             return Decision(action, BACKING_OFF, "blocked", recovering=True)
         poses, _ = _likely_hypotheses(belief)
@@ -218,7 +244,7 @@ class ActiveLocaliser:
             if self._place is not None:
                 self._give_up_if_stalled(belief.stamp_ns, self._place[0][:2])
                 return self._drive_to(poses[0], *self._place, surroundings, velocity, len(poses))
-            self._visited.restart_clock()
+            self._stall_timer.restart()
             if self._prediction_failure:
                 reason = f"{len(poses)} places are possible; standing without predicted scans to tell them apart"
                 return Decision(reason=f"{reason}: {self._prediction_failure}", state="lost")
@@ -226,31 +252,33 @@ class ActiveLocaliser:
         if self._unknown_since_ns is None or belief.stamp_ns < self._unknown_since_ns:
             self._unknown_since_ns = belief.stamp_ns
         if belief.stamp_ns - self._unknown_since_ns < INITIAL_WAIT_NS:
-            self._visited.restart_clock()
+            self._stall_timer.restart()
             return Decision(reason=f"the belief is {belief.state}: standing while the estimator searches", state="lost")
         return self._drive_to_open_space(belief, scan, surroundings, velocity)
 
     def _give_up_if_stalled(self, stamp_ns: int, place: Array) -> None:
-        """Gives up the place (2,) m in base_link and backs off, if the robot makes no progress towards it.
+        """Counts the place (2,) m in base_link as visited and backs off, if the robot makes no progress towards it.
 
         From where the robot cannot reach one place, it often cannot reach others.
         """
-        if self._visited.give_up_if_stalled(place):
+        if self._stall_timer.expired:
+            self._stall_timer.restart()
+            self._visited.add(place)
             self._recovery.begin(stamp_ns)
 
-    def _candidate_places(self, pose: Array) -> tuple[Array, Array]:
-        """Displacements (M, 3) in base_link of the places around a hypothesis (3,), and costs (M,) m of the paths."""
-        field = self.graph.cost_field(pose[:2], self.min_point_distance + PLACE_SPACING_M)
-        if field is None:
-            return np.zeros((0, 3)), np.zeros(0)
+    def _candidate_places(self, field: CostField, pose: Array) -> tuple[Array, Array]:
+        """Displacements (M, 3) in base_link of the places around a hypothesis (3,), and costs (M,) m of the paths.
+
+        The ``field`` leads to the hypothesis.
+        """
         step = max(1, round(PLACE_SPACING_M / self.graph.grid.resolution))
         rows, columns = np.meshgrid(*(np.arange(step // 2, n, step) for n in field.cost.shape), indexing="ij")
         cells = (rows * field.cost.shape[1] + columns).ravel()
         cost = field.cost.ravel()[cells]
-        is_candidate = (cost > MIN_PATH_M) & (cost < MAX_PATH_M)
-        if not is_candidate.any():  # where scans tell little about the pose, a metre costs up to a hundred
-            near = np.hypot(*(self.graph.grid.centres(cells) - pose[:2]).T) < MAX_PATH_M
-            is_candidate = (cost > MIN_PATH_M) & np.isfinite(cost) & near
+        is_candidate = (cost > MIN_PATH_COST_M) & (cost < MAX_PATH_COST_M)
+        if not is_candidate.any():  # where scans tell little about the pose, a metre costs hundreds
+            near = np.hypot(*(self.graph.grid.centres(cells) - pose[:2]).T) < MAX_PATH_COST_M
+            is_candidate = (cost > MIN_PATH_COST_M) & np.isfinite(cost) & near
         cells, cost = cells[is_candidate], cost[is_candidate]
         # Thin out to MAX_PLACES, evenly over the costs.
         selected = np.argsort(cost, kind="stable")[:: max(1, -(-len(cost) // MAX_PLACES))]
@@ -289,7 +317,7 @@ class ActiveLocaliser:
         length = np.minimum(room - self.min_point_distance, MAX_USEFUL_ROOM_M)
         if room.max() < MIN_ROOM_M and self.may_turn:
             reason = f"the belief is {belief.state}: turning to where there is room"
-            return Decision(np.array([0.0, 0.0, 0.5]), reason, "exploring")
+            return Decision(np.array([0.0, 0.0, TURN_RATE]), reason, "exploring")
         reason = f"the belief is {belief.state}: driving to where there is room, to see more"
         direction = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
         turn = np.abs(se2.wrap(bearing - surroundings.forward)) * self.robot.max_speed / self.robot.max_turn
@@ -298,7 +326,7 @@ class ActiveLocaliser:
         energy = ExpectedFreeEnergy(NATS_PER_METRE * (length + turn), zero, zero, gain)
         best = int(np.argmin(energy.total))
         self._give_up_if_stalled(belief.stamp_ns, length[best] * direction[best])
-        lookahead = min(float(length[best]), 2.0) * direction[best]
+        lookahead = min(float(length[best]), MAX_LOOKAHEAD_M) * direction[best]
         return self._approach(
             lookahead, surroundings, velocity, Decision(reason=reason, terms=energy.of(best, energy.total))
         )
@@ -313,34 +341,34 @@ class ActiveLocaliser:
             forward=surroundings.forward,
         )
         if not action.any() and self.may_turn:  # no free motion: turn to look elsewhere
-            action[2] = 0.5 if lookahead[1] >= 0 else -0.5
+            action[2] = TURN_RATE if lookahead[1] >= 0 else -TURN_RATE
         decision.action, decision.state = action, "exploring"
         return decision
 
 
-def drive_energy(
-    drives: CandidateDrives,
+def path_energy(
+    paths: CandidatePaths,
     ranges: Array,
     sigma: Array,
     range_max: float,
     cost_to_goal: Callable[[Array], Array],
     novelty: Callable[[Array], Array],
 ) -> ExpectedFreeEnergy:
-    """Expected free energy of M drives under K hypotheses.
+    """Expected free energy of M paths under K hypotheses.
 
     ``ranges`` and ``sigma`` (K, M, B) m are the scans predicted at the ends. ``cost_to_goal`` returns the cost (...,) m
     of the paths to the goal from places (..., 2) m in map; ``novelty`` returns the share (M,) of the information of
     scans at places (M, 2) m in base_link that is new.
     """
-    rest_of_path = drives.weights @ cost_to_goal(drives.poses()[..., :2]) / drives.weights.sum()
+    rest_of_path = paths.weights @ cost_to_goal(paths.poses()[..., :2]) / paths.weights.sum()
     nominal_variance = NOMINAL_SIGMA_M**2 + efe.ARRIVAL_ERROR_M**2
     beam_entropy = np.log((sigma**2 + efe.ARRIVAL_ERROR_M**2) / nominal_variance).mean(axis=2) / 2
-    gain = efe.place_information(drives.weights, ranges, sigma, range_max)
+    gain = efe.place_information(paths.weights, ranges, sigma, range_max)
     return ExpectedFreeEnergy(
-        NATS_PER_METRE * (drives.lengths + rest_of_path),
-        drives.weights @ beam_entropy / drives.weights.sum(),
+        NATS_PER_METRE * (paths.path_costs + rest_of_path),
+        paths.weights @ beam_entropy / paths.weights.sum(),
         np.zeros(len(gain)),
-        gain * novelty(drives.displacements[:, :2]),
+        gain * novelty(paths.displacements[:, :2]),
     )
 
 

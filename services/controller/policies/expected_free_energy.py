@@ -38,7 +38,7 @@ class ExpectedFreeEnergy:
     """The terms of N motions in nats, (N,) each."""
 
     risk: Array
-    ambiguity: Array  # motions: entropy of the pose along the path; drives to a place: mean entropy of a beam there
+    ambiguity: Array  # motions: entropy of the pose along the path; paths to a place: mean entropy of a beam there
     pose_information: Array  # expected gain about where the robot is within a place
     place_information: Array  # expected gain about which of several places it is at
 
@@ -53,9 +53,9 @@ class ExpectedFreeEnergy:
         return terms | {"probability": float(motion_probabilities(energy)[motion])}
 
 
-def motion_probabilities(energy: Array, precision: float = PROBABILITY_PRECISION) -> Array:
+def motion_probabilities(energy: Array) -> Array:
     """Probabilities (N,) of motions with expected free energies (N,) nats, of which at least one is finite."""
-    weight = np.exp(-precision * (energy - np.min(energy)))
+    weight = np.exp(-PROBABILITY_PRECISION * (energy - np.min(energy)))
     return np.asarray(weight / weight.sum())
 
 
@@ -95,22 +95,14 @@ def entropy(weights: Array) -> float:
     return float(-np.sum(w * np.log(np.where(w > 0, w, 1.0))))
 
 
-def place_information(
-    weights: Array,
-    ranges: Array,
-    sigma: Array,
-    range_max: float,
-    outliers: float = OUTLIER_SHARE,
-    arrival_error: float = ARRIVAL_ERROR_M,
-    sectors: int = INDEPENDENT_SECTORS,
-) -> Array:
+def place_information(weights: Array, ranges: Array, sigma: Array, range_max: float) -> Array:
     """Lower bound (M,) in nats of what one scan after each of M motions tells about which hypothesis is true.
 
     ``weights`` (K,) belong to the hypotheses; ``ranges`` (K, M, B) m are predicted for each hypothesis after each
     motion, +inf for no return; ``sigma`` (K, M, B) m are their standard deviations. The density of a beam is
-    p(o) = (1 - e) N(o; r, s²) + e / R, with the share e of ``outliers``; the ``arrival_error`` m is added to sigma in
-    quadrature, and all beams count as at most ``sectors`` independent ones. With the defaults, and 0.69 nats between
-    two equally likely places, 3 clearly different beams of 61 gain 0.2 nats, 8 beams 0.4, and 20 beams 0.65.
+    p(o) = (1 - e) N(o; r, s²) + e / R, with e = `OUTLIER_SHARE`; `ARRIVAL_ERROR_M` is added to sigma in quadrature, and
+    all beams count as at most `INDEPENDENT_SECTORS` independent ones. With 0.69 nats between two equally likely places,
+    3 clearly different beams of 61 gain 0.2 nats, 8 beams 0.4, and 20 beams 0.65.
 
     The mutual information of hypothesis k and scan has no closed form for a mixture. This is the pairwise bound of
     Kolchinsky & Tracey 2017 ("Estimating mixture entropy with pairwise distances") with the Bhattacharyya coefficient:
@@ -127,14 +119,14 @@ def place_information(
     """
     w = np.asarray(weights, float) / np.sum(weights)
     r = np.clip(np.asarray(ranges, float), 0.0, range_max)
-    variance = np.asarray(sigma, float) ** 2 + arrival_error**2
-    tail = outliers / 2 + np.sqrt(outliers * (1 - outliers) / range_max) * (8 * np.pi * variance) ** 0.25
-    independent_share = min(1.0, sectors / max(r.shape[2], 1))
+    variance = np.asarray(sigma, float) ** 2 + ARRIVAL_ERROR_M**2
+    tail = OUTLIER_SHARE / 2 + np.sqrt(OUTLIER_SHARE * (1 - OUTLIER_SHARE) / range_max) * (8 * np.pi * variance) ** 0.25
+    independent_share = min(1.0, INDEPENDENT_SECTORS / max(r.shape[2], 1))
     overlap = np.ones((len(w), len(w), r.shape[1]))  # BC of whole scans
     for i in range(len(w)):
         for j in range(i):
             core = np.exp(-((r[i] - r[j]) ** 2) / (4 * (variance[i] + variance[j])))
-            beams = np.clip((1 - outliers) * core + tail[i] + tail[j], MIN_BEAM_OVERLAP, 1.0)
+            beams = np.clip((1 - OUTLIER_SHARE) * core + tail[i] + tail[j], MIN_BEAM_OVERLAP, 1.0)
             overlap[i, j] = overlap[j, i] = np.exp(independent_share * _log_product(beams))
     mixed = np.einsum("j,ijm->im", w, overlap)
     gain = -np.einsum("i,im->m", w, np.log(np.where(w[:, None] > 0, mixed, 1.0)))

@@ -153,6 +153,11 @@ class CostField:
         """Whether the goal can be reached from a point (2,) m."""
         return self._entry_cell(point) is not None
 
+    def cost_from(self, point: Array) -> float:
+        """Cost in m of the path from a point (2,) m to the goal; +inf if there is none."""
+        cell = self._entry_cell(point)
+        return np.inf if cell is None else float(self.cost.ravel()[cell])
+
     def path(self, point: Array) -> Array:
         """Path (K, 2) m in map from a point (2,) to the goal, cell by cell; (0, 2) if there is none."""
         cell = self._entry_cell(point)

@@ -39,11 +39,15 @@ class Recovery:
     def watch(self, stamp_ns: int, *, moving: bool) -> None:
         """Begins to back off after `STUCK_AFTER_NS` without motion; called with each decision to drive."""
         if moving:
-            self._standing_since_ns = None
+            self.restart_timer()
         elif self._standing_since_ns is None or stamp_ns < self._standing_since_ns:
             self._standing_since_ns = stamp_ns
         elif stamp_ns - self._standing_since_ns > STUCK_AFTER_NS:
             self.begin(stamp_ns)
+
+    def restart_timer(self) -> None:
+        """Measures the time without motion from the next `watch` on."""
+        self._standing_since_ns = None
 
     def begin(self, stamp_ns: int) -> None:
         """Begins to back off."""

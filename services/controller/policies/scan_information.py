@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 CELL_M = 0.5  # the information of scans changes slowly over the map
 MAX_CELLS = 10_000  # a map that would need more gets larger cells, so that the first scan takes about a second at most
 DIRECTIONS = 48  # of the rays that stand for a scan, evenly spaced over a full turn
-DEFAULT_SIGMA_M = 0.02  # of a range, if the scanner does not state it
+DEFAULT_SIGMA_M = 0.02  # of a range, if neither the scanner nor the estimator states it
 MAP_ERROR_M = 0.01  # of a surface along its normal
 MIN_INCIDENCE = 0.05  # cosine of the angle between beam and normal, below which the first order no longer holds
 MAX_RAY_STEPS = 60  # of sphere tracing

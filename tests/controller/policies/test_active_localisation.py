@@ -8,11 +8,11 @@ import pytest
 from common.messages.definitions import BeliefHypothesis, Pose
 from common.robot.robot import Robot
 from common.robot.scan_geometry import Sector
-from services.controller.policies.active_localisation import CHOICE_PERIOD_NS, ActiveLocaliser, VisitedPlaces
+from services.controller.policies.active_localisation import CHOICE_PERIOD_NS, ActiveLocaliser, StallTimer
 from services.controller.policies.free_space import FreeSpace
 from services.controller.policies.geodesic_field import FreeSpaceGraph
 from services.controller.policies.recovery import Recovery
-from tests.controller.driving import belief, room, scan
+from tests.controller.driving import belief, box, room, scan
 
 ROBOT = Robot()
 
@@ -24,28 +24,43 @@ def test_weight_of_the_second_hypothesis(weight, counted):
     hypotheses = [BeliefHypothesis(pose=Pose.of(p), weight=w) for p, w in zip(poses, (1 - weight, weight), strict=True)]
     ambiguous = belief(0, poses[0], "ambiguous").model_copy(update={"hypotheses": hypotheses})
     graph = FreeSpaceGraph(FreeSpace.of(room(10, 4)), ROBOT.radius)
-    motions = ActiveLocaliser(ROBOT, graph, 0.33, Recovery()).prediction_request(ambiguous)
+    paths = ActiveLocaliser(ROBOT, graph, 0.33, Recovery()).prediction_request(ambiguous)
     if counted is None:
-        assert motions is None
+        assert paths is None
     else:
-        assert motions.weights.tolist() == pytest.approx([1 - weight, counted])
+        assert paths.weights.tolist() == pytest.approx([1 - weight, counted])
 
 
 def test_time_for_progress():
     """It counts from when the robot may drive: not while it waits or backs off. A turn by half a radian is progress."""
-    visited = VisitedPlaces()
-    away = np.array([1.0, 0.0])
-    visited.move(0, np.zeros(3))
-    visited.move(4_000_000_000, np.zeros(3))
-    visited.restart_clock()
-    assert not visited.give_up_if_stalled(away)
-    visited.move(6_000_000_000, np.array([0.0, 0.0, 0.3]))
-    visited.move(8_000_000_000, np.zeros(3))
-    assert not visited.give_up_if_stalled(away)
-    visited.move(9_500_000_000, np.zeros(3))
-    assert visited.give_up_if_stalled(away)
-    assert not visited.give_up_if_stalled(away)
-    assert visited.positions[-1].tolist() == away.tolist()
+    timer = StallTimer()
+    assert not timer.expired
+    timer.move(0, np.zeros(3))
+    timer.move(4_000_000_000, np.zeros(3))
+    assert timer.expired
+    timer.restart()
+    assert not timer.expired
+    timer.move(6_000_000_000, np.array([0.0, 0.0, 0.6]))
+    timer.move(8_000_000_000, np.array([0.1, 0.0, 0.0]))
+    assert not timer.expired
+    timer.move(9_500_000_000, np.array([0.1, 0.0, 0.0]))
+    assert timer.expired
+    timer.move(9_600_000_000, np.array([0.1, 0.0, 0.0]))
+    assert not timer.expired
+
+
+def test_the_present_place_costs_as_much_as_its_path():
+    """It is 2 m away, behind a wall around which the path is much longer."""
+    poses, world = np.array([[3.5, 1.0, 0.0], [8.0, 1.0, 0.0]]), room(10, 6, box(4.5, 2.0, 0.2, 4.0))
+    hypotheses = [BeliefHypothesis(pose=Pose.of(pose), weight=0.5) for pose in poses]
+    ambiguous = belief(0, poses[0], "ambiguous").model_copy(update={"hypotheses": hypotheses})
+    graph = FreeSpaceGraph(FreeSpace.of(world), ROBOT.radius)
+    localiser = ActiveLocaliser(ROBOT, graph, 0.33, Recovery())
+    localiser._place = np.array([2.0, 0.0, 0.0]), {}
+    paths = localiser.prediction_request(ambiguous)
+    assert paths.displacements[0].tolist() == [2.0, 0.0, 0.0]
+    assert paths.path_costs[0] > 6.0
+    assert paths.path_costs[0] == graph.cost_field(poses[0, :2]).cost_from(np.array([5.5, 1.0]))
 
 
 def test_places_where_scans_tell_little():
@@ -55,9 +70,9 @@ def test_places_where_scans_tell_little():
     ambiguous = belief(0, poses[0], "ambiguous").model_copy(update={"hypotheses": hypotheses})
     graph = FreeSpaceGraph(FreeSpace.of(room(10, 4)), ROBOT.radius)
     graph.set_extra_cost_per_metre(np.full(graph.grid.shape, 100.0).ravel())
-    drives = ActiveLocaliser(ROBOT, graph, 0.33, Recovery()).prediction_request(ambiguous)
-    assert drives is not None
-    assert len(drives.displacements) > 5
+    paths = ActiveLocaliser(ROBOT, graph, 0.33, Recovery()).prediction_request(ambiguous)
+    assert paths is not None
+    assert len(paths.displacements) > 5
 
 
 def test_without_predictions_the_robot_asks_again_and_says_why_it_stands():
