@@ -86,10 +86,10 @@ class LocalisedRobot:
         if not self.navigator.goal_state.active:
             return 0
         began = time.thread_time_ns()
-        motions = self.policy.prediction_request(belief)
+        paths = self.policy.prediction_request(belief)
         took_us = (time.thread_time_ns() - began) // 1000
-        if motions is not None:
-            request = PredictRequest(poses=motions.poses().reshape(-1, 3), beams=PREDICTED_BEAMS)
+        if paths is not None:
+            request = PredictRequest(poses=paths.poses().reshape(-1, 3), beams=PREDICTED_BEAMS)
             self.policy.use_predictions(answer_prediction(estimator, request, geometry.angles, geometry.range_max))
         return took_us
 

@@ -25,8 +25,8 @@ def visible(
     The strip is two cells wide, so that targets at the edge of a shadow count as hidden.
 
     ``places`` (P, 2) and ``targets`` (T, 2) are x and y in cells from the corner of cell (0, 0) of ``opaque`` (rows,
-    columns). Targets farther than ``reach`` cells are not seen. Cells nearer to the place than
-    ``clear_range``, and nearer to the target than 2, do not hide it.
+    columns). Targets farther than ``reach`` cells are not seen. Cells nearer to the place than ``clear_range``, or
+    nearer to the target than 2, do not hide it; both distances are in cells.
     """
     rows, columns = opaque.shape
     seen = np.zeros((len(places), len(targets)), np.bool_)
@@ -36,9 +36,9 @@ def visible(
             distance = np.hypot(dx, dy)
             if distance > reach:
                 continue
+            ux, uy = dx / distance, dy / distance
             free, at = True, clear_range
             while free and at < distance - 2.0:
-                ux, uy = dx / distance, dy / distance
                 for side in (-1.0, 0.0, 1.0):
                     x, y = places[p, 0] + ux * at - side * uy, places[p, 1] + uy * at + side * ux
                     i, j = int(np.floor(y)), int(np.floor(x))

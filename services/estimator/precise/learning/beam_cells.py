@@ -32,7 +32,7 @@ def count_crossings(
     margin: float,
     crossed: Array,
 ) -> None:
-    """Counts in crossed (ny, nx) the beams that passed through the surface element of each cell.
+    """Counts in crossed (rows, columns) the beams that passed through the surface element of each cell.
 
     Beams have starts (R, 2), unit directions (R, 2) and ranges (R,), in m from node (0, 0). Cells of ``h`` m with
     ``surface`` set have an element with mean (mx, my) and normal (nx, ny). A beam passes through it if it crosses the
@@ -83,11 +83,12 @@ def mark_seen_cells(starts: Array, unit: Array, ranges: Array, h: float, seen: n
 def count_at_nodes(
     starts: Array, unit: Array, ranges: Array, h: float, radius: float, margin: float, ended: Array, passed: Array
 ) -> None:
-    """Counts in ended and passed (ny, nx) the beams that ended at each node of a grid of ``h`` m, and that passed it.
+    """Counts the beams that ended at each node of a grid of ``h`` m, and that passed it.
 
-    Beams have starts (R, 2), unit directions (R, 2) and ranges (R,), in m from node (0, 0). One belongs to a node if
-    its line is within ``radius`` m, at most ``h`` / 2, of it. It passed if it ends more than ``margin`` m behind the
-    node, and ended there if it ends less than that before or behind it.
+    The counts are added to ended and passed (rows, columns). Beams have starts (R, 2), unit directions (R, 2) and
+    ranges (R,), in m from node (0, 0). One belongs to a node if its line is within ``radius`` m, at most ``h`` / 2, of
+    it. It passed if it ends more than ``margin`` m behind the node, and ended there if it ends less than that before or
+    behind it.
     """
     rows, columns = ended.shape
     for b in range(ranges.shape[0]):

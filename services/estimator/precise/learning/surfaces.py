@@ -66,71 +66,76 @@ class Beams:
 
     def joined(self, other: Beams) -> Beams:
         """Returns these beams and those of ``other``."""
-        mine, theirs = (vars(each).values() for each in (self, other))
-        return Beams(*(np.concatenate(pair) for pair in zip(mine, theirs, strict=True)))
+        return Beams(
+            np.concatenate([self.starts, other.starts]),
+            np.concatenate([self.directions, other.directions]),
+            np.concatenate([self.ranges, other.ranges]),
+        )
 
 
 @dataclass(frozen=True)
 class SurfaceCells:
-    """Cells of a grid in which beams end, with a surface element (mean, normal) each; arrays (ny, nx)."""
+    """Cells of a grid in which beams end, with a surface element (mean, normal) each; arrays (rows, columns)."""
 
     low: Array  # (2,) m in map, corner of cell (0, 0)
-    h: float  # m, edge length
-    own: Array  # beams that end in the cell
-    mx: Array  # m from `low`
-    my: Array
-    nx: Array  # towards free space
-    ny: Array
+    cell_m: float  # edge length
+    counts: Array  # beams that end in the cell
+    mean_x: Array  # m from `low`
+    mean_y: Array
+    normal_x: Array  # towards free space
+    normal_y: Array
 
     @classmethod
-    def of(cls, beams: Beams, h: float) -> SurfaceCells:
-        """The cells of ``h`` m in which beams end."""
+    def of(cls, beams: Beams, cell_m: float) -> SurfaceCells:
+        """The cells of ``cell_m`` m in which beams end."""
         low, high = beams.bounds()
-        low = low - 4 * h
-        shape = np.ceil((high + 4 * h - low) / h).astype(int)[::-1] + 1
+        low = low - 4 * cell_m
+        shape = np.ceil((high + 4 * cell_m - low) / cell_m).astype(int)[::-1] + 1
         sums = np.zeros((8, int(shape.prod())))
         for part in beams.parts():
             local, (ux, uy) = part.ends() - low, part.unit().T
-            cell = np.floor(local / h).astype(int)
+            cell = np.floor(local / cell_m).astype(int)
             index, (x, y) = cell[:, 1] * shape[1] + cell[:, 0], local.T
             for total, values in zip(sums, (None, x, y, x**2, y**2, x * y, ux, uy), strict=True):
                 np.add(total, np.bincount(index, values, len(total)), out=total)
-        own = sums[0].reshape(shape)
-        number, sx, sy, sxx, syy, sxy, dx, dy = (_pooled(each.reshape(shape)) for each in sums)
-        count = np.maximum(number, 1)
-        mx, my = sx / count, sy / count
-        xx, yy, xy = sxx / count - mx**2, syy / count - my**2, sxy / count - mx * my
+        counts = sums[0].reshape(shape)
+        pooled, sx, sy, sxx, syy, sxy, dx, dy = (_pooled(each.reshape(shape)) for each in sums)
+        pooled = np.maximum(pooled, 1)
+        mean_x, mean_y = sx / pooled, sy / pooled
+        xx, yy, xy = sxx / pooled - mean_x**2, syy / pooled - mean_y**2, sxy / pooled - mean_x * mean_y
         angle = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the surface, the long axis of the points
-        nx, ny = -np.sin(angle), np.cos(angle)
-        flip = np.where(nx * dx + ny * dy > 0, -1.0, 1.0)  # normals point against the beams, towards free space
-        return cls(low, h, own, mx, my, nx * flip, ny * flip)
+        normal_x, normal_y = -np.sin(angle), np.cos(angle)
+        # Normals point against the beams, towards free space.
+        flip = np.where(normal_x * dx + normal_y * dy > 0, -1.0, 1.0)
+        return cls(low, cell_m, counts, mean_x, mean_y, normal_x * flip, normal_y * flip)
 
     @property
     def is_surface(self) -> npt.NDArray[np.bool_]:
-        """Mask (ny, nx) of cells in which enough beams end."""
-        return np.asarray(self.own >= MIN_POINTS_PER_CELL)
+        """Mask (rows, columns) of cells in which enough beams end."""
+        return np.asarray(self.counts >= MIN_POINTS_PER_CELL)
 
     def crossings(self, beams: Beams) -> Array:
-        """Counts (ny, nx) of beams that passed through the element of each cell."""
-        crossed, elements = np.zeros(self.own.shape), (self.mx, self.my, self.nx, self.ny)
+        """Counts (rows, columns) of beams that passed through the element of each cell."""
+        crossed = np.zeros(self.counts.shape)
+        elements = self.mean_x, self.mean_y, self.normal_x, self.normal_y
         for part in beams.parts():
             starts = part.starts - self.low
             count_crossings(
-                starts, part.unit(), part.ranges, self.h, self.is_surface, *elements, PASSED_DEPTH_M, crossed
+                starts, part.unit(), part.ranges, self.cell_m, self.is_surface, *elements, PASSED_DEPTH_M, crossed
             )
         return crossed
 
     def contradicted_by(self, beams: Beams) -> npt.NDArray[np.bool_]:
-        """Mask (ny, nx) of cells whose surface element is absent: most of the beams that meet it pass through it."""
+        """Mask (rows, columns) of cells whose surface element is absent: most beams that meet it pass through it."""
         crossed = _pooled(self.crossings(beams))
         cell, inside = self._cells_at(beams.ends())
-        ended = np.zeros(self.own.shape)
+        ended = np.zeros(self.counts.shape)
         np.add.at(ended, tuple(cell[inside].T), 1.0)
         ended = _pooled(ended)
         return are_mostly_passed(ended, crossed)
 
     def at(self, mask: npt.NDArray[np.bool_], points: Array) -> npt.NDArray[np.bool_]:
-        """The values (N,) of a mask (ny, nx) at points (N, 2) m in map; False beyond the grid."""
+        """The values (N,) of a mask (rows, columns) at points (N, 2) m in map; False beyond the grid."""
         cell, inside = self._cells_at(points)
         found = np.zeros(len(points), np.bool_)
         found[inside] = mask[tuple(cell[inside].T)]
@@ -138,8 +143,8 @@ class SurfaceCells:
 
     def _cells_at(self, points: Array) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.bool_]]:
         """Rows and columns (N, 2) of points (N, 2) m in map, and whether they are inside the grid."""
-        cell = np.floor((points - self.low) / self.h).astype(int)[:, ::-1]
-        return cell, np.asarray(((cell >= 0) & (cell < self.own.shape)).all(axis=1))
+        cell = np.floor((points - self.low) / self.cell_m).astype(int)[:, ::-1]
+        return cell, np.asarray(((cell >= 0) & (cell < self.counts.shape)).all(axis=1))
 
 
 def are_mostly_passed(ended: Array, passed: Array) -> npt.NDArray[np.bool_]:
@@ -147,13 +152,12 @@ def are_mostly_passed(ended: Array, passed: Array) -> npt.NDArray[np.bool_]:
     return np.asarray((passed >= MIN_POINTS_PER_CELL) & (ended < MIN_PRESENT_SHARE * (ended + passed)))
 
 
-def field_of_surfaces(beams: Beams, h: float) -> DistanceField:
-    """The field from surface elements in cells of ``h`` m, without those that most beams passed through."""
-    cells = SurfaceCells.of(beams, h)
+def field_of_surfaces(beams: Beams, cell_m: float) -> DistanceField:
+    """The field from surface elements in cells of ``cell_m`` m, without those that most beams passed through."""
+    cells = SurfaceCells.of(beams, cell_m)
     crossed = cells.crossings(beams)
-    surface = cells.is_surface & (cells.own >= MIN_PRESENT_SHARE * (cells.own + crossed))
-    phi = _distances(surface, cells.mx, cells.my, cells.nx, cells.ny, cells.own, h)
-    return DistanceField(phi, (float(cells.low[0]), float(cells.low[1])), h)
+    surface = cells.is_surface & (cells.counts >= MIN_PRESENT_SHARE * (cells.counts + crossed))
+    return DistanceField(_distances(cells, surface), (float(cells.low[0]), float(cells.low[1])), cell_m)
 
 
 def _pooled(grid: Array) -> Array:
@@ -161,28 +165,29 @@ def _pooled(grid: Array) -> Array:
     return np.asarray(ndimage.correlate(grid, np.ones((2 * POOL_CELLS + 1,) * 2), mode="constant"))
 
 
-def _distances(surface: np.ndarray, mx: Array, my: Array, nx: Array, ny: Array, own: Array, h: float) -> Floats:
+def _distances(cells: SurfaceCells, surface: npt.NDArray[np.bool_]) -> Floats:
     """Distances phi at the nodes: near surface elements to their planes, elsewhere to the nearest element.
 
-    Elements count by a Gaussian of their distance, with a standard deviation of 0.58 cells.
+    The elements are those of the cells in the mask ``surface`` (rows, columns). They count by the square root of the
+    number of their beams, and by a Gaussian of their distance, with a standard deviation of 0.58 cells.
     """
     rows, columns = np.nonzero(surface)
-    ex, ey, ax, ay = (a[surface] for a in (mx, my, nx, ny))
+    mean_x, mean_y = cells.mean_x[surface], cells.mean_y[surface]
+    normal_x, normal_y = cells.normal_x[surface], cells.normal_y[surface]
+    element_weight, cell_m = np.sqrt(cells.counts[surface]), cells.cell_m
     total, weight = np.zeros(surface.shape), np.zeros(surface.shape)
     span = int(np.ceil(ELEMENT_RADIUS_CELLS)) + 1
     for di in range(-span, span + 1):
         for dj in range(-span, span + 1):
             i, j = rows + di, columns + dj
             inside = (i >= 0) & (j >= 0) & (i < surface.shape[0]) & (j < surface.shape[1])
-            vx, vy = j * h - ex, i * h - ey
-            square = (vx**2 + vy**2) / h**2
-            w = np.where(
-                inside & (square < ELEMENT_RADIUS_CELLS**2), np.exp(-1.5 * square) * np.sqrt(own[surface]), 0.0
-            )
-            np.add.at(total, (i[inside], j[inside]), (w * (ax * vx + ay * vy))[inside])
+            x, y = j * cell_m - mean_x, i * cell_m - mean_y
+            square = (x**2 + y**2) / cell_m**2
+            w = np.where(inside & (square < ELEMENT_RADIUS_CELLS**2), np.exp(-1.5 * square) * element_weight, 0.0)
+            np.add.at(total, (i[inside], j[inside]), (w * (normal_x * x + normal_y * y))[inside])
             np.add.at(weight, (i[inside], j[inside]), w[inside])
     near = weight > 0
     phi = np.divide(total, weight, out=np.zeros_like(total), where=near)
-    nodes = np.argwhere(~near)[:, ::-1] * h
-    phi[~near], _ = cKDTree(np.column_stack([ex, ey])).query(nodes)
+    nodes = np.argwhere(~near)[:, ::-1] * cell_m
+    phi[~near], _ = cKDTree(np.column_stack([mean_x, mean_y])).query(nodes)
     return phi.astype(np.float32)
