@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import importlib.metadata
 import platform
 import shlex
@@ -30,19 +31,34 @@ PACKAGES = (
 )
 
 
+ROOT = Path(__file__).resolve().parent.parent
+_run = functools.partial(
+    subprocess.run, cwd=ROOT, capture_output=True, text=True, errors="replace", timeout=5, check=True
+)
+
+
 @functools.cache
 def commit() -> str:
     """The commit of the checkout, followed by + if files were changed; 'unknown' outside a checkout."""
-    root = Path(__file__).resolve().parent.parent
-    if not (root / ".git").exists():
+    if not (ROOT / ".git").exists():
         return "unknown"
     try:
-        run = functools.partial(subprocess.run, cwd=root, capture_output=True, text=True, timeout=5, check=True)
-        head = run(["git", "rev-parse", "--short=12", "HEAD"]).stdout.strip()
-        dirty = run(["git", "status", "--porcelain", "--untracked-files=no"]).stdout.strip()
+        head = _run(["git", "rev-parse", "--short=12", "HEAD"]).stdout.strip()
+        dirty = _run(["git", "status", "--porcelain", "--untracked-files=no"]).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return "unknown"
     return head + ("+" if dirty else "")
+
+
+@functools.cache
+def checkout_state() -> str:
+    """Names one state of the code: the commit, followed by + and a digest if files outside docs/ were changed.
+
+    Results are written into docs/, so a run that was interrupted changes the files there.
+    """
+    head = commit().rstrip("+")
+    changes = "" if head == "unknown" else _run(["git", "diff", "--binary", "HEAD", "--", ".", ":!docs"]).stdout
+    return f"{head}+{hashlib.sha256(changes.encode()).hexdigest()[:12]}" if changes else head
 
 
 def presage_command() -> str:

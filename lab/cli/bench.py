@@ -320,8 +320,8 @@ def bench_integrity(
 ) -> None:
     """Whether estimators are right about themselves in generated buildings that differ from their maps.
 
-    Each trial is one case in one building. After Ctrl-C, the same command continues. Prints a table for each estimator,
-    and writes integrity.md, .json, .trials.jsonl and a reliability diagram.
+    Each trial is one case in one building. After Ctrl-C the same command continues, unless the code has changed. Prints
+    a table for each estimator, and writes integrity.md, .json, .trials.jsonl and a reliability diagram.
 
     Examples: `presage bench integrity --out results`;
     `presage bench integrity --worlds 5 --cases moved-50,wrong-map --model exact --estimators precise --out quick`;

@@ -188,7 +188,7 @@ def real_drive(
 
     Compares preset precise with the particle filter in four tasks. a: tracking with odometry; b: tracking without;
     c: global localisation, starting at every 50th scan; d: kidnapping. Errors are relative to the log's reference
-    poses. After Ctrl-C the same command continues.
+    poses. After Ctrl-C the same command continues, unless the code has changed.
     Examples: `presage map drive.npz --mount 0,0,0 --poses reference --half first --no-learn -o first_half.yaml`, then
     `presage experiment real --log drive.npz --mount 0,0,0 --world first_half.yaml --quick`;
     `presage experiment --out mine real --log fr079.mcap --world fr079.yaml --name fr079 --every 50`.
@@ -213,7 +213,8 @@ def peers(
 ) -> None:
     """The scans on which Nav2's AMCL, Beluga and MRPT were measured (docs/peers.md), with the same protocol.
 
-    Processor times are of one thread if OMP_NUM_THREADS=1. After Ctrl-C the same command continues.
+    Processor times are of one thread if OMP_NUM_THREADS=1. After Ctrl-C the same command continues, unless the code has
+    changed.
     Examples: `presage experiment peers scans --trials 3`;
     `presage experiment --out mine peers scans --estimators "presage polygons,presage 5 cm map"`.
     """
@@ -233,8 +234,9 @@ def all_experiments(
         typer.Option(min=0, help="Maximum number of trials of each experiment; 0 for each one's own number."),
     ] = 0,
 ) -> None:
-    """Every experiment of the paper, one after another. After Ctrl-C the same command continues.
+    """Every experiment of the paper, one after another.
 
+    After Ctrl-C the same command continues, unless the code has changed.
     Examples: `presage experiment all`; `presage experiment --out look all --trials 3`.
     """
     from lab.paper.suite import run_all

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from common.errors import UserError
-from common.versions import commit
+from common.versions import checkout_state
 from lab.workers import pool
 
 Job = TypeVar("Job")  # a frozen dataclass of plain values, because it is pickled and compared with stored jobs
@@ -83,16 +83,16 @@ def _run_in_parallel(
 
 
 class TrialStore:
-    """A file with the results of an unfinished run, one per line, valid for the same jobs and commit only."""
+    """A file with the results of an unfinished run, one per line, valid for the same jobs and `checkout_state` only."""
 
     def __init__(self, path: Path, jobs: Sequence[Any]) -> None:
         """Stores the path and the jobs' key; the file is neither read nor written yet."""
         self.path = path
-        plain = json.dumps([commit(), [asdict(job) for job in jobs]], sort_keys=True, default=str)
+        plain = json.dumps([checkout_state(), [asdict(job) for job in jobs]], sort_keys=True, default=str)
         self.key = hashlib.sha256(plain.encode()).hexdigest()
 
     def read(self) -> dict[int, TrialResult]:
-        """Results by index. Ignores an incomplete last line; deletes a file of other jobs or another commit."""
+        """Results by index. Ignores an incomplete last line; deletes a file of other jobs or another checkout."""
         done: dict[int, TrialResult] = {}
         if not self.path.exists():
             return done

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from common.versions import commit
+from common.versions import checkout_state
 from lab.experiments import results
 from lab.pages import tables_page as page
 from lab.paper import aliasing, prediction, samples
@@ -25,7 +25,7 @@ Run = Callable[[], results.Result]
 
 
 def run_all(trials: int, seed: int, out: Path, workers: int, console: Console) -> None:
-    """Runs all experiments, except those already finished by an interrupted run of the same command and commit.
+    """Runs all experiments, except those already finished by an interrupted run of the same command and checkout.
 
     ``trials`` limits the number of trials of each experiment; 0 means each experiment's own number.
     """
@@ -69,11 +69,11 @@ def run_all(trials: int, seed: int, out: Path, workers: int, console: Console) -
 
 
 class FinishedExperiments:
-    """A file with the experiments that an interrupted run of the same command and commit has finished."""
+    """A file with the experiments that an interrupted run of the same command and checkout has finished."""
 
     def __init__(self, path: Path, parameters: list[int]) -> None:
-        """Reads the file if it exists and has the same ``parameters`` and commit."""
-        self.path, self.key = path, [commit(), *parameters]
+        """Reads the file if it exists and has the same ``parameters`` and `checkout_state`."""
+        self.path, self.key = path, [checkout_state(), *parameters]
         self._done: dict[str, str] = {}  # by name, the digest of its result
         with suppress(OSError, ValueError, KeyError, TypeError):  # treat a damaged file as a missing one
             kept = json.loads(path.read_text(encoding="utf-8"))
