@@ -1,10 +1,11 @@
-"""95 % intervals of shares and of errors, and errors relative to the stated covariance."""
+"""95 % intervals of shares and of errors, errors relative to the stated covariance, and durations."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
 import numpy as np
+import numpy.typing as npt
 
 from common.geometry.se2 import Array
 
@@ -53,3 +54,13 @@ def median(values: Array) -> float:
 def root_mean_square(values: Array) -> float:
     """The root of the mean of the squared values."""
     return float(np.sqrt(np.mean(np.square(values))))
+
+
+def longest_duration(values: npt.NDArray[np.bool_], periods: Array) -> float:
+    """Longest uninterrupted time in s for which ``values`` (N,) are true, each for its ``periods`` (N,) s.
+
+    Rounded to microseconds, so that 15 periods of 1/15 s are 1 s.
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], values, [False]])))
+    times = np.concatenate([[0.0], np.cumsum(periods)])
+    return round(float(np.diff(times[edges])[::2].max(initial=0.0)), 6)

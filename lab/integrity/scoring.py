@@ -13,7 +13,7 @@ import numpy.typing as npt
 from common.geometry import se2
 from common.geometry.se2 import Array
 from lab.accuracy.tasks import FOUND_DISTANCE, FOUND_YAW
-from lab.statistics import bootstrap_interval, squared_mahalanobis, wilson_interval
+from lab.statistics import bootstrap_interval, longest_duration, squared_mahalanobis, wilson_interval
 from services.estimator.shared.interface import Posterior
 
 Mask = npt.NDArray[np.bool_]
@@ -99,23 +99,20 @@ def score_trial(scans: Estimates, rate: float, kidnappings: Sequence[int], *, se
     """Scores of one trial whose scans come at ``rate`` Hz; ``separate`` scans are not one stretch of time."""
     right = scans.tracking & scans.correct
     recovered = [bool(right[first : first + RECOVERY_SCANS].any()) for first in kidnappings]
-    longest = min(1, int(scans.wrong.sum())) if separate else longest_run(scans.wrong)
+    period = 1 / rate
+    longest = period if scans.wrong.any() else 0.0
+    if not separate:
+        longest = longest_duration(scans.wrong, np.full(len(scans.wrong), period))
     return {
         "scans": len(scans.tracking),
         "tracking": int(scans.tracking.sum()),
         "in_map": int(np.isfinite(scans.error[:, 0]).sum()),
         "correct": int(scans.correct.sum()),
         "wrong": int(scans.wrong.sum()),
-        "longest_wrong_s": longest / rate,
+        "longest_wrong_s": longest,
         "kidnapped": len(recovered),
         "recovered": sum(recovered),
     }
-
-
-def longest_run(values: Mask) -> int:
-    """Length of the longest run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], values, [False]])))
-    return int(np.diff(edges)[::2].max(initial=0))
 
 
 def score_case(trials: Sequence[dict[str, Any]], scans: Estimates) -> dict[str, Any]:

@@ -15,8 +15,8 @@ PRESETS = {"precise": "presage", "particle-filter": "particle filter, tuned"}
 REAL_TASKS = {
     "with odometry": "a: tracking with odometry",
     "laser alone": "b: tracking without",
-    "unknown start": "c: from nothing",
-    "kidnapped": "d: carried off",
+    "unknown start": "c: global localisation",
+    "kidnapped": "d: kidnapped",
 }
 TASKS = {
     "unknown start, 20 scans": "standing, 20 scans",
@@ -39,13 +39,13 @@ def real_logs(folder: Path) -> str:
         for label, task in REAL_TASKS.items():
             rows = [summary[f"{task}, {preset}"] for preset in PRESETS]
             lines.append([f"{half}: {label}", *map(_correct_and_wrong, rows)])
-            longest = [max(each, row["wrong_claim_longest_s"]) for each, row in zip(longest, rows, strict=True)]
+            longest = [max(each, row["longest_wrong_s"]) for each, row in zip(longest, rows, strict=True)]
     lines.append(["longest wrong `tracking`", *(f"{each:.1f} s" for each in longest)])
     return markdown(["", *PRESETS.values()], lines)
 
 
 def _correct_and_wrong(row: dict[str, Any]) -> str:
-    correct = f"{row['tracked_share']:.1%}" if row["trials"] == 1 else f"{row['found']} of {row['trials']}"
+    correct = f"{row['correct'] / row['scans']:.1%}" if row["trials"] == 1 else f"{row['found']} of {row['trials']}"
     wrong = wrong_share_of_tracking(row)
     return f"{correct}; –" if wrong is None else f"{correct}; {wrong:.1%}"
 
@@ -76,7 +76,7 @@ def accuracy(folder: Path) -> str:
 
 
 def _best_filter(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """The particle filter with the most poses found, less those wrongly claimed; of several, the most exact one."""
+    """The particle filter with the most poses found, less the wrong ones; of several, the most exact one."""
     filters = [row for row in rows if row["estimator"].startswith("particle-filter")]
     return max(
         filters,

@@ -24,9 +24,8 @@ from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.shared.interface import Observation, PoseEstimator
 
 MAX_SEARCH_SCANS = 40
-SCANS_BEFORE_KIDNAPPING = 10  # scans for which the robot is tracked before it is kidnapped
+SCANS_BEFORE_KIDNAPPING = 10  # with which the estimator starts from a given pose
 START_COVARIANCE = np.diag([0.01, 0.01, 0.0025])  # m², m², rad²; of the given start pose
-TRACKED_DISTANCE = 0.5  # m; a scan with a smaller error counts as tracked
 # AMCL's default motion model is differential and cannot follow every base, so its omnidirectional model is used.
 AMCL_SETTINGS = ParticleFilterSettings(robot_model_type="omni")
 ODOMETRY, LASER, GLOBAL, KIDNAPPED = "odometry", "laser", "global", "kidnapped"
@@ -117,10 +116,10 @@ def trial(job: StretchJob) -> dict[str, Any]:
     return {"estimator": job.estimator, "task": job.task, "first": job.first, "to": job.to, **rows}
 
 
-def hide_kidnapping(odom: Array, carried: int) -> Array:
-    """Odometry (N, 3) without the motion just before scan ``carried``, as if the robot had been lifted."""
+def hide_kidnapping(odom: Array, first_after: int) -> Array:
+    """Odometry (N, 3) without the motion just before scan ``first_after``, as if the robot had been lifted."""
     moved = odom.copy()
-    moved[carried:] = se2.compose(odom[carried - 1], se2.between(odom[carried], odom[carried:]))
+    moved[first_after:] = se2.compose(odom[first_after - 1], se2.between(odom[first_after], odom[first_after:]))
     return np.asarray(moved)
 
 

@@ -20,7 +20,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from common.errors import UserError
 from common.geometry.world import load_world
-from common.versions import commit
+from common.versions import checkout_state
 from lab.experiments import results
 from lab.experiments.trials import run_trials
 from lab.real_logs.drive import (
@@ -30,12 +30,20 @@ from lab.real_logs.drive import (
     MAX_SEARCH_SCANS,
     ODOMETRY,
     SCANS_BEFORE_KIDNAPPING,
-    TRACKED_DISTANCE,
     StretchJob,
     trial,
 )
 from lab.real_logs.figure import draw
 from lab.real_logs.filter_tuning import ParameterValues, TunedSettings, starting_point, tune
+from lab.real_logs.scoring import (
+    CORRECT_DISTANCE_M,
+    CORRECT_YAW_RAD,
+    counted,
+    is_correct,
+    is_tracking,
+    longest_wrong_s,
+    scans_until_found,
+)
 from presage.learning.train_drive import TrainDriveOptions as Training
 from presage.learning.train_drive import card_of
 from services.estimator.precise.learning import weights
@@ -45,15 +53,13 @@ from services.estimator.precise.learning.field_learning import Recipe
 
 ESTIMATORS = ("precise", "particle-filter", "amcl-defaults")
 TASKS = {
-    ODOMETRY: "a: tracking with odometry",
-    LASER: "b: tracking without",
-    GLOBAL: "c: from nothing",
-    KIDNAPPED: "d: carried off",
+    ODOMETRY: "tracking with odometry",
+    LASER: "tracking without",
+    GLOBAL: "global localisation",
+    KIDNAPPED: "kidnapped",
 }
+LETTERS = {ODOMETRY: "a", LASER: "b", GLOBAL: "c", KIDNAPPED: "d"}  # of the tasks
 MIN_FREE_SHARE = 0.5  # of the reference poses in free space; the map may lack places that the drive saw
-# Within this heading error (rad) and TRACKED_DISTANCE of the reference a scan counts as tracked. Otherwise state
-# `tracking` is a wrong claim.
-TRACKED_YAW = float(np.deg2rad(10))
 QUICK_SCANS = 120  # scans of (a) and (b) with --quick
 
 
@@ -94,8 +100,8 @@ def run(job: RealLogJob, out: Path, workers: int, console: Console) -> results.R
     ]
     rows = run_trials(job.result, trial, jobs, out, workers, console)
     summary = {
-        f"{TASKS[task]}, {name}": summarise([r for r in rows if (r["task"], r["estimator"]) == (task, name)])
-        for task in TASKS
+        f"{LETTERS[task]}: {title}, {name}": summarise([r for r in rows if (r["task"], r["estimator"]) == (task, name)])
+        for task, title in TASKS.items()
         for name in ESTIMATORS
         if any(r["task"] == task for r in rows)
     }
@@ -150,12 +156,12 @@ def _train_and_tune(
 ) -> tuple[Path, weights.FieldCard, TunedSettings]:
     """The model trained on the training half, and the settings of the particle filter tuned on it.
 
-    An interrupted run's model and settings are reused if the command and the commit are the same.
+    An interrupted run's model and settings are reused if the command and all files of the checkout are the same.
     """
     world = load_world(job.map)
     path = out / f".{job.result}" / "model.safetensors"
     kept = path.with_name("tuned.json")
-    key = json.dumps([commit(), asdict(job)], sort_keys=True, default=str)
+    key = json.dumps([checkout_state(), asdict(job)], sort_keys=True, default=str)
     with suppress(OSError, ValueError, KeyError, TypeError, UserError):  # no usable files of an interrupted run
         before = json.loads(kept.read_text(encoding="utf-8"))
         if before["key"] == key:
@@ -199,66 +205,49 @@ def stretches(template: StretchJob, half: int, count: int, job: RealLogJob, *, o
     starts = list(range(half, count - MAX_SEARCH_SCANS, job.every * (4 if job.quick else 1)))
     kidnappings = [
         replace(template, task=KIDNAPPED, first=first, to=to)
-        for first in starts
-        if (to := half + (first - half + (count - half) // 2) % (count - half - MAX_SEARCH_SCANS))
-        > first + SCANS_BEFORE_KIDNAPPING
-        or to + MAX_SEARCH_SCANS <= first
+        for first, to in ((first, _kidnapped_to(first, half, count)) for first in starts)
+        if to is not None
     ]
-    return [*whole, *(replace(template, task=GLOBAL, first=first) for first in starts), *kidnappings]
+    return [*whole, *kidnappings, *(replace(template, task=GLOBAL, first=first) for first in starts)]
+
+
+def _kidnapped_to(first: int, half: int, count: int) -> int | None:
+    """Index of the scan half a drive away from ``first``; None if scans from there on overlap those before."""
+    to = half + (first - half + (count - half) // 2) % (count - half - MAX_SEARCH_SCANS)
+    overlaps = first - MAX_SEARCH_SCANS < to <= first + SCANS_BEFORE_KIDNAPPING
+    return None if overlaps else to
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Statistics of one estimator in one task."""
-    after = [SCANS_BEFORE_KIDNAPPING if row["task"] == KIDNAPPED else 0 for row in rows]
-    error, yaw, state, ms, nees = (
-        np.array([value for row, skip in zip(rows, after, strict=True) for value in row[name][skip:]])
-        for name in ("error_m", "yaw_error_rad", "state", "ms", "nees")
+    error, yaw, ms, nees = (
+        np.concatenate([counted(row, name) for row in rows]) for name in ("error_m", "yaw_error_rad", "ms", "nees")
     )
-    tracked_scans = (error < TRACKED_DISTANCE) & (yaw < TRACKED_YAW)
-    claims = state == "tracking"
-    first = [_scans_until_found(row, skip) for row, skip in zip(rows, after, strict=True)]
-    reached = [k for k in first if k is not None]
-    known = np.array([value for value in nees[tracked_scans & claims] if value is not None], float)
+    correct = np.concatenate([is_correct(row) for row in rows])
+    tracking = np.concatenate([is_tracking(row) for row in rows])
+    found = [k for k in map(scans_until_found, rows) if k is not None]
+    known = np.array([value for value in nees[correct & tracking] if value is not None], float)
     return {
+        "task": rows[0]["task"],
+        "estimator": rows[0]["estimator"],
         "trials": len(rows),
         "scans": len(error),
         "error_median_m": float(np.median(error)),
         "error_rms_m": float(np.sqrt(np.mean(error**2))),
         "error_95_m": float(np.quantile(error, 0.95)),
-        "tracked_error_rms_m": float(np.sqrt(np.mean(error[tracked_scans] ** 2))) if tracked_scans.any() else None,
+        "correct_error_rms_m": float(np.sqrt(np.mean(error[correct] ** 2))) if correct.any() else None,
         "yaw_error_median_rad": float(np.median(yaw)),
-        "tracked_share": float(tracked_scans.mean()),
-        "claimed_share": float(claims.mean()),
-        "wrong_claims_share": float((claims & ~tracked_scans).mean()),
-        "wrong_claim_longest_s": max(_longest_wrong(row, skip) for row, skip in zip(rows, after, strict=True)),
-        "found": len(reached),
-        "scans_until_found_median": float(np.median(reached)) if reached else None,
-        "scans_until_found_mean": float(np.mean(reached)) if reached else None,
+        "correct": int(correct.sum()),
+        "tracking": int(tracking.sum()),
+        "wrong": int((tracking & ~correct).sum()),
+        "longest_wrong_s": max(map(longest_wrong_s, rows)),
+        "found": len(found),
+        "scans_until_found_median": float(np.median(found)) if found else None,
+        "scans_until_found_mean": float(np.mean(found)) if found else None,
         "nees_median": float(np.median(known)) if len(known) else None,
         "ms_median": float(np.median(ms)),
         "ms_95": float(np.quantile(ms, 0.95)),
     }
-
-
-def _is_tracked(row: dict[str, Any], skip: int) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    error, yaw = np.array(row["error_m"][skip:]), np.array(row["yaw_error_rad"][skip:])
-    return np.asarray((error < TRACKED_DISTANCE) & (yaw < TRACKED_YAW))
-
-
-def _scans_until_found(row: dict[str, Any], skip: int) -> int | None:
-    """Number of scans until the state is `tracking` at the right place. Returns None if it never is."""
-    right = _is_tracked(row, skip) & (np.array(row["state"][skip:]) == "tracking")
-    return int(np.argmax(right)) + 1 if right.any() else None
-
-
-def _longest_wrong(row: dict[str, Any], skip: int) -> float:
-    """Longest uninterrupted time in s in which the state was `tracking` at a wrong place."""
-    wrong = ~_is_tracked(row, skip) & (np.array(row["state"][skip:]) == "tracking")
-    longest, since = 0.0, None
-    for stamp, is_wrong in zip(row["stamp_s"][skip:], wrong, strict=True):
-        since = (stamp if since is None else since) if is_wrong else None
-        longest = max(longest, 0.0 if since is None else stamp - since)
-    return longest
 
 
 def curves_of(rows: Sequence[dict[str, Any]]) -> dict[str, list[Any]]:
@@ -276,8 +265,8 @@ def notes(job: RealLogJob, card: weights.FieldCard, tuned: TunedSettings) -> lis
     found, learned = card.calibration, "second" if job.exchange else "first"
     lines = [
         (
-            f"correct: within {TRACKED_DISTANCE} m and 10 deg of the reference pose, whose error adds to the errors; "
-            f"found: state `tracking` there within {MAX_SEARCH_SCANS} scans"
+            f"correct: within {CORRECT_DISTANCE_M} m and {np.rad2deg(CORRECT_YAW_RAD):.0f} deg of the reference pose, "
+            f"whose error adds to the errors; found: state `tracking` there within {MAX_SEARCH_SCANS} scans"
         ),
         *(
             f"particle filter, tuned on the {learned} half, {what}: {_format_settings(each)}"
@@ -305,12 +294,12 @@ def _format_settings(settings: ParameterValues) -> str:
 
 def wrong_share_of_tracking(row: dict[str, Any]) -> float | None:
     """Share of the scans in state `tracking` whose pose is wrong; None if no scan is in that state."""
-    return row["wrong_claims_share"] / row["claimed_share"] if row["claimed_share"] else None
+    return row["wrong"] / row["tracking"] if row["tracking"] else None
 
 
-def claims_of(row: dict[str, Any]) -> str:
-    """Share of the scans in state `tracking`, and share of these whose pose is wrong."""
-    return f"{row['claimed_share']:.1%}, {wrong_share_of_tracking(row) or 0.0:.1%}"
+def _tracking_text(row: dict[str, Any]) -> str:
+    share, wrong_share = row["tracking"] / row["scans"], wrong_share_of_tracking(row) or 0.0
+    return f"{share:.1%}, {wrong_share:.1%}; {row['longest_wrong_s']:.1f}"
 
 
 def table(summary: dict[str, dict[str, Any]]) -> str:
@@ -325,13 +314,13 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
     )
     rows = [
         [
-            f"{name[0]},{name.rpartition(',')[2]}",
+            f"{LETTERS[row['task']]}, {row['estimator']}",
             results.millimetres(row["error_median_m"]),
-            f"{row['tracked_share']:.1%}",
-            f"{claims_of(row)}; {row['wrong_claim_longest_s']:.1f}",
-            "–" if name.startswith(("a:", "b:")) else f"{row['found']}/{row['trials']}",
+            f"{row['correct'] / row['scans']:.1%}",
+            _tracking_text(row),
+            f"{row['found']}/{row['trials']}" if row["task"] in (GLOBAL, KIDNAPPED) else "–",
             results.number(row["nees_median"], 2),
         ]
-        for name, row in summary.items()
+        for row in summary.values()
     ]
     return results.markdown(heads, rows)

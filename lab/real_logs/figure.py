@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from lab.real_logs.drive import LASER, ODOMETRY, TRACKED_DISTANCE
+from lab.real_logs.drive import LASER, ODOMETRY
+from lab.real_logs.scoring import CORRECT_DISTANCE_M
 from presage.learning.drive_figure import calibration_curve
 from presage.plotting import style as drawing
 from services.estimator.precise.learning.calibration import Calibration
@@ -29,9 +30,9 @@ def draw(calibration: Calibration | None, rows: Sequence[dict[str, Any]], titles
             stamps = np.array(row["stamp_s"]) - row["stamp_s"][0]
             axes.plot(stamps, error, linewidth=0.9, color=colour, label=name)
             share = np.arange(1, len(error) + 1) / len(error)
-            cumulative.plot(np.sort(error), share, style, color=colour, label=f"{name}, {titles[task][3:]}")
+            cumulative.plot(np.sort(error), share, style, color=colour, label=f"{name}, {titles[task]}")
         drawing.log_metres(axes)
-        axes.axhline(TRACKED_DISTANCE, color=drawing.BOUND, linestyle=":", linewidth=1)
+        axes.axhline(CORRECT_DISTANCE_M, color=drawing.BOUND, linestyle=":", linewidth=1)
         axes.set(xlabel="time (s)", ylabel="position error (m)", title=titles[task])
     drawing.log_metres(cumulative, "x")
     cumulative.set(

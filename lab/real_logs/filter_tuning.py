@@ -5,9 +5,9 @@ the second quarter, in a map of the first quarter. Like the half that is localis
 that the map lacks, and this decides whether recovery helps or harms.
 
 Three sets of settings are tuned separately, so that no task suffers from the needs of another: tracking with odometry,
-tracking without, and finding (global localisation and kidnapping). The best tracking settings keep the most scans, and
-among equals have the smallest median error. The best finding settings find the most starts, and among equals need the
-fewest scans.
+tracking without, and finding (global localisation and kidnapping). With the best tracking settings most scans have a
+correct pose, and among equals the smallest median error. The best finding settings find the most starts, and among
+equals need the fewest scans.
 """
 
 from __future__ import annotations
@@ -29,11 +29,10 @@ from lab.real_logs.drive import (
     LASER,
     MAX_SEARCH_SCANS,
     ODOMETRY,
-    SCANS_BEFORE_KIDNAPPING,
-    TRACKED_DISTANCE,
     StretchJob,
     trial,
 )
+from lab.real_logs.scoring import counted, is_correct, scans_until_found
 from services.estimator.precise.motion_model import MotionNoise
 from services.mapper.slam.drive import Laser
 from services.mapper.slam.grid import grid_of_scans
@@ -71,7 +70,7 @@ class TunedSettings:
     odometry: ParameterValues  # for tracking with odometry
     laser: ParameterValues  # for tracking without
     finding: ParameterValues  # for global localisation and kidnapping
-    # A line per trial: task and setting, share of scans kept or starts found, median error (m) or mean number of scans.
+    # A line per trial: task and setting, share of correct scans or found starts, median error (m) or number of scans.
     tried: list[str]
 
 
@@ -184,18 +183,14 @@ def _with(settings: ParameterValues, name: str, value: float) -> ParameterValues
 
 
 def _tracking_score(rows: list[dict[str, Any]]) -> Score:
-    """Share of scans tracked, and the negative median error (m) of those."""
-    errors = np.array([value for row in rows for value in row["error_m"]])
-    tracked = errors < TRACKED_DISTANCE
-    return round(float(tracked.mean()), 2), -float(np.median(errors[tracked])) if tracked.any() else -np.inf
+    """Share of scans with a correct pose, and the negative median error (m) of those."""
+    errors = np.concatenate([counted(row, "error_m") for row in rows])
+    correct = np.concatenate([is_correct(row) for row in rows])
+    return round(float(correct.mean()), 2), -float(np.median(errors[correct])) if correct.any() else -np.inf
 
 
 def _search_score(rows: list[dict[str, Any]]) -> Score:
     """Share of starts found, and the negative mean number of scans until then."""
-    scans = []
-    for row in rows:
-        skip = SCANS_BEFORE_KIDNAPPING if row["task"] == KIDNAPPED else 0
-        right = (np.array(row["error_m"][skip:]) < TRACKED_DISTANCE) & (np.array(row["state"][skip:]) == "tracking")
-        scans.append(int(np.argmax(right)) + 1 if right.any() else None)
+    scans = [scans_until_found(row) for row in rows]
     found = [k for k in scans if k is not None]
     return len(found) / len(rows), -float(np.mean([MAX_SEARCH_SCANS if k is None else k for k in scans]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.statistics import bootstrap_interval, median, root_mean_square, wilson_interval
+from lab.statistics import bootstrap_interval, longest_duration, median, root_mean_square, wilson_interval
 
 
 def test_shares():
@@ -32,3 +32,13 @@ def test_interval_of_a_median():
         low, high = bootstrap_interval(list(rng.exponential(size=(41, 1))), median)
         covered += low <= np.log(2) <= high
     assert 88 <= covered <= 99
+
+
+@pytest.mark.parametrize(
+    ("values", "longest"), [([], 0), ([0, 0], 0), ([1], 1), ([1, 1, 0, 1, 1, 1], 3), ([1, 1, 0, 1], 2)]
+)
+def test_durations(values, longest):
+    values = np.array(values, bool)
+    assert longest_duration(values, np.full(len(values), 1 / 15)) == pytest.approx(longest / 15, abs=1e-6)
+    assert longest_duration(np.ones(15, bool), np.full(15, 1 / 15)) == 1.0
+    assert longest_duration(np.array([True, True, False, True]), np.array([1.0, 1.0, 5.0, 3.0])) == 3.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lab.integrity.report import reliability_diagram, table
-from lab.integrity.scoring import Estimates, longest_run, reliability, score_case, score_trial, share_of_scans
+from lab.integrity.scoring import Estimates, reliability, score_case, score_trial, share_of_scans
 from lab.statistics import MAX_NEES
 from services.estimator.shared.interface import Hypothesis, Posterior
 
@@ -73,13 +73,6 @@ def test_robot_outside_the_map(scans):
     row = score_case([{"seed": 1, **score_trial(away, 1.0, [], separate=False)}], away)
     assert row["correct"] is None
     assert row["wrong"]["count"] == row["wrong"]["of"] == 4
-
-
-@pytest.mark.parametrize(
-    ("values", "longest"), [([], 0), ([0, 0], 0), ([1], 1), ([1, 1, 0, 1, 1, 1], 3), ([1, 1, 0, 1], 2)]
-)
-def test_longest_run(values, longest):
-    assert longest_run(np.array(values, bool)) == longest
 
 
 def test_reliability_bins():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -87,8 +88,8 @@ def test_kidnapped_robot(folder, estimator):
     assert np.median(row["error_m"][:10]) < 0.2
     found = real.summarise([row])
     if estimator == "precise":  # three surfaces change, too few to prefer the right place: the belief stays ambiguous
-        assert found["wrong_claim_longest_s"] <= 0.5
-        assert found["claimed_share"] < 0.1
+        assert found["longest_wrong_s"] <= 0.5
+        assert found["tracking"] < 0.1 * found["scans"]
     else:
         assert found["found"] == 1
 
@@ -100,7 +101,7 @@ def test_scans_used_for_tuning(folder, tmp_path, monkeypatch):
     def fake(job):
         tried.append(job)
         error = [0.1 if dict(job.particles).get("keep_initial_pose", 1.0) else 9.0] * 20
-        return {"task": job.task, "error_m": error, "state": ["tracking"] * 20}
+        return {"task": job.task, "error_m": error, "yaw_error_rad": [0.0] * 20, "state": ["tracking"] * 20}
 
     monkeypatch.setattr(real_tuning, "trial", fake)
     job = StretchJob(
@@ -189,22 +190,43 @@ def row(task, error, state, stamps=None):
     }  # fmt: skip
 
 
-def test_durations_of_wrong_claims():
+def test_durations_of_wrong_tracking():
     t, lost = "tracking", "lost"
     found = real.summarise([row("odometry", [0, 9, 9, 9, 9, 0, 9], [t, t, t, t, lost, t, t])])
-    assert found["wrong_claim_longest_s"] == pytest.approx(1.0)  # from the second to the fourth scan
-    assert found["wrong_claims_share"] == pytest.approx(4 / 7)
-    assert found["tracked_share"] == pytest.approx(2 / 7)
+    assert found["longest_wrong_s"] == pytest.approx(1.5)  # from the second to the fifth scan
+    assert (found["scans"], found["correct"], found["tracking"], found["wrong"]) == (7, 2, 6, 4)
+    single = real.summarise([row("odometry", [0, 9, 0], [t, t, t], [0.0, 1.0, 1.4])])
+    assert single["longest_wrong_s"] == pytest.approx(0.4)
     searched = real.summarise([row("global", [9, 9, 0.1, 0], [lost, t, lost, t]), row("global", [9, 9], [lost, lost])])
     assert searched["found"] == 1
     assert searched["scans_until_found_median"] == 4
 
 
+def test_headings_count():
+    turned = row("global", [0, 0], ["tracking"] * 2) | {"yaw_error_rad": [0.2, 0.1]}
+    found = real.summarise([turned])
+    assert (found["correct"], found["wrong"], found["scans_until_found_median"]) == (1, 1, 2)
+    assert real_tuning._tracking_score([turned])[0] == 0.5
+    assert real_tuning._search_score([turned]) == (1.0, -2.0)
+
+
+def test_stretches():
+    job = real.RealLogJob(Path("drive.npz"), "map.yaml", every=10)
+    found = real.stretches(StretchJob("", "", None, "precise", "", 0), 200, 400, job, odometry=True)
+    assert [each.count for each in found[:2]] == [200, 200]
+    kidnappings = [each for each in found if each.task == KIDNAPPED]
+    assert found[2 : 2 + len(kidnappings)] == kidnappings
+    for each in kidnappings:  # the scans after a kidnapping are in the same half, and none of those before it
+        assert 200 <= each.to <= 400 - MAX_SEARCH_SCANS
+        before = range(each.first, each.first + 10)
+        assert not set(before) & set(range(each.to, each.to + MAX_SEARCH_SCANS))
+
+
 def test_table(tmp_path):
     assert page.MODULES["real"] == "lab.real_logs.experiment"
-    summary = {"a: tracking with odometry, precise": real.summarise([row("odometry", [0.01, 0.02], ["tracking"] * 2)])}
+    summary = {"a: tracking with odometry, precise": real.summarise([row("odometry", [0.01, 9], ["tracking"] * 2)])}
     table = real.table(summary)
-    assert "| a, precise | 15.0 |" in table
+    assert "| a, precise | 4505 | 50.0% | 100.0%, 50.0%; 0.5 | – | 3.00 |" in table
 
 
 def test_short_log(folder, tmp_path):
