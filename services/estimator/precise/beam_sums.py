@@ -39,7 +39,7 @@ def accumulate(
     random: float,
     range_max: float,
     unseen: float,
-    attention: Array,
+    weights: Array,
     energy: Array,
     gradient: Array,
     matrices: Array,
@@ -47,8 +47,8 @@ def accumulate(
     """Sums -ln p(o | pose) and its derivatives over the beams; see `services.estimator.precise.likelihood`.
 
     Adds to energy (N,), to gradient (N, 3), and to matrices (N, 3, 3, 3): the curvature and the covariances of the
-    gradient caused by the scanner's noise and by the model's error. ``attention`` (N, B) scales the derivatives of each
-    beam; it may be empty, for 1.
+    gradient caused by the scanner's noise and by the model's error. ``weights`` (N, B) scale the derivatives of each
+    beam; the array may be empty, for 1.
     """
     flat = random / range_max
     for k in range(expected.shape[0]):
@@ -78,15 +78,15 @@ def accumulate(
             density = core + flat + early
             inlier = core / density
             energy[k] -= math.log(density * (1.0 - unseen))
-            share = attention[k, b] if attention.size else 1.0
-            weight = share * inlier / variance
-            slope = weight * e - share * early / (max(g, 1e-3) * density)  # d ln p / dg
+            beam_weight = weights[k, b] if weights.size else 1.0
+            information = beam_weight * inlier / variance
+            slope = information * e - beam_weight * early / (max(g, 1e-3) * density)  # d ln p / dg
             # The variance grows with g, too.
-            slope += share * inlier * relative * relative * g * (e * e / variance - 1.0) / variance
+            slope += beam_weight * inlier * relative * relative * g * (e * e / variance - 1.0) / variance
             for i in range(3):
                 gradient[k, i] += slope * jacobian[k, b, i]
                 for j in range(3):
-                    outer = jacobian[k, b, i] * jacobian[k, b, j] * weight
+                    outer = jacobian[k, b, i] * jacobian[k, b, j] * information
                     matrices[k, 0, i, j] += outer
                     matrices[k, 1, i, j] += outer * noise / variance
                     matrices[k, 2, i, j] += outer * model / variance

@@ -273,12 +273,21 @@ class PreciseEstimator:
     ) -> list[MotionCandidate]:
         """Predicts the motions that the robot may have made since the last scan; the last one is the widest."""
         return predict_motion(
-            self.settings.motion, mode.pose, mode.noise_covariance, period, odom, command, mode.velocity, mode.drift
+            self.settings.motion,
+            mode.pose,
+            mode.noise_covariance,
+            period,
+            odom,
+            command,
+            mode.velocity,
+            mode.drift_covariance,
         )
 
     def _predict_local_motion(self, period: float, odom: Array | None, command: Array | None) -> list[MotionCandidate]:
         """Predicts the motions in the local frame, where the last pose is known far better than in the map."""
-        last = replace(self.modes[0], pose=self._local_pose, noise_covariance=np.zeros((3, 3)), drift=np.zeros((3, 3)))
+        last = replace(
+            self.modes[0], pose=self._local_pose, noise_covariance=np.zeros((3, 3)), drift_covariance=np.zeros((3, 3))
+        )
         return self._predict_motion(last, period, odom, command)
 
     def _match_map(
@@ -424,8 +433,8 @@ class PreciseEstimator:
             replace(
                 mode,
                 explained=states.explained[k],
-                present=present[k] + log_change,
-                present_surroundings=surroundings[k],
+                scan_log_likelihood=present[k] + log_change,
+                scan_surroundings=surroundings[k],
             )
             for k, mode in enumerate(modes)
         ]
@@ -439,7 +448,7 @@ class PreciseEstimator:
         pairs = zip(self.modes, modes, strict=False)
         self._unknown_place.allow_mismatch(max(self._log_mismatch(before, after) for before, after in pairs))
         # Either the surroundings have changed, or the robot was carried to another place and all surfaces are new.
-        self._unknown_place.present = max(
+        self._unknown_place.scan_log_likelihood = max(
             _log_unmapped_surfaces(view, ignored) + log_change, _log_unmapped_surfaces(view, small)
         )
         self._set_hypotheses(modes)
@@ -461,7 +470,7 @@ class PreciseEstimator:
         """Sets the hypotheses and their weights."""
         unknown = self._unknown_place
         min_log_unknown = max(mode.log_weight for mode in modes) + float(np.log(self.settings.unknown_probability))
-        log_unknown = max(unknown.log_evidence + unknown.present, min_log_unknown)
+        log_unknown = max(unknown.log_evidence + unknown.scan_log_likelihood, min_log_unknown)
         self.modes, unknown.weight = weigh(modes, log_unknown, self.settings.max_hypotheses)
 
     def _add_key_scan(self, view: View) -> None:
@@ -475,7 +484,7 @@ class PreciseEstimator:
         key = LocalMapScan(self._local_pose, view, self._ignored_beams, mapped, self._log_change, log_unknown)
         self._local_map.add(key, best.pose, best.noise_covariance)
         self.modes = [
-            replace(mode, log_evidence=mode.log_weight, present=0.0, surroundings=mode.present_surroundings)
+            replace(mode, log_evidence=mode.log_weight, scan_log_likelihood=0.0, surroundings=mode.scan_surroundings)
             for mode in self.modes
         ]
 
@@ -547,7 +556,7 @@ class PreciseEstimator:
         found, view = search_everywhere(views, self.seeds, self.settings), views[0]
         small = view.surfaces.small
         log_at_unknown_place = _log_reference(view, small) + _log_unmapped_surfaces(view, small)
-        return [mode for mode in found if mode.present > log_at_unknown_place + 1] or found[:1]
+        return [mode for mode in found if mode.scan_log_likelihood > log_at_unknown_place + 1] or found[:1]
 
     def _start_with(
         self, view: View, found: list[Mode], unknown: float, off_map: float, all_changed: float = 0.0
@@ -560,24 +569,31 @@ class PreciseEstimator:
         self._restart_local_map(view)
         self._unknown_place.restart(unknown, off_map)
         reference = _log_reference(view, self._ignored_beams)
-        log_all_changed = self._unknown_place.present + float(np.log(all_changed)) if all_changed else -np.inf
-        self._set_hypotheses([replace(mode, present=max(mode.present - reference, log_all_changed)) for mode in found])
+        log_all_changed = (
+            self._unknown_place.scan_log_likelihood + float(np.log(all_changed)) if all_changed else -np.inf
+        )
+        self._set_hypotheses(
+            [
+                replace(mode, scan_log_likelihood=max(mode.scan_log_likelihood - reference, log_all_changed))
+                for mode in found
+            ]
+        )
 
     def _restart_local_map(self, view: View) -> None:
         """Starts a new local map at the present scan."""
         self._local_map.clear()
         self._local_pose, self._ignored_beams, self._log_change = np.zeros(3), view.surfaces.small, 0.0
-        self._unknown_place.present = _log_unmapped_surfaces(view, self._ignored_beams)
+        self._unknown_place.scan_log_likelihood = _log_unmapped_surfaces(view, self._ignored_beams)
 
     def _add_hypotheses(self, found: list[Mode], view: View) -> None:
         """Adds hypotheses: the robot may have been there since one of the key scans, or was carried there just now."""
         stayed, surroundings = self._log_stayed(found, view)
-        present = np.array([mode.present for mode in found])
+        present = np.array([mode.scan_log_likelihood for mode in found])
         carried = self._unknown_place.log_evidence + present - _log_reference(view, view.surfaces.small)
         evidence = np.array([mode.log_evidence for mode in found]) + np.maximum(stayed, carried)
         surroundings[carried >= stayed] = FIRST_SURROUNDINGS
         added = [
-            replace(mode, log_evidence=evidence[k], present=0.0, present_surroundings=surroundings[k])
+            replace(mode, log_evidence=evidence[k], scan_log_likelihood=0.0, scan_surroundings=surroundings[k])
             for k, mode in enumerate(found)
         ]
         best = int(np.argmax(evidence))

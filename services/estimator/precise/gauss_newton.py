@@ -223,18 +223,18 @@ class View:
         self._last.appendleft(_PredictedScans(np.array(poses), expected, with_map_error, behind, borders))
         return self._last[0]
 
-    def evidence(self, poses: Array, extra_sigma: float = 0.0, attention: Array | None = None) -> Evidence:
+    def evidence(self, poses: Array, extra_sigma: float = 0.0, weights: Array | None = None) -> Evidence:
         """Returns the evidence of the scan at base_link poses (N, 3), with derivatives by these poses.
 
-        ``extra_sigma`` m is added in quadrature to every beam's standard deviation. ``attention`` (N, B) scales the
+        ``extra_sigma`` m is added in quadrature to every beam's standard deviation. ``weights`` (N, B) scale the
         derivatives of each beam.
         """
         lasers = se2.compose(poses, self.mount)
-        if attention is None:
+        if weights is None:
             expected = self._with_map_error(self.expect(lasers))
         else:
             expected = self._predicted(poses).with_map_error
-        at_laser = self.likelihood.evaluate(self.ranges, self.range_max, expected, extra_sigma, attention)
+        at_laser = self.likelihood.evaluate(self.ranges, self.range_max, expected, extra_sigma, weights)
         return self._at_base(at_laser, poses, lasers)
 
     def evidence_of_each_surface(self, pose: Array) -> Evidence:

@@ -45,12 +45,12 @@ class Mode:
     curvature: Array  # (3, 3) Gauss-Newton Hessian of accuracy
     explained: float = 0.0  # fraction of the last scan's beams that end at surfaces of the map
     log_evidence: float = 0.0  # nats, of the key scans and the prior; unnormalised
-    # nats, log likelihood of the present scan; relative to that of known surfaces once the estimator has adopted it
-    present: float = 0.0
+    # nats, of the present scan; relative to that of known surfaces once the estimator has adopted the hypothesis
+    scan_log_likelihood: float = 0.0
     surroundings: Array = field(default_factory=lambda: FIRST_SURROUNDINGS)  # (3,) probabilities at the last key scan
-    present_surroundings: Array = field(default_factory=lambda: FIRST_SURROUNDINGS)  # (3,) at the present scan
+    scan_surroundings: Array = field(default_factory=lambda: FIRST_SURROUNDINGS)  # (3,) at the present scan
     velocity: Array | None = None  # (3,) in base_link; None while unknown
-    drift: Array = field(default_factory=lambda: np.zeros((3, 3)))  # covariance of the pose with the drift
+    drift_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))  # covariance of the pose with the drift
     weight: float = 1.0
     # number of consecutive scans at which neither the map nor the local map showed the motion along some direction
     unobserved_scans: int = 0
@@ -58,7 +58,7 @@ class Mode:
     @property
     def log_weight(self) -> float:
         """Unnormalised, in nats."""
-        return self.log_evidence + self.present
+        return self.log_evidence + self.scan_log_likelihood
 
     def covariance(self, inflation: float) -> Array:
         """Covariance (3, 3) of x, y, yaw in map."""
@@ -71,7 +71,7 @@ class UnknownPlace:
 
     log_evidence: float = 0.0  # of the key scans and the prior
     log_off_map: float = 0.0  # the same for places that are not on the map, which remain after a search of all of it
-    present: float = 0.0  # log likelihood of the present scan
+    scan_log_likelihood: float = 0.0  # of the present scan
     weight: float = 1.0  # probability
 
     def restart(self, probability: float, off_map: float) -> None:
@@ -89,9 +89,9 @@ class UnknownPlace:
 
     def add_key_scan(self) -> None:
         """Adds the evidence of the present scan, which becomes a key scan."""
-        self.log_evidence += self.present
-        self.log_off_map += self.present
-        self.present = 0.0
+        self.log_evidence += self.scan_log_likelihood
+        self.log_off_map += self.scan_log_likelihood
+        self.scan_log_likelihood = 0.0
 
     def exclude_mapped_places(self) -> None:
         """Removes the places on the map, after a search of the whole map has made hypotheses of them."""
@@ -206,7 +206,7 @@ def update_mode(mode: Mode, fused: FusedMotion, evidence: Evidence, k: int, peri
         log_evidence=mode.log_evidence,
         surroundings=mode.surroundings,
         velocity=velocity,
-        drift=inverse @ prior_information @ fused.candidate.drift,
+        drift_covariance=inverse @ prior_information @ fused.candidate.drift_covariance,
         unobserved_scans=mode.unobserved_scans + 1 if unobserved else 0,
     )
 
@@ -230,10 +230,10 @@ def same_place(poses: Array, pose: Array) -> npt.NDArray[np.bool_]:
     return np.asarray((off[:, :2] < SAME_POSITION_M).all(axis=1) & (off[:, 2] < SAME_HEADING_RAD))
 
 
-def select_distinct(poses: Array, energy: Array, count: int) -> list[int]:
-    """Indices of up to ``count`` poses with the least energy, no two at the same place."""
+def select_best(poses: Array, log_weights: Array, count: int) -> list[int]:
+    """Indices of up to ``count`` poses with the largest weights, best first, no two at the same place."""
     kept: list[int] = []
-    for k in np.argsort(energy, kind="stable"):
+    for k in np.argsort(-log_weights, kind="stable"):
         if not same_place(poses[kept], poses[k]).any():
             kept.append(int(k))
         if len(kept) == count:
@@ -247,16 +247,14 @@ def weigh(modes: list[Mode], log_unknown: float, count: int) -> tuple[list[Mode]
     Returns up to ``count`` hypotheses, best first, whose weights sum to 1, and the probability that the robot is at
     none of them. ``log_unknown`` is the unnormalised logarithm of that.
     """
-    energy = np.array([-mode.log_weight for mode in modes])
-    kept = select_distinct(np.array([mode.pose for mode in modes]), energy, count)
-    logs = np.array([*(-energy[kept]), log_unknown])
-    weights = np.exp(logs - logs.max())
-    weights /= weights.sum()
-    total = weights[:-1].sum()
-    known = weights[:-1] / total if total > 0 else np.eye(len(kept))[0]
-    known = known / known[known > MIN_WEIGHT].sum()
-    weighted = [replace(modes[k], weight=float(w)) for k, w in zip(kept, known, strict=True) if w > MIN_WEIGHT]
-    return weighted, float(weights[-1])
+    logs = np.array([mode.log_weight for mode in modes])
+    best = select_best(np.array([mode.pose for mode in modes]), logs, count)
+    log_known = np.logaddexp.reduce(logs[best])
+    weights = np.exp(logs[best] - log_known)
+    kept = weights > MIN_WEIGHT
+    weights /= weights[kept].sum()
+    weighted = [replace(modes[k], weight=float(w)) for k, w, keep in zip(best, weights, kept, strict=True) if keep]
+    return weighted, float(np.exp(log_unknown - np.logaddexp(log_known, log_unknown)))
 
 
 def probability_of_being_near(covariance: Array) -> float:

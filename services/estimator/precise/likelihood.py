@@ -74,12 +74,12 @@ class Likelihood:
         range_max: float,
         expected: Expected,
         extra_sigma: float = 0.0,
-        attention: Array | None = None,
+        weights: Array | None = None,
     ) -> Evidence:
         """Returns the evidence of a scan, with derivatives by the laser's poses.
 
         ``measured`` (B,) are ranges in m: +inf is no return, -inf and NaN are not used. ``extra_sigma`` m is added in
-        quadrature to every standard deviation. ``attention`` (N, B) scales the derivatives of each beam, by default 1.
+        quadrature to every standard deviation. ``weights`` (N, B) scale the derivatives of each beam, by default 1.
         """
         count = len(expected.ranges)
         energy, gradient = np.zeros(count), np.zeros((count, 3))
@@ -96,7 +96,7 @@ class Likelihood:
             self.random,
             range_max,
             self.unseen,
-            np.zeros((0, 0)) if attention is None else attention,
+            np.zeros((0, 0)) if weights is None else weights,
             energy,
             gradient,
             matrices,

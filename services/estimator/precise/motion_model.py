@@ -61,7 +61,7 @@ class MotionCandidate:
     mean: Array  # (3,)
     covariance: Array  # (3, 3) in map
     probability: float
-    drift: Array = field(default_factory=lambda: np.zeros((3, 3)))  # covariance with the drift, of unit variance
+    drift_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))  # with the drift, of unit variance
 
     def squared_distance(self, pose: Array) -> float:
         """Squared Mahalanobis distance of ``pose`` (3,) from the mean."""
@@ -81,16 +81,16 @@ def predict_motion(
     odom: Array | None = None,
     command: Array | None = None,
     velocity: Array | None = None,
-    drift: Array | None = None,
+    drift_covariance: Array | None = None,
 ) -> list[MotionCandidate]:
     """Returns the candidates after ``period`` s, from the last posterior (3,), (3, 3); the last one is the widest.
 
-    ``drift`` (3, 3) is the posterior's covariance with the drift; 0 by default. ``odom`` (3,) is the motion since then
-    in base_link. ``command`` and ``velocity`` (3,) are in m/s, m/s, rad/s in base_link; a command takes precedence over
-    the velocity.
+    ``drift_covariance`` (3, 3) is that of the posterior with the drift; 0 by default. ``odom`` (3,) is the motion since
+    then in base_link. ``command`` and ``velocity`` (3,) are in m/s, m/s, rad/s in base_link; a command takes precedence
+    over the velocity.
     """
     full_speed = np.array([noise.speed, noise.speed, noise.turn]) * period
-    before = MotionCandidate(pose, covariance, 1.0, np.zeros((3, 3)) if drift is None else drift)
+    before = MotionCandidate(pose, covariance, 1.0, np.zeros((3, 3)) if drift_covariance is None else drift_covariance)
     likely = 1 - noise.surprise
     probability = likely if odom is None else likely * noise.surprise  # of the motions that odometry does not give
     if command is not None or velocity is not None:
@@ -147,14 +147,15 @@ def _velocity_variance(pose: Array, covariance: Array, period: float) -> Array:
 def _propagate(before: MotionCandidate, step: Array, deviation: Array, probability: float) -> MotionCandidate:
     by_pose, by_step = se2.compose_jacobians(before.mean, step)
     covariance = by_pose @ before.covariance @ by_pose.T + (by_step * deviation**2) @ by_step.T
-    return MotionCandidate(se2.compose(before.mean, step), covariance, probability, by_pose @ before.drift)
+    return MotionCandidate(se2.compose(before.mean, step), covariance, probability, by_pose @ before.drift_covariance)
 
 
 def _add_drift(candidate: MotionCandidate, lost: Array, yaw: float) -> MotionCandidate:
     """Adds the drift of one period: the motion that slipping may have ``lost`` (3,) in base_link at the heading."""
     growth = se2.rotation(yaw) * lost
-    covariance = candidate.covariance + growth @ candidate.drift.T + candidate.drift @ growth.T + growth @ growth.T
-    return replace(candidate, covariance=covariance, drift=candidate.drift + growth)
+    both = growth @ candidate.drift_covariance.T
+    covariance = candidate.covariance + both + both.T + growth @ growth.T
+    return replace(candidate, covariance=covariance, drift_covariance=candidate.drift_covariance + growth)
 
 
 def widen_unobserved(
@@ -187,7 +188,7 @@ def limit_covariance(candidate: MotionCandidate, unknown: Array) -> MotionCandid
         return candidate
     scale = 1 / np.maximum(excess, 1.0)
     covariance = candidate.covariance * np.outer(scale, scale)
-    return replace(candidate, covariance=covariance, drift=candidate.drift * scale[:, None])
+    return replace(candidate, covariance=covariance, drift_covariance=candidate.drift_covariance * scale[:, None])
 
 
 def reachable_poses(noise: MotionNoise, pose: Array, period: float, basin: float) -> Array:

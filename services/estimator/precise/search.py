@@ -18,7 +18,7 @@ from services.estimator.precise.hypotheses import (
     Mode,
     mode_from_search,
     project_evidence,
-    select_distinct,
+    select_best,
     unobserved_directions,
 )
 
@@ -50,7 +50,7 @@ def search_everywhere(views: list[View], seeds: Seeds, settings: PreciseSettings
     few = view.thinned(settings.search_beams)
     poses, _ = few.descend(starts, None, SEED_SCHEDULE_M)
     fit = few.surface_evidence(poses, SEED_SCHEDULE_M[-1]).log_likelihood
-    starts = poses[select_distinct(poses, -fit, settings.search_results)]
+    starts = poses[select_best(poses, fit, settings.search_results)]
     return _best_first([_best_modes(each, *each.descend(starts), None, seeds, settings) for each in views])
 
 
@@ -71,7 +71,7 @@ def search_near(
     prior = Prior.repeated(len(starts), pose, covariance)
     poses, _ = views[0].descend(starts, prior, NEAR_SCHEDULE_M)
     fit = views[0].surface_evidence(poses, NEAR_SCHEDULE_M[-1]).log_likelihood - prior.energy(poses)
-    starts = poses[select_distinct(poses, -fit, settings.search_results)]
+    starts = poses[select_best(poses, fit, settings.search_results)]
     prior = Prior.repeated(len(starts), pose, covariance)
     return _best_first([_best_modes(each, *each.descend(starts, prior), prior, seeds, settings) for each in views])
 
@@ -100,7 +100,7 @@ def _best_modes(
     surfaces = view.surface_evidence(poses)
     log_likelihood = surfaces.without(view.surfaces.small)
     log_prior = -prior.energy(poses) if prior else np.zeros(len(poses))
-    modes, kept = [], select_distinct(poses, -log_likelihood - log_prior, settings.max_hypotheses)
+    modes, kept = [], select_best(poses, log_likelihood + log_prior, settings.max_hypotheses)
     for k, unobserved in zip(kept, unobserved_directions(view, poses[kept], evidence.curvature[kept]), strict=True):
         project_evidence(evidence, k, unobserved)
         mode = mode_from_search(poses[k], evidence, k, prior, seeds.volume, seeds.spread)
@@ -109,7 +109,7 @@ def _best_modes(
                 mode,
                 explained=float(surfaces.explained[k]),
                 log_evidence=view.log_prior + mode.log_evidence + float(log_prior[k]),
-                present=float(log_likelihood[k]),
+                scan_log_likelihood=float(log_likelihood[k]),
             )
         )
     return modes

@@ -15,7 +15,7 @@ from common.geometry.world import World
 from services.estimator.precise import beam_sums, global_seeds
 from services.estimator.precise.gauss_newton import MAX_STEP, Prior, View
 from services.estimator.precise.global_seeds import Seeds, thin_places
-from services.estimator.precise.hypotheses import Mode, select_distinct, unobserved_directions, weigh
+from services.estimator.precise.hypotheses import Mode, select_best, unobserved_directions, weigh
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.motion_model import (
     MotionCandidate,
@@ -127,7 +127,7 @@ def test_gradient(seed):
         assert found[axis] == pytest.approx(-(high - low) / (2 * step), rel=1e-4, abs=5e-3)
 
 
-def test_attention():
+def test_beam_weights():
     """The derivatives are the sums over the beams, each times its constant weight."""
     rng = np.random.default_rng(4)
     seen, poses = view(scan(TRUTH, rng)), TRUTH + rng.normal(0, 0.01, (2, 3))
@@ -238,8 +238,8 @@ def test_drift():
     def drifted(steps):
         pose, P, drift = TRUTH, np.zeros((3, 3)), None
         for step in steps:
-            moved = expected_motion(predict_motion(noise, pose, P, 0.1, odom=np.array(step), drift=drift))
-            pose, P, drift = moved.mean, moved.covariance, moved.drift
+            moved = expected_motion(predict_motion(noise, pose, P, 0.1, odom=np.array(step), drift_covariance=drift))
+            pose, P, drift = moved.mean, moved.covariance, moved.drift_covariance
         return se2.rotation(-TRUTH[2]) @ P @ se2.rotation(-TRUTH[2]).T
 
     assert drifted([[0.2, 0, 0]] * 50) == pytest.approx(np.diag([1.0, 0, 0]), abs=1e-9)
@@ -263,11 +263,10 @@ def test_unobserved_motion():
     assert np.sqrt(np.diag(every.covariance)) == pytest.approx([3, 3, 6], rel=1e-3)
 
 
-def mode(x, log_evidence, present=0.0):
-    nothing = np.zeros((3, 3))
-    return Mode(
-        np.array([x, 0.0, 0.0]), np.eye(3), nothing, 1.0, 0.0, 0.0, np.zeros(3), np.eye(3), log_evidence, present
-    )
+def mode(x, log_evidence, log_likelihood=0.0):
+    pose, zero, one = np.array([x, 0.0, 0.0]), np.zeros((3, 3)), np.eye(3)
+    evidence = {"log_evidence": log_evidence, "scan_log_likelihood": log_likelihood}
+    return Mode(pose, one, zero, 1.0, 0.0, np.zeros(3), one, **evidence)
 
 
 def test_hypothesis_weights():
@@ -298,7 +297,7 @@ def test_unobserved_directions():
 
 def test_headings_across_pi():
     poses = np.array([[0, 0, np.pi - 0.01], [0, 0, -np.pi + 0.01], [0, 0, 0.0]])
-    assert select_distinct(poses, np.array([1.0, 0.0, 2.0]), 8) == [1, 2]
+    assert select_best(poses, np.array([-1.0, 0.0, -2.0]), 8) == [1, 2]
 
 
 def test_seed_ranking():

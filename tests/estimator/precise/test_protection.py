@@ -30,7 +30,7 @@ def test_evidence_of_each_surface(matched):
     made, pose = matched
     by_surface = made.evidence_of_each_surface(pose)
     weights = made.surface_evidence(pose[None]).weights * ~made.surfaces.small
-    together = made.evidence(pose[None], attention=weights)
+    together = made.evidence(pose[None], weights=weights)
     assert len(by_surface.xi) > 2
     assert by_surface.xi.sum(axis=0) == pytest.approx(together.xi[0])
     assert by_surface.curvature.sum(axis=0) == pytest.approx(together.curvature[0])
