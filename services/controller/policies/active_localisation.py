@@ -110,7 +110,7 @@ class VisitedPlaces:
 
 
 class StallTimer:
-    """Measures the time without progress of a robot that paths."""
+    """Measures for how long the robot has made no progress."""
 
     def __init__(self) -> None:
         self._pose = np.zeros(3)  # in the present base_link, where the robot last made progress
