@@ -57,7 +57,9 @@ def checkout_state() -> str:
     Results are written into docs/, so a run that was interrupted changes the files there.
     """
     head = commit().rstrip("+")
-    changes = "" if head == "unknown" else _run(["git", "diff", "--binary", "HEAD", "--", ".", ":!docs"]).stdout
+    if head == commit():
+        return head
+    changes = _run(["git", "diff", "--binary", "HEAD", "--", ".", ":!docs"]).stdout
     return f"{head}+{hashlib.sha256(changes.encode()).hexdigest()[:12]}" if changes else head
 
 

@@ -99,17 +99,14 @@ def score_trial(scans: Estimates, rate: float, kidnappings: Sequence[int], *, se
     """Scores of one trial whose scans come at ``rate`` Hz; ``separate`` scans are not one stretch of time."""
     right = scans.tracking & scans.correct
     recovered = [bool(right[first : first + RECOVERY_SCANS].any()) for first in kidnappings]
-    period = 1 / rate
-    longest = period if scans.wrong.any() else 0.0
-    if not separate:
-        longest = longest_duration(scans.wrong, np.full(len(scans.wrong), period))
+    longest = longest_duration(scans.wrong, np.full(len(scans.wrong), 1 / rate))
     return {
         "scans": len(scans.tracking),
         "tracking": int(scans.tracking.sum()),
         "in_map": int(np.isfinite(scans.error[:, 0]).sum()),
         "correct": int(scans.correct.sum()),
         "wrong": int(scans.wrong.sum()),
-        "longest_wrong_s": longest,
+        "longest_wrong_s": min(longest, 1 / rate) if separate else longest,
         "kidnapped": len(recovered),
         "recovered": sum(recovered),
     }

@@ -8,15 +8,16 @@ from typing import Any
 from lab.accuracy import report
 from lab.experiments.results import markdown, number, read
 from lab.peers.experiment import table_with_others
+from lab.real_logs.drive import GLOBAL, KIDNAPPED, LASER, ODOMETRY
 from lab.real_logs.experiment import wrong_share_of_tracking
 
 PRESETS = {"precise": "presage", "particle-filter": "particle filter, tuned"}
 # Labels in README, and the tasks of `presage experiment real` and of `presage bench accuracy`
 REAL_TASKS = {
-    "with odometry": "a: tracking with odometry",
-    "laser alone": "b: tracking without",
-    "unknown start": "c: global localisation",
-    "kidnapped": "d: kidnapped",
+    "with odometry": ODOMETRY,
+    "laser alone": LASER,
+    "unknown start": GLOBAL,
+    "kidnapped": KIDNAPPED,
 }
 TASKS = {
     "unknown start, 20 scans": "standing, 20 scans",
@@ -35,9 +36,10 @@ def real_logs(folder: Path) -> str:
     """
     lines, longest = [], [0.0] * len(PRESETS)
     for half, name in (("second half", "real-fr079"), ("first half", "real-fr079_exchanged")):
-        summary = read(folder / f"{name}.json")["summary"]
+        summary = read(folder / f"{name}.json")["summary"].values()
+        rows_of = {(row["task"], row["estimator"]): row for row in summary}
         for label, task in REAL_TASKS.items():
-            rows = [summary[f"{task}, {preset}"] for preset in PRESETS]
+            rows = [rows_of[task, preset] for preset in PRESETS]
             lines.append([f"{half}: {label}", *map(_correct_and_wrong, rows)])
             longest = [max(each, row["longest_wrong_s"]) for each, row in zip(longest, rows, strict=True)]
     lines.append(["longest wrong `tracking`", *(f"{each:.1f} s" for each in longest)])

@@ -24,7 +24,7 @@ from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.shared.interface import Observation, PoseEstimator
 
 MAX_SEARCH_SCANS = 40
-SCANS_BEFORE_KIDNAPPING = 10  # with which the estimator starts from a given pose
+SCANS_BEFORE_KIDNAPPING = 10  # from a given pose on
 START_COVARIANCE = np.diag([0.01, 0.01, 0.0025])  # m², m², rad²; of the given start pose
 # AMCL's default motion model is differential and cannot follow every base, so its omnidirectional model is used.
 AMCL_SETTINGS = ParticleFilterSettings(robot_model_type="omni")

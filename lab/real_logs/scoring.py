@@ -1,6 +1,6 @@
 """Which scans of a trial have a correct pose, and for how long a wrong one was reported as `tracking`.
 
-A row is what `drive.trial` returns. Scans before a kidnapping do not count.
+A row is what `drive.trial` returns. Scans before a kidnapping are left out.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ Mask = npt.NDArray[np.bool_]
 
 
 def counted(row: dict[str, Any], name: str) -> npt.NDArray[Any]:
-    """The values (N,) of one name of the scans that count."""
+    """One column (N,) of the row, without the scans before a kidnapping."""
     return np.array(row[name][SCANS_BEFORE_KIDNAPPING if row["task"] == KIDNAPPED else 0 :])
 
 
 def is_correct(row: dict[str, Any]) -> Mask:
-    """Whether the pose is correct, for each scan that counts."""
+    """Whether the pose is correct, for each scan that is not left out."""
     near = counted(row, "error_m") < CORRECT_DISTANCE_M
     return np.asarray(near & (counted(row, "yaw_error_rad") < CORRECT_YAW_RAD))
 
 
 def is_tracking(row: dict[str, Any]) -> Mask:
-    """Whether the state is `tracking`, for each scan that counts."""
+    """Whether the state is `tracking`, for each scan that is not left out."""
     return np.asarray(counted(row, "state") == "tracking")
 
 

@@ -50,7 +50,9 @@ def test_goal_on_another_floor(process, presage):
     assert going.output.startswith("going to (2, 2) on floor 'first'\n")
     # On a busy machine there may be too few scans at the goal to state that the pose is known as well.
     assert going.output.splitlines()[-1].startswith("reached: within 0.02 m of the goal")
-    assert all(before != after for before, after in pairwise(going.output.splitlines()))  # only changes
+    lines = going.output.splitlines()
+    assert len(set(lines)) < 12
+    assert all(before != after for before, after in pairwise(lines))  # only changes are printed
 
     status, output = presage("goal", "4", "3.5", "--floor", "first")
     assert status == 2

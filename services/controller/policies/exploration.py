@@ -82,7 +82,7 @@ class ExplorationState:
     home: Array  # (2,) m in map, where the tour ends
     target: Array | None  # (2,) m in map, the viewpoint to which the robot drives now
     unreachable: Array  # (N, 2) m in map, viewpoints that were given up
-    goal_count: int = 0  # goals of users when the choice was requested; the navigator drops the choice after another
+    goal_count: int = 0  # goals of users when the choice was requested; after another one, it is not used
 
 
 @dataclass(frozen=True)

@@ -428,12 +428,14 @@ class PreciseEstimator:
         if log_probability < np.log(SUDDEN_CHANGE_PROBABILITY):
             self._search_interval = 1
 
-        present, surroundings = _log_at_poses(view, poses, ignored, np.array([mode.surroundings for mode in modes]))
+        log_likelihood, surroundings = _log_at_poses(
+            view, poses, ignored, np.array([mode.surroundings for mode in modes])
+        )
         modes = [
             replace(
                 mode,
                 explained=states.explained[k],
-                scan_log_likelihood=present[k] + log_change,
+                scan_log_likelihood=log_likelihood[k] + log_change,
                 scan_surroundings=surroundings[k],
             )
             for k, mode in enumerate(modes)
@@ -569,14 +571,11 @@ class PreciseEstimator:
         self._restart_local_map(view)
         self._unknown_place.restart(unknown, off_map)
         reference = _log_reference(view, self._ignored_beams)
-        log_all_changed = (
-            self._unknown_place.scan_log_likelihood + float(np.log(all_changed)) if all_changed else -np.inf
-        )
+        unknown_place = self._unknown_place
+        log_all_changed = unknown_place.scan_log_likelihood + float(np.log(all_changed)) if all_changed else -np.inf
+        log_likelihoods = [max(mode.scan_log_likelihood - reference, log_all_changed) for mode in found]
         self._set_hypotheses(
-            [
-                replace(mode, scan_log_likelihood=max(mode.scan_log_likelihood - reference, log_all_changed))
-                for mode in found
-            ]
+            [replace(mode, scan_log_likelihood=each) for mode, each in zip(found, log_likelihoods, strict=True)]
         )
 
     def _restart_local_map(self, view: View) -> None:
@@ -588,8 +587,8 @@ class PreciseEstimator:
     def _add_hypotheses(self, found: list[Mode], view: View) -> None:
         """Adds hypotheses: the robot may have been there since one of the key scans, or was carried there just now."""
         stayed, surroundings = self._log_stayed(found, view)
-        present = np.array([mode.scan_log_likelihood for mode in found])
-        carried = self._unknown_place.log_evidence + present - _log_reference(view, view.surfaces.small)
+        log_likelihood = np.array([mode.scan_log_likelihood for mode in found])
+        carried = self._unknown_place.log_evidence + log_likelihood - _log_reference(view, view.surfaces.small)
         evidence = np.array([mode.log_evidence for mode in found]) + np.maximum(stayed, carried)
         surroundings[carried >= stayed] = FIRST_SURROUNDINGS
         added = [

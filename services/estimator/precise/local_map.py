@@ -128,7 +128,8 @@ class LocalMap:
         """Masks (B,) of two kinds of beams of a scan at ``local`` (3,).
 
         - Seen before: they end at surfaces of the key scans. Beams without return also count as seen once there are key
-          scans. Which surfaces are seen must not depend on a hypothesis: the same ones would be new at each other.
+          scans. It does not matter whether the map shows them: that depends on the best hypothesis, and the same
+          surfaces would be new evidence whenever another one becomes the best.
         - Appeared: they end where a key scan saw free space, so the surface came since then, wherever the robot is.
         """
         seen, appeared = np.zeros(len(view.ranges), np.bool_), np.zeros(len(view.ranges), np.bool_)

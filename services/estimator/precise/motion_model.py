@@ -153,8 +153,8 @@ def _propagate(before: MotionCandidate, step: Array, deviation: Array, probabili
 def _add_drift(candidate: MotionCandidate, lost: Array, yaw: float) -> MotionCandidate:
     """Adds the drift of one period: the motion that slipping may have ``lost`` (3,) in base_link at the heading."""
     growth = se2.rotation(yaw) * lost
-    both = growth @ candidate.drift_covariance.T
-    covariance = candidate.covariance + both + both.T + growth @ growth.T
+    cross = growth @ candidate.drift_covariance.T
+    covariance = candidate.covariance + cross + cross.T + growth @ growth.T
     return replace(candidate, covariance=covariance, drift_covariance=candidate.drift_covariance + growth)
 
 
