@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 
 NEAR_POSITION_M, NEAR_HEADING_RAD = 0.2, math.radians(5)  # a pose with a larger error is wrong
 SAME_POSITION_M, SAME_HEADING_RAD = 0.1, 0.1  # of hypotheses nearer to one another, the best is kept
-# A scan observes a direction if it is this much less probable, in nats, this far to both sides of the pose (guesses).
-MIN_FALL, AWAY_M = math.log(100), 0.1
+# A scan observes a direction if it is this much less probable, in nats, this far to both sides of the pose. Within the
+# map's error, the pose fits alike everywhere, so twice its standard deviation is added (guesses).
+MIN_FALL, AWAY_M, AWAY_MAP_DEVIATIONS = math.log(100), 0.1, 2.0
 WEAK_PRIOR = np.eye(3)  # 1/m², 1/rad²: keeps the covariance finite along unobserved directions
 MIN_WEIGHT = 1e-9  # hypotheses with less weight are dropped
 # The surfaces that a key scan shows for the first time are as the map predicts (0), clutter (1), or in a room that the
@@ -120,7 +121,8 @@ def unobserved_directions(view: View, poses: Array, curvatures: Array) -> list[A
 def _are_observed(view: View, poses: Array, curvatures: Array, directions: Array) -> npt.NDArray[np.bool_]:
     """Mask (N,) of the poses whose position along ``directions`` (N, 2) a scan shows, with the best heading there."""
     turns = -np.einsum("ni,ni->n", curvatures[:, 2, :2], directions) / np.maximum(curvatures[:, 2, 2], 1e-12)
-    steps = AWAY_M * np.column_stack([directions, turns])
+    away_m = AWAY_M + AWAY_MAP_DEVIATIONS * view.map_error
+    steps = away_m * np.column_stack([directions, turns])
     here = view.surface_evidence(poses).log_likelihood
     away = view.surface_evidence(np.concatenate([poses + steps, poses - steps])).log_likelihood
     return np.asarray(here - away.reshape(2, -1).max(axis=0) > MIN_FALL)

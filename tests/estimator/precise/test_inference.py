@@ -288,6 +288,9 @@ def test_unobserved_directions():
     seen = View(hall, Likelihood(), np.zeros(3), ANGLES, clean, 25.0)
     curvature = seen.evidence(pose[None]).curvature
     assert unobserved_directions(seen, pose[None], curvature)[0].shape == (0, 3)
+    rough, near = replace(seen, map_error=0.04), pose + np.array([[dx, 0, 0] for dx in (-0.04, 0, 0.04)])
+    curvatures = rough.evidence(near, 0.0, rough.surface_evidence(near).weights).curvature
+    assert [len(found) for found in unobserved_directions(rough, near, curvatures)] == [0, 0, 0]
     hidden = replace(seen, ranges=np.where(clean > 6, 0.8, clean))
     ((along,),) = unobserved_directions(hidden, pose[None], curvature)
     assert np.abs(along) == pytest.approx([1.0, 0.0, 0.0], abs=0.01)
