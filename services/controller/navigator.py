@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from common.geometry.world import World
     from services.controller.growing_map import PlannedMap
     from services.controller.policies.exploration import ExplorationState, NoPath, Viewpoint
+
+MAX_RECENT_SCANS = 60  # 4 s at 15 Hz: longer than a search of the whole map takes on a slow computer
 
 
 class Answer(NamedTuple):
@@ -67,14 +70,17 @@ class Navigator:
         self.explorer: Explorer | None = None  # None after it was cancelled, or when a goal follows its end
         self._exploration_request: Goal | None = None  # waits for the first map and a pose in it
         self._goal_count = 0  # goals of users so far; a viewpoint that was requested before the last is not used
-        self._scan: Scan | None = None
+        self._recent_scans: deque[Scan] = deque(maxlen=MAX_RECENT_SCANS)  # the latest last
         self._scan_points = np.zeros((0, 2))  # m in base_link
 
     def on_scan(self, scan: Scan) -> None:
         """Stores the scan, corrected for the robot's motion, for the obstacle limits and the policy."""
-        self._scan = correct_scan(scan, self._command.velocity)
-        self._scan_points = safety.scan_points(self._scan)
-        self.policy.prepare(self._scan)
+        if self._scan is not None and scan.stamp_ns < self._scan.stamp_ns:  # the simulation was reset
+            self._recent_scans.clear()
+        corrected = correct_scan(scan, self._command.velocity)
+        self._recent_scans.append(corrected)
+        self._scan_points = safety.scan_points(corrected)
+        self.policy.prepare(corrected)
 
     def on_drive(self, drive: Drive) -> None:
         """Stores a manual velocity command, which has priority over the goal."""
@@ -219,6 +225,15 @@ class Navigator:
         return next((f"the line to the goal is not free: {reason}" for reason in reasons if reason is not None), None)
 
     @property
+    def _scan(self) -> Scan | None:
+        """The latest scan; None before the first one."""
+        return self._recent_scans[-1] if self._recent_scans else None
+
+    def _scan_of(self, belief: Belief) -> Scan | None:
+        """The scan of a belief; None if it has not come, or is too old."""
+        return next((scan for scan in reversed(self._recent_scans) if scan.stamp_ns == belief.stamp_ns), None)
+
+    @property
     def scan_stamp(self) -> int | None:
         """Stamp of the latest scan in ns; None before the first scan."""
         return None if self._scan is None else self._scan.stamp_ns
@@ -234,8 +249,7 @@ class Navigator:
         self._begin_exploration()
         if self.explorer is not None:
             self.explorer.move(pose, tracking=self._tracking)
-        has_its_scan = self._scan is not None and self._scan.stamp_ns == belief.stamp_ns
-        self.policy.observe(self._scan if has_its_scan else None, belief)
+        self.policy.observe(self._scan_of(belief), belief)
         self._follow_floor()
         if manual_twist is not None:
             self._suspend_goal()

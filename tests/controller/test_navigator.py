@@ -8,7 +8,7 @@ import pytest
 from common.robot.robot import Robot
 from services.controller.navigator import Navigator
 from services.controller.policies.planner import GeodesicPolicy
-from tests.controller.driving import PERIOD_NS, PERIOD_S, belief, box, drive, goal, path_length, room, session
+from tests.controller.driving import PERIOD_NS, PERIOD_S, belief, box, drive, goal, path_length, room, scan, session
 
 ROOM = room(10, 4)
 
@@ -138,6 +138,19 @@ def test_stop_without_a_belief(navigator):
     command, status, _ = session(navigator, [3, 2, 0], [None] * 5, ROOM, first=20)[-1]
     assert status.state == "navigating"
     assert command.twist.vx > 0
+
+
+@pytest.mark.parametrize("late", [0, 1, 20])
+def test_localising_with_late_beliefs(late):
+    """The robot drives in order to localise, although newer scans have come than that of the belief."""
+    navigator = Navigator(chosen_policy=GeodesicPolicy(Robot(), ROOM), world=ROOM)
+    navigator.on_goal(goal(8.5, 2))
+    for number in range(100):
+        navigator.on_scan(scan(number * PERIOD_NS, [2, 2, 0], ROOM))
+        if number >= late:
+            command, status = navigator.step(belief((number - late) * PERIOD_NS, [2, 2, 0], "localising"))
+    assert status.state == "exploring", status
+    assert command.twist.array().any()
 
 
 @pytest.mark.parametrize("late", [0, 1, 9])
