@@ -66,7 +66,7 @@ def session_bus(link: Link) -> Iterator[Bus]:
         try:
             yield bus
         except UserError:
-            if (robots := bus.robots()) and bus.robot not in robots:
+            if (robots := bus.robots(CONNECT_TIMEOUT_S)) and bus.robot not in robots:
                 raise UserError(
                     f"no robot {bus.robot!r} is running: choose one of {', '.join(robots)} with `presage --robot NAME`"
                 ) from None

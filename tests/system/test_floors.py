@@ -30,7 +30,8 @@ def tower(process, bus, link, tmp_path, monkeypatch):
     monkeypatch.setenv("PRESAGE_CONNECT", link.connect[0])
     monkeypatch.setenv("PRESAGE_ROBOT", link.robot)
     for name in SERVICES:
-        process(name, env={"PRESAGE_WORLD": str(tmp_path / "tower.yaml"), "PRESAGE_MODEL": "exact"})
+        world = {"PRESAGE_WORLD": str(tmp_path / "tower.yaml"), "PRESAGE_MODEL": "exact"}
+        process(name, env={**world, "PRESAGE_PACE": "lockstep"})  # however slow the machine is
     assert wait_until(lambda: set(SERVICES) <= bus.alive(), 60)
 
 
@@ -48,7 +49,6 @@ def test_goal_on_another_floor(process, presage):
     assert presage("teleport", "1", "2", "0", "--floor", "first")[0] == 0
     assert going.wait(180) == 0, going.output
     assert going.output.startswith("going to (2, 2) on floor 'first'\n")
-    # On a busy machine there may be too few scans at the goal to state that the pose is known as well.
     assert going.output.splitlines()[-1].startswith("reached: within 0.02 m of the goal")
     lines = going.output.splitlines()
     assert len(set(lines)) < 12

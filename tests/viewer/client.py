@@ -61,7 +61,8 @@ class Page:
     def __init__(self, link, origin=None, **options):
         parts = urlsplit(link)
         query = f"?{parts.query}" if parts.query else ""
-        options = {"open_timeout": WAIT_TIMEOUT_S, "compression": None, "max_size": None, "close_timeout": 2, **options}
+        waits = {"open_timeout": WAIT_TIMEOUT_S, "ping_timeout": WAIT_TIMEOUT_S, "close_timeout": 2}
+        options = {"compression": None, "max_size": None, **waits, **options}
         origin = origin or f"http://{parts.netloc}"
         self.socket = connect(f"ws://{parts.netloc}/ws{query}", origin=origin, **options).__enter__()
         self.numbers = itertools.count(1)

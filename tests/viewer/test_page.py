@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import ROOT, WAIT_TIMEOUT_S
-from tests.viewer.client import Page, is_complete, page_of
+from tests.viewer.client import Page, page_of
 
 STATIC = ROOT / "services" / "viewer" / "static"
 AWAY = "Math.hypot({0}.x - arg[0], {0}.y - arg[1])"  # m from a given place
@@ -26,7 +26,6 @@ COLOURS = """(() => {
     const canvas = document.getElementById("c-scan");
     return new Set(canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data).size;
 })()"""
-CRATE = {"box": {"center": [6.0, 1.5], "size": [0.4, 0.4]}}
 
 
 class System:
@@ -193,17 +192,20 @@ def test_missing_service(page, system):
 def test_two_visitors(system):
     """Without a browser: what both see, and what the page's buttons do not reach."""
     with Page(system.address) as page, Page(system.address) as other:
-        frame = page.frame(lambda h: is_complete(h) and h["latency_ms"] is not None)
+        # On a busy machine, the belief may always be that of an earlier scan.
+        frame = page.frame(lambda h: h["latency_ms"] is not None and h["arrays"]["predicted"][1] > 0)
         assert len(frame.arrays["ranges"]) == len(frame.arrays["predicted"]) == len(frame.arrays["sigma"])
         assert frame.header["latency_ms"] > 0
-        page.done("obstacle", action="add", name="crate", obstacle=CRATE)
+        far = 4.5 if frame.header["truth"]["x"] > 9 else 13.0  # from the robot, in the free middle of the corridor
+        crate = {"box": {"center": [far, 1.5], "size": [0.4, 0.4]}}
+        page.done("obstacle", action="add", name="crate", obstacle=crate)
         for visitor in (page, other):
             visitor.wait_for("world", lambda m: "crate" in [o["name"] for o in m["world"]["obstacles"]])
         page.done("obstacle", action="remove", name="crate")
         assert "crate" in page.request("obstacle", action="remove", name="crate")["reason"]
         assert "inside something" in page.request("goal", x=-4, y=1.5)["reason"]
         assert "wall" in page.request("teleport", x=0.05, y=0.05)["reason"]
-        page.done("goal", x=12.0, y=1.5, yaw=1.57)
+        page.done("goal", x=far, y=1.5, yaw=1.57)
         frame = page.frame(
             lambda h: (
                 h["status"]
@@ -212,9 +214,9 @@ def test_two_visitors(system):
                 and h["arrays"]["motion"][1] > 2
             )
         )
-        np.testing.assert_allclose(frame.arrays["path"][-2:], [12.0, 1.5], atol=0.1)
+        np.testing.assert_allclose(frame.arrays["path"][-2:], [far, 1.5], atol=0.1)
         assert frame.header["status"]["goal"]["yaw_tolerance"] == 0.15
-        field = page.by_now("field", lambda f: f.header["goal"]["x"] == 12.0)
+        field = page.by_now("field", lambda f: f.header["goal"]["x"] == far)
         assert np.isfinite(field.arrays["distance"]).sum() > 1000
         page.done("cancel")
         page.frame(lambda h: h["status"]["goal"] is None)
