@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from lab.real_logs.drive import LASER, ODOMETRY
 from lab.real_logs.scoring import CORRECT_DISTANCE_M
-from presage.learning.drive_figure import calibration_curve
+from presage.learning.field_figure import calibration_curve
 from presage.plotting import style as drawing
 from services.estimator.precise.learning.calibration import Calibration
 

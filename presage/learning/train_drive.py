@@ -22,7 +22,7 @@ from common.robot.robot import Robot
 from common.robot.scan_geometry import Sweep
 from common.robot.scanner import Scanner
 from common.versions import commit, presage_command, versions
-from presage.learning.drive_figure import draw_learned
+from presage.learning.field_figure import draw_model
 from presage.logs.log import Reading
 from presage.logs.scan_files import Scans, read_scans
 from services.estimator.factory import ScannerGeometry
@@ -92,7 +92,7 @@ def train_on_drive(options: TrainDriveOptions, drive: ReferenceDrive, console: C
         learned = learn_drive(drive, options.recipe, simulated, report, replayed=options.former is not None)
     card = card_of(options, world, drive, learned, time.monotonic() - start)
     weights.save(path, learned.model, learned.places, card)
-    draw_learned(weights.load(path)[0], card, path.with_suffix(".png"))
+    draw_model(weights.load(path)[0], card, path.with_suffix(".png"))
     console.print(f"{path}: {path.stat().st_size / 1e6:.2f} MB, trained in {card.learning_s:.0f} s on {card.source}")
     for line in summary(card):
         console.print(line)

@@ -17,8 +17,8 @@ from common.geometry.world import World, load_world
 from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS, Scanner
 from common.versions import commit, presage_command, versions
+from presage.learning.field_figure import draw_model
 from presage.learning.simulated_scans import collect, scanner_on_bus
-from presage.plotting.style import empty_figure
 from services.estimator.factory import MIN_SIGMA_M
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.learning import weights
@@ -71,7 +71,7 @@ def train_precise(options: TrainPreciseOptions, link: Link, console: Console) ->
             train = collect(bus, poses["train"], scanner, options.recipe.seed, bar, "training scans")
             held_out = collect(bus, poses["held out"], scanner, None, bar, "test scans")
         card = learn_and_save(path, options, world, poses, {"train": train, "held out": held_out}, bar)
-    _draw(weights.load(path)[0], card, path.with_suffix(".png"))
+    draw_model(weights.load(path)[0], card, path.with_suffix(".png"))
     position_error_m = card.test_position_error_rms_m
     assert position_error_m is not None  # noqa: S101 - it was just measured
     console.print(
@@ -162,25 +162,3 @@ def _card(
         command=presage_command(),
         versions=versions(),
     )
-
-
-def _draw(model: FieldModel, card: weights.FieldCard, png: Path) -> None:
-    figure = empty_figure(9, 4.6)
-    axes = figure.add_subplot()
-    field = model.field
-    ny, nx = field.phi.shape
-    x0, y0, h = *field.origin, field.resolution
-    image = axes.imshow(
-        field.phi, origin="lower", extent=(x0, x0 + h * (nx - 1), y0, y0 + h * (ny - 1)), cmap="viridis", vmin=0
-    )
-    axes.contour(
-        x0 + h * np.arange(nx), y0 + h * np.arange(ny), field.phi, levels=[0.0], colors="#D55E00", linewidths=0.8
-    )
-    axes.set(
-        xlabel="x (m)",
-        ylabel="y (m)",
-        aspect="equal",
-        title=f"{card.world.name}: learned distance (m) to the nearest surface, and its zero",
-    )
-    figure.colorbar(image, ax=axes, shrink=0.8)
-    figure.savefig(png, dpi=120, bbox_inches="tight")  # else the title of a narrow world is cut off
