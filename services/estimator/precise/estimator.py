@@ -414,7 +414,7 @@ class PreciseEstimator:
         poses = np.array([mode.pose for mode in modes])
         states = view.surface_evidence(poses)
         self._last_log_fit = _log_fit(view, states)
-        seen, appeared = self._local_map.find_seen_and_appeared(local, view)
+        seen, appeared = self._local_map.find_seen_and_appeared(local, view, states.weights[0] > 0.5)
         small = view.surfaces.small
         ignored = seen | appeared | small
 
@@ -478,12 +478,12 @@ class PreciseEstimator:
     def _add_key_scan(self, view: View) -> None:
         """Makes the present scan a key scan: keeps its evidence, and adds its surfaces to the local map."""
         best, log_unknown = self.modes[0], self._unknown_place.log_evidence
-        mapped = view.surface_evidence(best.pose[None]).weights[0] > 0.5
-        if self._is_tracked():
+        mapped, tracked = view.surface_evidence(best.pose[None]).weights[0] > 0.5, self._is_tracked()
+        if tracked:
             self._precision.learn_changes(view, best.pose)
             self._precision.learn_map_error(view, best.pose)
         self._unknown_place.add_key_scan()
-        key = LocalMapScan(self._local_pose, view, self._ignored_beams, mapped, self._log_change, log_unknown)
+        key = LocalMapScan(self._local_pose, view, self._ignored_beams, mapped, tracked, self._log_change, log_unknown)
         self._local_map.add(key, best.pose, best.noise_covariance)
         self.modes = [
             replace(mode, log_evidence=mode.log_weight, scan_log_likelihood=0.0, surroundings=mode.scan_surroundings)

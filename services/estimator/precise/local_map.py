@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from common.geometry import se2
 from common.geometry.se2 import Array
@@ -57,9 +58,15 @@ class LocalMapScan(LocalScan):
     # (B,) beams that are no evidence: they end at surfaces seen before, at ones that have just appeared (which count as
     # a change), or at ones with fewer than MIN_BEAMS beams
     ignored: npt.NDArray[np.bool_]
-    mapped: npt.NDArray[np.bool_]  # (B,) beams that end at surfaces of the map
+    mapped: npt.NDArray[np.bool_]  # (B,) beams that end at surfaces of the map, according to the best hypothesis
+    tracked: bool  # whether that was so probable that the state was `tracking`
     log_change: float  # nats, log probability of what had changed since the scan before
     log_unknown: float  # nats, evidence before this scan that the robot is at none of the hypotheses
+
+    @property
+    def unmapped_points(self) -> Array:
+        """End points (K, 2), m in the local frame, of the beams not known to end at surfaces of the map."""
+        return self.points[~self.mapped[self.view.returned]] if self.tracked else self.points
 
 
 @dataclass
@@ -99,11 +106,12 @@ class LocalMap:
     # (3, 3) of the pose in map at the last key scan, with the drift that this scan contributes
     covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
     _points: SurfacePoints | None = None
+    _unmapped: cKDTree | None = None  # of the unmapped points of all scans
 
     def clear(self) -> None:
         """Removes all scans."""
         self.scans.clear()
-        self._points = None
+        self._points = self._unmapped = None
 
     def to_local(self, pose: Array) -> Array:
         """A pose (3,) in map, in the local frame."""
@@ -122,14 +130,18 @@ class LocalMap:
         self.scans.append(key)
         self.place(key.pose, pose)
         self.covariance = covariance + np.diag(DRIFT_PER_SCAN**2)
-        self._points = None
+        self._points = self._unmapped = None
 
-    def find_seen_and_appeared(self, local: Array, view: View) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    def find_seen_and_appeared(
+        self, local: Array, view: View, mapped: npt.NDArray[np.bool_]
+    ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
         """Masks (B,) of two kinds of beams of a scan at ``local`` (3,).
 
         - Seen before: they end at surfaces of the key scans. Beams without return also count as seen once there are key
-          scans. It does not matter whether the map shows them: that depends on the best hypothesis, and the same
-          surfaces would be new evidence whenever another one becomes the best.
+          scans. A beam that does not end at a surface of the map (``mapped`` (B,) is false) is not seen at one that was
+          known to be in the map: something else stands there now, maybe in another room. Only key scans in state
+          `tracking` tell this. Otherwise the best hypothesis may change with each search, and the same surfaces would
+          be new evidence each time.
         - Appeared: they end where a key scan saw free space, so the surface came since then, wherever the robot is.
         """
         seen, appeared = np.zeros(len(view.ranges), np.bool_), np.zeros(len(view.ranges), np.bool_)
@@ -141,6 +153,9 @@ class LocalMap:
         free = np.zeros(len(near), np.bool_)
         free[~near] = self._in_free_space(placed[~near])
         appeared[view.returned] = free
+        unmapped = near & ~mapped[view.returned]
+        distance, _ = self._tree_of_unmapped_points().query(placed[unmapped], distance_upper_bound=SEEN_RADIUS_M)
+        near[unmapped] = np.isfinite(distance)
         seen[:] = ~view.returned
         seen[view.returned] = near
         return seen, appeared
@@ -192,6 +207,12 @@ class LocalMap:
                 points, np.concatenate([each.mapped[each.view.returned] for each in self.scans])
             )
         return self._points
+
+    def _tree_of_unmapped_points(self) -> cKDTree:
+        """Index of the unmapped points of all scans; kept until the scans change."""
+        if self._unmapped is None:
+            self._unmapped = cKDTree(np.concatenate([each.unmapped_points for each in self.scans]))
+        return self._unmapped
 
 
 def count_changes(last: LocalScan, now: LocalScan) -> int:

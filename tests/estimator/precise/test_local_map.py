@@ -51,7 +51,7 @@ def local_map(scene, *poses, frame=(0.0, 0.0, 0.0)):
     for pose in poses:
         scan = view(scene, pose)
         nothing, everything = np.zeros(len(scan.ranges), np.bool_), np.ones(len(scan.ranges), np.bool_)
-        key = LocalMapScan(made.to_local(np.array(pose)), scan, nothing, everything, 0.0, 0.0)
+        key = LocalMapScan(made.to_local(np.array(pose)), scan, nothing, everything, True, 0.0, 0.0)
         made.add(key, np.array(pose), np.diag([1e-4, 1e-4, 1e-5]))
     return made
 
@@ -119,22 +119,40 @@ def changed(scan, beams, factor):
 def test_seen_surfaces():
     scene = Scene.of(ROOM, 361, 1)
     scan = view(scene, HERE)
-    seen, appeared = LocalMap().find_seen_and_appeared(HERE, scan)
+    mapped = np.ones(len(scan.ranges), np.bool_)
+    seen, appeared = LocalMap().find_seen_and_appeared(HERE, scan, mapped)
     assert not seen.any()
     assert not appeared.any()
     made = local_map(scene, HERE)
     here = made.to_local(HERE)
     assert made.is_key_scan_due(made.to_local(HERE + np.array([1.01 * MIN_DISTANCE_M, 0.0, 0.0])))
     assert not made.is_key_scan_due(here)
-    assert made.find_seen_and_appeared(here, view(scene, HERE))[0].all()
-    seen, appeared = made.find_seen_and_appeared(here, changed(scan, slice(100, 150), 0.5))  # a person
+    assert made.find_seen_and_appeared(here, view(scene, HERE), mapped)[0].all()
+    seen, appeared = made.find_seen_and_appeared(here, changed(scan, slice(100, 150), 0.5), mapped)  # a person
     assert np.flatnonzero(~seen).tolist() == np.flatnonzero(appeared).tolist() == list(range(100, 150))
-    seen, appeared = made.find_seen_and_appeared(here, changed(scan, slice(100, 150), 1.5))  # a door was opened
+    seen, appeared = made.find_seen_and_appeared(here, changed(scan, slice(100, 150), 1.5), mapped)  # a door was opened
     assert np.flatnonzero(~seen).tolist() == list(range(100, 150))
     assert not appeared.any()
     behind = replace(scan, ranges=scan.ranges + 0.14)  # another room, whose walls are near those of this one
-    seen, _ = made.find_seen_and_appeared(here, behind)
+    seen, _ = made.find_seen_and_appeared(here, behind, mapped)
     assert seen.mean() < 0.5  # only beams that meet walls at a shallow angle
+
+
+@pytest.mark.parametrize("tracked", [True, False])
+def test_surface_in_place_of_another(tracked):
+    """What ends where the map's surface was seen, but not at that surface, was not seen before."""
+    scene = Scene.of(ROOM, 361, 1)
+    scan, made = view(scene, HERE), local_map(scene)
+    nothing = np.zeros(len(scan.ranges), np.bool_)
+    mapped = ~nothing
+    mapped[100:150] = False
+    covariance = np.diag([1e-4, 1e-4, 1e-5])
+    made.add(LocalMapScan(np.zeros(3), scan, nothing, ~nothing, tracked, 0.0, 0.0), HERE, covariance)
+    seen, appeared = made.find_seen_and_appeared(np.zeros(3), scan, mapped)
+    assert np.flatnonzero(~seen).tolist() == (list(range(100, 150)) if tracked else [])
+    assert not appeared.any()
+    made.add(LocalMapScan(np.zeros(3), scan, nothing, mapped, tracked, 0.0, 0.0), HERE, covariance)
+    assert made.find_seen_and_appeared(np.zeros(3), view(scene, HERE), mapped)[0].all()
 
 
 def test_changes_between_scans():
