@@ -240,7 +240,8 @@ class Processes:
         for _ in range(5):
             port = free_tcp_port()
             running = self.start("common.router", "--listen", f"tcp/127.0.0.1:{port}", *args)
-            wait_until(lambda r=running, p=port: not r.running or accepts(p), WAIT_TIMEOUT_S)
+            # Not by connecting to the port: another test's router may have just taken it.
+            wait_until(lambda r=running: not r.running or "router listens" in r.output, WAIT_TIMEOUT_S)
             if running.running:
                 return running, port
         raise AssertionError(f"no router started:\n{running.output}")
