@@ -211,8 +211,10 @@ class PreciseEstimator:
         if self._scan is None:
             raise RuntimeError("there is no scan to search with: call track first")
         view, observation = self._scan
-        start, is_first = self._start, not self._precision.scans
-        view = self._search_for_hypotheses([view, _with_rough_map(view)] if is_first else [view])
+        start, is_first = self._start, not self.modes
+        # The map's errors are unknown until a key scan has shown them.
+        views = [view] if self._precision.scans else [view, _with_rough_map(view)]
+        view = self._search_for_hypotheses(views)
         if is_first and self._is_tracked():
             view = self._search_with_map_error(view, start)
         return self._finish_scan(view, observation)
@@ -385,8 +387,8 @@ class PreciseEstimator:
         """Other hypotheses within the motion prior that fit the scan, if it made the ``best`` one far more certain.
 
         The pose was uncertain before this scan, and a descent from one pose finds only the nearest match. An
-        alternative loses evidence if its motion is less probable than that of the best match; it never gains any. So
-        does a motion of which the robot is hardly capable, according to the ``widest`` candidate.
+        alternative loses evidence if its motion is less probable than that of the best match, and gains none if it is
+        more probable. As in `_fuse`, a motion of which the robot is hardly capable costs evidence as well.
         """
         before = self.modes[0]
         doubt = 1 - self._probability_of_being_near(before)
@@ -400,6 +402,7 @@ class PreciseEstimator:
             replace(
                 mode,
                 log_evidence=min(before.log_evidence, at_best + mode.log_evidence) - widest.excess(mode.pose),
+                surroundings=before.surroundings,
             )
             for mode in found
         ]
@@ -502,7 +505,7 @@ class PreciseEstimator:
         return bool(best.log_weight <= unknown - log_places)
 
     def _is_search_due(self) -> bool:
-        """Whether to search now: at each key scan while not tracking, otherwise at growing intervals."""
+        """Whether to search now: at growing intervals, and while not tracking also at each key scan."""
         if not self._is_tracked() and self._is_key_scan_due():
             return True
         return self._scans_since_search >= self._search_interval

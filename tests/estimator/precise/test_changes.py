@@ -20,6 +20,8 @@ from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepar
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.global_seeds import Seeds, thin_places
 from services.estimator.precise.hypotheses import NEAR_HEADING_RAD, NEAR_POSITION_M, probability_of_being_near
+from services.estimator.precise.motion_model import MotionCandidate
+from services.estimator.precise.precision import Precision
 from services.estimator.shared.generative_models import Expected, RayCaster
 
 BEAMS, RATE = 271, 15.0
@@ -139,6 +141,37 @@ def test_slow_robot_in_the_wrong_map():
     made = prepare_factory(EstimatorOptions(trial.map_world, "precise", "exact"))(ScannerGeometry.of(trial.scanner))
     found = [made.update(observation) for observation in trial.observations]
     assert max(posterior.probability for posterior in found) < 1e-3
+
+
+def test_a_later_search_keeps_the_evidence():
+    """Even if no key scan has shown the map's errors yet, as long as the state was not `tracking`."""
+    made, scene = estimator(OFFICE)
+    made._map_cell = 0.05
+    x = np.linspace(3.0, 5.0, 30)
+    path = np.column_stack([x, np.full(len(x), CORRIDOR_Y), np.zeros(len(x))])
+    made.restart(path[0], CLOSE)
+    drive(made, scene, path[:-1])
+    made._precision = Precision.before_first_scan(0.05)
+    before = len(made._local_map.scans)
+    assert before > 4
+    made.track(scene.observe(scene.clean(path[-1:])[0], len(path) / RATE))
+    made.search()
+    assert len(made._local_map.scans) >= before
+
+
+def test_alternatives_are_in_the_same_surroundings():
+    """An alternative to the best match is no more probable because the hypothesis was in a room that the map lacks."""
+    made, scene = estimator(OFFICE)
+    made.restart(np.array([3.0, CORRIDOR_Y, 0.0]), CLOSE)
+    drive(made, scene, [[3.0, CORRIDOR_Y, 0.0]])
+    view = made._scan[0]
+    (before,) = made.modes
+    unmapped = np.array([0.0, 0.0, 1.0])
+    made.modes = [replace(before, noise_covariance=0.1 * np.eye(3), surroundings=unmapped)]
+    motion = MotionCandidate(before.pose, 0.1 * np.eye(3), 1.0)
+    found = made._find_alternatives(view, before, [motion], motion)
+    assert found
+    assert all(np.array_equal(mode.surroundings, unmapped) for mode in found)
 
 
 @pytest.fixture(scope="module")
