@@ -113,9 +113,18 @@ class Navigator:
         self._exploration_request = request
         self._begin_exploration()
 
+    @property
+    def _explores(self) -> bool:
+        """Whether an exploration decides where the robot drives, or begins as soon as the robot is localised."""
+        if self.explorer is not None and self.explorer.sets_goals:
+            return True
+        return self._exploration_request is not None and self._map is not None
+
     def _begin_exploration(self) -> None:
-        """Begins the requested exploration when there is a map and a pose in it."""
-        if self._exploration_request is not None and self._map is not None and self._pose is not None:
+        """Begins the requested exploration when there is a map and the robot is localised in it."""
+        if self._exploration_request is None or not self._tracking:
+            return
+        if self._map is not None and self._pose is not None:
             self.explorer = Explorer(self._exploration_request.seq, self._pose, self._map)
             self._exploration_request = None
 
@@ -138,8 +147,10 @@ class Navigator:
         explorer = self.explorer
         if explorer is None or not explorer.tracking or self.goal_state.phase is Phase.UNLOCALISED:
             return None  # the robot first has to be localised
-        due, explorer.viewpoint_due = explorer.viewpoint_due, False
-        if not due or not explorer.sets_goals or self._scan is None:
+        if self._scan is None or not explorer.viewpoint_due:
+            return None
+        explorer.viewpoint_due = False
+        if not explorer.sets_goals:
             return None
         from services.controller.policies.exploration import FieldOfView  # slow: numba
 
@@ -209,19 +220,20 @@ class Navigator:
             self._choose_destination(goal)
 
     def _refusal(self, goal: Goal) -> str | None:
-        def of_place(place: Array) -> str | None:
+        def refusal_at(place: Array) -> str | None:
             if self.world is not None and self.world.floors and self._present_floor() != self.world.floor_at(place):
-                return wall_refusal(self.world, place, self.robot.radius)  # paths can be checked only on that floor
+                # The policy can check paths only on the robot's floor.
+                return wall_refusal(self.world, place, self.robot.radius)
             return self.policy.refusal(place)
 
         if self._docking is None:
             place = goal.pose.array()[:2]
             # A goal at which the robot stands already is never refused, whatever the map says about walls.
             at_goal = self._pose is not None and np.hypot(*(self._pose[:2] - place)) <= goal.tolerance
-            return None if at_goal else of_place(place)
+            return None if at_goal else refusal_at(place)
         if (reason := self._docking.refusal()) is not None:
             return reason
-        reasons = [of_place(point) for point in self._docking.line()]
+        reasons = [refusal_at(point) for point in self._docking.line()]
         return next((f"the line to the goal is not free: {reason}" for reason in reasons if reason is not None), None)
 
     @property
@@ -262,7 +274,7 @@ class Navigator:
         desired = np.zeros(3)
         if goal is not None and distance is not None and self.goal_state.active:
             desired = self._goal_velocity(belief, pose, goal, distance)
-        elif self.explorer is not None and self.explorer.sets_goals and not self.explorer.tracking:
+        elif not self._tracking and self._explores:
             desired = self._localising_velocity(belief)
         command, limited_by_scan = self._command.limit(belief.stamp_ns, desired, self._scan_points)
         moving = is_moving(self._command.velocity)
@@ -331,7 +343,8 @@ class Navigator:
         """The status with the progress of the exploration, if there is one."""
         if self._exploration_request is not None:
             progress = Exploration(phase="exploring", seq=self._exploration_request.seq, area=0.0, path=0.0)
-            reason = "waiting for the mapper's first map"
+            missing = "for the mapper's first map" if self._map is None else "until the robot is localised in the map"
+            reason = f"waiting {missing}"
             return status.model_copy(update={"exploration": progress, "state": "exploring", "reason": reason})
         return status if self.explorer is None else self.explorer.add_progress(status)
 

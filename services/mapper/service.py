@@ -28,7 +28,7 @@ from services.mapper.slam.elements import elements_of_scan
 from services.mapper.slam.front_end import ScanPose
 from services.mapper.slam.mapper import Mapper, MapSnapshot
 
-MAX_LATE_NS = 1_000_000_000  # a scan that is earlier than the last one by less is left out; by more, time went back
+MAX_LATE_NS = 1_000_000_000  # a scan that is earlier than the last one by less is ignored; by more, the clock was reset
 UPDATE_PERIOD_NS = 1_000_000_000  # between the beginnings of two updates of the map, which leaves time for the scans
 REPEAT_PERIOD_NS = 5_000_000_000  # an unchanged map is published again after this time, for later subscribers
 
@@ -36,8 +36,8 @@ REPEAT_PERIOD_NS = 5_000_000_000  # an unchanged map is published again after th
 class MapperService(Service):
     """Publishes a belief for each scan, and the map whenever it has grown.
 
-    Loop closing and the map take seconds in a large building. They run in a thread, one update at a time; scans that
-    are dropped meanwhile are counted in the health message.
+    Loop closing and drawing the map take seconds in a large building, so they run in a second thread, one update at a
+    time. Scans for which there is no time meanwhile are dropped, and counted in the health message.
     """
 
     name: ClassVar[str] = "mapper"
@@ -111,7 +111,7 @@ class MapperService(Service):
         if self.mapper is None or restarted or not np.allclose(mount, self.mapper.laser.mount, atol=1e-4):
             if self.mapper is not None:
                 self.log.warning("time went back or the scanner's mount changed: mapping starts again")
-                self._finish_update()
+                self._update = None  # its result belongs to the old map
             self.mapper = Mapper(Laser(scan.angles(), mount, scan.range_max, scan.time_increment), self.settings.cell)
             self._update_ns = self._published_ns = scan.stamp_ns - UPDATE_PERIOD_NS
         return self.mapper

@@ -161,6 +161,35 @@ def test_kidnapped_without_a_viewpoint(before_the_first):
     assert robot.step().goal.x == 5
 
 
+def test_exploration_that_is_requested_after_a_kidnapping():
+    """The robot first localises itself; it will return to where it was then, not to where it was last localised."""
+    robot = PerfectRobot()
+    robot.pose = np.array([6.0, 1.5, 0.0])
+    robot.step(state="lost")
+    robot.navigator.on_goal(goal(0, 0, explore=True, seq=5))
+    for _ in range(5 * SCANS_PER_S):
+        status = robot.step(state="lost")
+    assert status.reason == "waiting until the robot is localised in the map"
+    assert np.hypot(*(robot.pose[:2] - (6.0, 1.5))) > 0.2
+    localised = robot.pose
+    robot.step()
+    robot.explore((5.0, 2.5))
+    robot.until(lambda _: robot.navigator.explorer.viewpoint_due)
+    robot.explore(None)
+    home = robot.until(lambda status: status.goal is not None).goal
+    assert (home.x, home.y) == pytest.approx(localised[:2], abs=0.05)
+
+
+def test_a_choice_waits_for_the_first_scan():
+    navigator = Navigator(Robot(), chosen_policy=GeodesicPolicy(Robot(), None))
+    navigator.on_map(map_with(START))
+    navigator.on_goal(goal(0, 0, explore=True, seq=5))
+    navigator.step(belief(0, START))
+    assert navigator.take_exploration_state() is None
+    navigator.on_scan(scan(PERIOD_NS, START, HALL))
+    assert navigator.take_exploration_state() is not None
+
+
 def test_a_choice_is_repeated_if_the_robot_was_kidnapped_meanwhile():
     robot = exploring_robot()
     exploration_state = robot.navigator.take_exploration_state()

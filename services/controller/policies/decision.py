@@ -55,7 +55,7 @@ class Policy(Protocol):
         """Computes what depends on the scanner; called with each scan, before its belief."""
 
     def observe(self, scan: Scan | None, belief: Belief) -> None:
-        """Processes a belief and the scan from which it was computed, or None if that is no longer the latest scan."""
+        """Processes a belief and the scan from which it was computed; None if that has not come, or is too old."""
 
     def decide(self, belief: Belief, velocity: Array, motion_until_effect: Array) -> Decision:
         """Chooses a velocity towards the goal when the pose is known.
