@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from services.estimator.precise.surface_evidence import SurfaceEvidence
     from services.estimator.shared.generative_models import Expected, GenerativeModel
 
-START_COVARIANCE = np.diag([0.25, 0.25, 0.09])  # of a pose given without one
+START_COVARIANCE = np.diag([0.25, 0.25, 0.09])  # m², m², rad², of a start that is given without one
 MAX_SEARCH_INTERVAL = 150  # scans between two searches without success; the interval doubles from 1
 # Probability (a guess) that a match with the local map is wrong. The match is rejected if the scan is less probable
 # than this at its pose in the map, relative to the pose that fits the map best.
@@ -75,6 +75,7 @@ EXPLAINED_BY_CHANCE = 0.1
 UNKNOWN_SIGMA_M = 100.0  # published where the map is unknown
 # A less probable number of changes (a guess) may be due to a kidnapping, so a search is due soon.
 SUDDEN_CHANGE_PROBABILITY = 0.01
+MIN_GAIN = 1.0  # nats, by which a scan must be more probable at a place of the map than at an unknown one (a guess)
 TARGET_BEAMS = 2000  # a scan with at least twice as many is thinned, because the time of a search grows with the beams
 
 
@@ -130,9 +131,10 @@ class PreciseEstimator:
         self.restart()
 
     def restart(self, pose: Array | None = None, covariance: Array | None = None) -> None:
-        """Starts from ``pose`` within ``covariance`` (default 0.5 m, 0.5 m, 0.3 rad), or from an unknown pose.
+        """Starts from ``pose`` with ``covariance`` (3, 3), or from an unknown pose.
 
-        A ``pose`` (2,) is a position with an unknown heading.
+        The default covariance is that of standard deviations of 0.5 m, 0.5 m and 0.3 rad. A ``pose`` (2,) is a position
+        with an unknown heading.
         """
         self.modes: list[Mode] = []  # the hypotheses, best first
         self._start: tuple[Array, Array] | None = None  # pose and covariance, until the first search
@@ -158,7 +160,7 @@ class PreciseEstimator:
         self._log_change = 0.0  # nats, log probability of the changes since the last scan
 
     def use_model(self, model: GenerativeModel, seeds: Seeds) -> None:
-        """Replaces the model by one learned from real scans in the same frame, between two scans. The belief stays."""
+        """Replaces the model by one learned from real scans in the same frame; the belief stays."""
         self.model, self.seeds, self._map_cell = model, seeds, 0.0
         self._precision.forget_map()
 
@@ -179,7 +181,7 @@ class PreciseEstimator:
         # Optimisation
         match = self._match_map(view, motions, period, with_odometry=odom is not None)
         # Local map
-        if match.explained[0] < self.settings.min_explained_share or len(match.unobserved[0]):
+        if match.explained[0] < self.settings.min_explained_fraction or len(match.unobserved[0]):
             predicted = expected_motion(motions[0]) if odom is not None else motions[0][-1]
             match = self._match_local_map(
                 match, self._predict_local_motion(period, odom, observation.command), predicted.covariance
@@ -313,11 +315,11 @@ class PreciseEstimator:
         return ScanMatch(view, motions, poses, evidence)
 
     def _match_local_map(self, match: ScanMatch, motions: list[MotionCandidate], prior: Array) -> ScanMatch:
-        """Matches the scan to the map again, near the motion that scan matching to the local map gives.
+        """Matches the scan to the local map, and from the pose that this gives to the map again.
 
         ``motions`` are predicted in the local frame, so that an error of the pose in the map does not bias them; the
-        pose that fits the map is only a further start; ``prior`` (3, 3) is the covariance of the predicted pose in map.
-        Returns ``match`` unchanged if the local map gives no motion, or if the scan fits the map far better there.
+        pose of ``match`` is one more start there. ``prior`` (3, 3) is the covariance of the predicted pose in map.
+        Returns ``match`` if the local map gives no motion, or if the scan fits the map far better at its pose.
         """
         view = match.view
         starts = np.array([*(each.mean for each in motions), self._local_map.to_local(match.poses[0])])
@@ -415,9 +417,9 @@ class PreciseEstimator:
         if local is None:
             local = self._local_map.to_local(modes[0].pose)
         poses = np.array([mode.pose for mode in modes])
-        states = view.surface_evidence(poses)
-        self._last_log_fit = _log_fit(view, states)
-        seen, appeared = self._local_map.find_seen_and_appeared(local, view, states.weights[0] > 0.5)
+        evidence = view.surface_evidence(poses)
+        self._last_log_fit = _log_fit(view, evidence)
+        seen, appeared = self._local_map.find_seen_and_appeared(local, view, evidence.weights[0] > 0.5)
         small = view.surfaces.small
         ignored = seen | appeared | small
 
@@ -437,7 +439,7 @@ class PreciseEstimator:
         modes = [
             replace(
                 mode,
-                explained=states.explained[k],
+                explained=evidence.explained[k],
                 scan_log_likelihood=log_likelihood[k] + log_change,
                 scan_surroundings=surroundings[k],
             )
@@ -448,7 +450,7 @@ class PreciseEstimator:
         log_kidnapping = max(mode.log_evidence for mode in self.modes) + float(
             np.log(self.settings.unknown_probability)
         )
-        self._unknown_place.allow_kidnapping(log_kidnapping, self.settings.unmapped_share)
+        self._unknown_place.allow_kidnapping(log_kidnapping, self.settings.off_map_probability)
         # Alternatives found for this scan come last in `modes`, and have no counterpart in `self.modes`.
         pairs = zip(self.modes, modes, strict=False)
         self._unknown_place.allow_mismatch(max(self._log_mismatch(before, after) for before, after in pairs))
@@ -524,7 +526,7 @@ class PreciseEstimator:
             found = search_near(views, *start, self.seeds, self.settings, self._rng)
             view = _most_probable(views, found[0].pose)
             unknown, all_changed = self.settings.unknown_probability, self.settings.all_changed_probability
-            self._start_with(view, found, unknown, unknown * self.settings.unmapped_share, all_changed)
+            self._start_with(view, found, unknown, unknown * self.settings.off_map_probability, all_changed)
             if not self._may_be_elsewhere():
                 return view
         found = self._search_everywhere(views)
@@ -534,7 +536,7 @@ class PreciseEstimator:
             view = _most_probable(views, self.modes[0].pose)
             self._add_key_scan(view)
         else:
-            self._start_with(view, found, self.settings.unmapped_share, self.settings.unmapped_share)
+            self._start_with(view, found, self.settings.off_map_probability, self.settings.off_map_probability)
         return view
 
     def _search_with_map_error(self, view: View, start: tuple[Array, Array] | None) -> View:
@@ -554,14 +556,14 @@ class PreciseEstimator:
         return self._search_for_hypotheses([view])
 
     def _search_everywhere(self, views: list[View]) -> list[Mode]:
-        """The hypotheses in the whole map at which the scan is more probable than at an unknown place; at least one."""
+        """The hypotheses in the whole map at which the scan is more probable than at an unknown place, or the best."""
         if self._precision.scans:  # the map's errors were learned in one room, but the robot may be in another
             elsewhere = self._precision.map_error_elsewhere
             views = [replace(view, map_error=max(view.map_error, elsewhere)) for view in views]
         found, view = search_everywhere(views, self.seeds, self.settings), views[0]
         small = view.surfaces.small
         log_at_unknown_place = _log_reference(view, small) + _log_unmapped_surfaces(view, small)
-        return [mode for mode in found if mode.scan_log_likelihood > log_at_unknown_place + 1] or found[:1]
+        return [mode for mode in found if mode.scan_log_likelihood > log_at_unknown_place + MIN_GAIN] or found[:1]
 
     def _start_with(
         self, view: View, found: list[Mode], unknown: float, off_map: float, all_changed: float = 0.0
@@ -731,9 +733,9 @@ def _log_reference(view: View, skip: npt.NDArray[np.bool_]) -> float:
     return float(view.surfaces.known_log_density[~skip].sum())
 
 
-def _log_fit(view: View, states: SurfaceEvidence) -> float:
-    """Log likelihood in nats, minus `_log_reference`, of all beams at the first of some poses in the map."""
-    return float(states.log_likelihood[0] - view.surfaces.known_log_density.sum())
+def _log_fit(view: View, evidence: SurfaceEvidence) -> float:
+    """Log likelihood in nats of all beams at the first pose of the ``evidence``, minus `_log_reference`."""
+    return float(evidence.log_likelihood[0] - view.surfaces.known_log_density.sum())
 
 
 def _log_unmapped_surfaces(view: View, skip: npt.NDArray[np.bool_]) -> float:

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
 NEAR_POSITION_M, NEAR_HEADING_RAD = 0.2, math.radians(5)  # a pose with a larger error is wrong
 SAME_POSITION_M, SAME_HEADING_RAD = 0.1, 0.1  # of hypotheses nearer to one another, the best is kept
-# A scan observes a direction if it is this much less probable, in nats, this far to both sides of the pose. Within the
-# map's error, the pose fits alike everywhere, so twice its standard deviation is added (guesses).
-MIN_FALL, AWAY_M, AWAY_MAP_DEVIATIONS = math.log(100), 0.1, 2.0
+# A scan observes a direction if its log likelihood is lower by this (nats) at two poses, one to either side at this
+# distance. Poses within the map's error fit equally well, so twice its standard deviation is added (guesses).
+MIN_LOG_LIKELIHOOD_DROP, PROBE_DISTANCE_M, PROBE_MAP_DEVIATIONS = math.log(100), 0.1, 2.0
 WEAK_PRIOR = np.eye(3)  # 1/m², 1/rad²: keeps the covariance finite along unobserved directions
 MIN_WEIGHT = 1e-9  # hypotheses with less weight are dropped
 # The surfaces that a key scan shows for the first time are as the map predicts (0), clutter (1), or in a room that the
@@ -46,7 +46,7 @@ class Mode:
     curvature: Array  # (3, 3) Gauss-Newton Hessian of accuracy
     explained: float = 0.0  # fraction of the last scan's beams that end at surfaces of the map
     log_evidence: float = 0.0  # nats, of the key scans and the prior; unnormalised
-    # nats, of the present scan; relative to that of known surfaces once the estimator has adopted the hypothesis
+    # nats, of the present scan; absolute in the result of a search, in the estimator minus `_log_reference`
     scan_log_likelihood: float = 0.0
     surroundings: Array = field(default_factory=lambda: FIRST_SURROUNDINGS)  # (3,) probabilities at the last key scan
     scan_surroundings: Array = field(default_factory=lambda: FIRST_SURROUNDINGS)  # (3,) at the present scan
@@ -79,9 +79,9 @@ class UnknownPlace:
         """Starts with the ``probability`` that the robot is at no hypothesis, ``off_map`` that it is off the map."""
         self.log_evidence, self.log_off_map = float(np.log(probability)), float(np.log(off_map))
 
-    def allow_kidnapping(self, log_probability: float, unmapped: float) -> None:
-        """Allows for a kidnapping; with probability ``unmapped`` it was to a place that is not on the map."""
-        self.log_off_map = max(self.log_off_map, log_probability + float(np.log(unmapped)))
+    def allow_kidnapping(self, log_probability: float, off_map: float) -> None:
+        """Allows for a kidnapping; with probability ``off_map`` it was to a place that is not on the map."""
+        self.log_off_map = max(self.log_off_map, log_probability + float(np.log(off_map)))
         self.log_evidence = max(self.log_evidence, log_probability)
 
     def allow_mismatch(self, log_probability: float) -> None:
@@ -121,11 +121,11 @@ def unobserved_directions(view: View, poses: Array, curvatures: Array) -> list[A
 def _are_observed(view: View, poses: Array, curvatures: Array, directions: Array) -> npt.NDArray[np.bool_]:
     """Mask (N,) of the poses whose position along ``directions`` (N, 2) a scan shows, with the best heading there."""
     turns = -np.einsum("ni,ni->n", curvatures[:, 2, :2], directions) / np.maximum(curvatures[:, 2, 2], 1e-12)
-    away_m = AWAY_M + AWAY_MAP_DEVIATIONS * view.map_error
-    steps = away_m * np.column_stack([directions, turns])
+    distance = PROBE_DISTANCE_M + PROBE_MAP_DEVIATIONS * view.map_error
+    steps = distance * np.column_stack([directions, turns])
     here = view.surface_evidence(poses).log_likelihood
     away = view.surface_evidence(np.concatenate([poses + steps, poses - steps])).log_likelihood
-    return np.asarray(here - away.reshape(2, -1).max(axis=0) > MIN_FALL)
+    return np.asarray(here - away.reshape(2, -1).max(axis=0) > MIN_LOG_LIKELIHOOD_DROP)
 
 
 def project_evidence(evidence: Evidence, k: int, unobserved: Array) -> None:

@@ -22,20 +22,18 @@ from services.estimator.precise.scan_surfaces import MIN_BEAMS
 from services.estimator.precise.surface_points import MIN_POINTS, Match, SurfacePoints, place_points
 
 MAX_SCANS = 12  # in the local map
-MIN_DISTANCE_M, MIN_TURN_RAD = 0.25, 0.35  # a key scan is taken after a motion of either size
-# A point is on a surface seen before if it is this near to a point of the local map, since neighbouring beams are so
-# far apart on a distant surface, ...
-SEEN_RADIUS_M = 0.15
-# ... and this near to the line through that point, if there are enough neighbours for a line. Three standard deviations
-# of the noise are added in quadrature. A wider tolerance takes much of another room for this one.
-SEEN_ACROSS_M = 0.05
+KEY_DISTANCE_M, KEY_TURN_RAD = 0.25, 0.35  # a key scan is taken after a motion of either size
+# A point was seen before if it is within this radius of a point of the local map (neighbouring beams are so far apart
+# on a distant surface), and this near to the line through that point and its neighbours, if there are enough. Three
+# standard deviations of the noise are added to the latter in quadrature. More takes much of another room for this one.
+SEEN_RADIUS_M, SEEN_ACROSS_M = 0.15, 0.05
 MAX_SQUARED_DISTANCE = 4.0  # squared standard deviations of the result from the prior
-CHANGE_MEMORY_S = 30.0  # after which a change of the surroundings counts by 1 / e (a guess)
+CHANGE_MEMORY_S = 30.0  # time constant with which changes of the surroundings are forgotten (a guess)
 PASSED_M = 0.3  # a beam that is longer by this than the distance to a surface has passed through it
 MIN_MATCHED_FRACTION = 0.5  # of a scan's points, else there is no match
 CLEAR_MATCHED_FRACTION = 0.8  # if fewer match, matching is repeated from `EXTRA_HEADINGS_RAD`
 EXTRA_HEADINGS_RAD = np.array([-0.3, -0.15, 0.15, 0.3])
-DRIFT_PER_SCAN = np.array([0.02, 0.02, 0.005])  # m, m, rad: standard deviation that each key scan contributes
+KEY_SCAN_DEVIATION = np.array([0.02, 0.02, 0.005])  # m, m, rad: that each key scan adds to the local map's pose
 
 
 @dataclass(frozen=True)
@@ -103,7 +101,7 @@ class LocalMap:
 
     scans: deque[LocalMapScan] = field(default_factory=lambda: deque(maxlen=MAX_SCANS))
     frame: Array = field(default_factory=lambda: np.zeros(3))  # (3,) local frame in map
-    # (3, 3) of the pose in map at the last key scan, with the drift that this scan contributes
+    # (3, 3) of the pose in map at the last key scan, with the deviation that this scan adds
     covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
     _points: SurfacePoints | None = None
     _unmapped: cKDTree | None = None  # of the unmapped points of all scans
@@ -129,7 +127,7 @@ class LocalMap:
         """Adds a key scan, taken at ``pose`` (3,) in map with ``covariance`` (3, 3)."""
         self.scans.append(key)
         self.place(key.pose, pose)
-        self.covariance = covariance + np.diag(DRIFT_PER_SCAN**2)
+        self.covariance = covariance + np.diag(KEY_SCAN_DEVIATION**2)
         self._points = self._unmapped = None
 
     def find_seen_and_appeared(
@@ -137,12 +135,12 @@ class LocalMap:
     ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
         """Masks (B,) of two kinds of beams of a scan at ``local`` (3,).
 
-        - Seen before: they end at surfaces of the key scans. Beams without return also count as seen once there are key
-          scans. A beam that does not end at a surface of the map (``mapped`` (B,) is false) is not seen at one that was
-          known to be in the map: something else stands there now, maybe in another room. Only key scans in state
-          `tracking` tell this. Otherwise the best hypothesis may change with each search, and the same surfaces would
-          be new evidence each time.
-        - Appeared: they end where a key scan saw free space, so the surface came since then, wherever the robot is.
+        - Seen before: the beam ends at a surface of the key scans. Beams without return count as seen once there are
+          key scans. Where that surface is one of the map, but the beam does not end at a surface of the map (``mapped``
+          (B,) is false), something else stands there now, so the beam is new evidence. Only key scans in state
+          `tracking` are trusted to know which of their surfaces are in the map. In other states the best hypothesis may
+          change with each search, and the same surfaces would count again.
+        - Appeared: the beam ends where a key scan saw free space. The surface is new, wherever the robot is.
         """
         seen, appeared = np.zeros(len(view.ranges), np.bool_), np.zeros(len(view.ranges), np.bool_)
         if not any(len(each.view.points) for each in self.scans):
@@ -163,14 +161,15 @@ class LocalMap:
     def _in_free_space(self, points: Array) -> npt.NDArray[np.bool_]:
         """Mask (K,) of local points (K, 2) in m that a beam of a key scan passed."""
         free = np.zeros(len(points), np.bool_)
-        for key in self.scans if len(points) else ():
+        for key in self.scans:
             free |= _passed(key, points, SEEN_RADIUS_M)
         return free
 
     def match(self, starts: Array, view: View, prior: MotionCandidate) -> Match | None:
         """Returns the match of a scan with the key scans; ``starts`` (N, 3) and ``prior`` are in the local frame.
 
-        Returns None if less than half of its points match, or if they have almost no information along some direction.
+        Returns None if there are no key scans, if the scan has too few points, or fewer than half of them match, if the
+        result contradicts ``prior``, or if the points have almost no information along some direction.
         """
         if not self.scans or len(view.points) < MIN_POINTS:
             return None
@@ -186,7 +185,7 @@ class LocalMap:
     def candidate(self, match: Match, prior: Array) -> MotionCandidate:
         """The pose in map that a match gives; ``prior`` (3, 3) is the pose's covariance in map before the match."""
         turn = se2.rotation(float(self.frame[2]))
-        # If the surfaces have moved instead of the robot, its motion since the last key scan is wrong.
+        # If the surfaces have moved instead of the robot, the error is all of its motion since the last key scan.
         motion = se2.difference(match.pose, self.scans[-1].pose)
         covariance = match.covariance(turn.T @ prior @ turn + np.outer(motion, motion))
         return MotionCandidate(se2.compose(self.frame, match.pose), self.covariance + turn @ covariance @ turn.T, 1.0)
@@ -231,7 +230,7 @@ def _count_passed(seen: LocalScan, by: LocalScan) -> int:
 def is_key_pose(last: Array, pose: Array) -> bool:
     """Whether ``pose`` (3,) is so far from that of the ``last`` (3,) key scan that a key scan is due there."""
     motion = se2.between(last, pose)
-    return bool(np.hypot(motion[0], motion[1]) >= MIN_DISTANCE_M or abs(motion[2]) >= MIN_TURN_RAD)
+    return bool(np.hypot(motion[0], motion[1]) >= KEY_DISTANCE_M or abs(motion[2]) >= KEY_TURN_RAD)
 
 
 def _passed(scan: LocalScan, points: Array, distance: float) -> npt.NDArray[np.bool_]:

@@ -20,11 +20,11 @@ class PreciseSettings:
     max_hypotheses: int = 8
 
     # Following
-    min_explained_share: float = 0.75  # if the map explains a smaller fraction of beams, recent scans give the motion
+    min_explained_fraction: float = 0.75  # if the map explains fewer of the beams, recent scans give the motion
 
     # Belief. The probabilities are guesses.
     unknown_probability: float = 1e-5  # least probability that the robot is at none of the hypotheses
-    unmapped_share: float = 0.01  # probability, if so, that it is at no place that a search of the map finds
+    off_map_probability: float = 0.01  # if so, of being at a place that no search of the map finds
     all_changed_probability: float = 1e-2  # that nothing around the start is as the map shows it
     tracking_probability: float = 0.999  # of the pose being within 0.2 m and 5 degrees of the truth
     # Weight of the second hypothesis above which the belief is ambiguous. It is at any weight if only other hypotheses

@@ -8,9 +8,10 @@ Each beam is in one of four states:
 - 3, removed: at the map's next surface, because the first one was removed.
 
 The states are a Markov chain along the scan, since neighbouring beams mostly meet the same surface. Where another
-surface starts in the scan or in the map, the states are independent: a removed chair says nothing about the wall beside
-it. The forward algorithm sums over all sequences of states, and the backward algorithm gives the probability of each
-state (Rabiner 1989, section III).
+surface starts in the scan, the state does not depend on the one before: a removed chair says nothing about the wall
+beside it. The same holds where another surface starts in the map, except for state 1, as a new object may stand in
+front of both. The forward algorithm sums over all sequences of states, and the backward algorithm gives the probability
+of each state (Rabiner 1989, section III).
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ NEAR_SIGMAS = 3.0
 # If the map's range at the next beam is farther from the straight continuation of the surface, another surface starts.
 BORDER_M = 0.1
 PLAUSIBLE_SIGMAS = 2.0  # a larger error makes it less probable that a beam ends at a surface of the map
-PLAUSIBLE_MEAN = 0.04  # nats, mean loss of Gaussian errors by that, which is added back
+MEAN_PENALTY = 0.04  # nats, of Gaussian errors due to that; it is added back, so that the penalty is 0 on average
 
 jit = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -49,7 +50,7 @@ jit = numba.njit(cache=True, nogil=True, error_model="numpy")
 class SurfaceEvidence:
     """Evidence of one scan at N poses."""
 
-    by_beam: Array  # (N, B) nats, log likelihood of each beam given those before it; 0 for a beam without a range
+    by_beam: Array  # (N, B) nats, log likelihood of each beam given those before it; 0 for a beam that was not measured
     explained: Array  # (N,) expected fraction of the beams that end at a surface of the map, the first or the next
     weights: Array  # (N, B) probability that a beam ends at the first surface of the map
 
@@ -127,7 +128,7 @@ def _log_density(
     square = error * error / variance
     if starts_surface:
         return math.log((1 - OUTLIER) * math.exp(-0.5 * square) / math.sqrt(2 * math.pi * variance) + OUTLIER / FAR_M)
-    excess = 0.5 * max(0.0, square - PLAUSIBLE_SIGMAS**2) - PLAUSIBLE_MEAN
+    excess = 0.5 * max(0.0, square - PLAUSIBLE_SIGMAS**2) - MEAN_PENALTY
     return float(max(known_log_density - excess * noise_variance / variance, math.log(OUTLIER / FAR_M)))
 
 
@@ -170,6 +171,7 @@ def _emit(
         error = r - surface
         near = error * error < NEAR_SIGMAS**2 * (noise_variance + model_variance)
         if near:
+            # Counted once per surface as far as the map's error is alike along it, as in `_log_density`.
             coincidence = math.log(COINCIDENCE) * noise_variance / (noise_variance + model_variance)
         log_densities[0] = _log_density(error, noise_variance, model_variance, known_log_density, starts_surface)
     if error < 0 or near:
@@ -217,12 +219,12 @@ def _forward_backward(
             if n > 0 and borders[k, used[n - 1] + 1 : b + 1].any():
                 # At the map's next surface the state is drawn again, but a new object may stand in front of both.
                 keep[n, 0], keep[n, 2], keep[n, 3] = 0.0, 0.0, 0.0
-            at, surface = _nearest_surface(ranges[b], expected[k], b, edge_tolerance[b])
+            map_beam, surface = _nearest_surface(ranges[b], expected[k], b, edge_tolerance[b])
             _emit(
                 ranges[b],
                 surface,
-                behind[k, at],
-                scale[k, at],
+                behind[k, map_beam],
+                scale[k, map_beam],
                 sigma,
                 relative,
                 range_max,
@@ -244,14 +246,15 @@ def _forward_backward(
 
 
 @jit
-def _nearest_surface(r: float, expected: Array, b: int, reach: int) -> tuple[int, float]:
-    """The beam whose surface in the map is nearest to r (m) in the direction of beam b, and its range there.
+def _nearest_surface(r: float, expected: Array, b: int, edge_tolerance: int) -> tuple[int, float]:
+    """The beam whose surface in the map, continued to beam b, is nearest to the range r (m), and its range at beam b.
 
-    An edge may be misplaced by ``reach`` beams, so the surfaces at the neighbouring beams are continued straight.
+    The edge of a surface may be misplaced by ``edge_tolerance`` beams, so the surfaces at as many neighbours are
+    continued straight.
     """
     beam, best = b, expected[b]
     for step in (-1, 1):
-        for away in range(1, reach + 1):
+        for away in range(1, edge_tolerance + 1):
             other = b + step * away
             if not 0 <= other + step < expected.shape[0]:
                 break

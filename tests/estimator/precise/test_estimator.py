@@ -172,7 +172,7 @@ def test_motion_along_a_hall_by_what_the_map_lacks():
     scene = Scene.of(World(name="hall", boundary=HALL.boundary, obstacles=columns), 360, 4)
     path = straight(27.0, 1.0, 0.0, 3.0, speed=0.8)
     found = drive(made, scene, path)
-    assert made.modes[0].explained > made.settings.min_explained_share
+    assert made.modes[0].explained > made.settings.min_explained_fraction
     error, stated = off(found[-1], path[-1]), np.sqrt(np.diag(found[-1].covariance))
     assert abs(error[0]) < min(0.2, 3 * stated[0])
 

@@ -16,7 +16,7 @@ from lab.accuracy.scenes import Scene
 from services.estimator.precise.gauss_newton import View
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.local_map import (
-    MIN_DISTANCE_M,
+    KEY_DISTANCE_M,
     ChangeRate,
     LocalMap,
     LocalMapScan,
@@ -125,7 +125,7 @@ def test_seen_surfaces():
     assert not appeared.any()
     made = local_map(scene, HERE)
     here = made.to_local(HERE)
-    assert made.is_key_scan_due(made.to_local(HERE + np.array([1.01 * MIN_DISTANCE_M, 0.0, 0.0])))
+    assert made.is_key_scan_due(made.to_local(HERE + np.array([1.01 * KEY_DISTANCE_M, 0.0, 0.0])))
     assert not made.is_key_scan_due(here)
     assert made.find_seen_and_appeared(here, view(scene, HERE), mapped)[0].all()
     seen, appeared = made.find_seen_and_appeared(here, changed(scan, slice(100, 150), 0.5), mapped)  # a person

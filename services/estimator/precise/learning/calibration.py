@@ -55,7 +55,7 @@ class Calibration:
     def settings(self) -> PreciseSettings:
         """Parameters of the estimator; the threshold of explained beams is relative to the usual share here."""
         return PreciseSettings(
-            min_explained_share=MIN_EXPLAINED_RATIO * self.usual,
+            min_explained_fraction=MIN_EXPLAINED_RATIO * self.usual,
             inflation=self.inflation,
             floor_position=self.floor_position,
             floor_heading=self.floor_heading,
