@@ -22,7 +22,7 @@ from services.estimator.precise.hypotheses import (
     update_mode,
     weigh,
 )
-from services.estimator.precise.likelihood import Likelihood
+from services.estimator.precise.likelihood import Evidence, Likelihood
 from services.estimator.precise.local_map import ChangeRate, LocalMap, LocalMapScan, LocalScan, count_changes
 from services.estimator.precise.motion_model import (
     MotionCandidate,
@@ -53,7 +53,6 @@ if TYPE_CHECKING:
 
     from common.geometry.se2 import Array
     from services.estimator.precise.global_seeds import Seeds
-    from services.estimator.precise.likelihood import Evidence
     from services.estimator.precise.surface_evidence import SurfaceEvidence
     from services.estimator.shared.generative_models import Expected, GenerativeModel
 
@@ -150,7 +149,7 @@ class PreciseEstimator:
         # The last scan
         self._stamp: float | None = None
         self._odom: Array | None = None
-        self._last_log_fit = 0.0  # nats, see `_log_fit`; at the best hypothesis before the scan was weighed
+        self._last_log_fit = 0.0  # nats, see `_log_fit`; at the best hypothesis
         self._last: LocalScan | None = None
 
         # The present scan
@@ -299,7 +298,7 @@ class PreciseEstimator:
     ) -> ScanMatch:
         """Matches the scan to the map near the predicted pose of each hypothesis.
 
-        If the map predicts it much worse than the last scan, searches a wider area.
+        If the map predicts it much worse than the last scan, searches a wider area for poses that fit it better.
         """
         widest = _prior_of([each[-1] for each in motions])
         predicted = np.array([expected_motion(each).mean for each in motions])
@@ -309,9 +308,10 @@ class PreciseEstimator:
             if not with_odometry:
                 extra_starts = reachable_poses(self.settings.motion, self.modes[0].pose, period, COARSE_SIGMA_M)
             wider_poses, wider_evidence = search_around(view, predicted, widest, extra_starts)
-            before, after = view.surface_evidence(np.stack([poses[0], wider_poses[0]])).log_likelihood
-            if after > before:
-                poses, evidence = wider_poses, wider_evidence
+            fit = view.surface_evidence(np.concatenate([poses, wider_poses])).log_likelihood.reshape(2, -1)
+            chosen = np.arange(len(poses)) + len(poses) * (fit[1] > fit[0])
+            poses = np.concatenate([poses, wider_poses])[chosen]
+            evidence = Evidence.joined([evidence, wider_evidence]).part(chosen)
         return ScanMatch(view, motions, poses, evidence)
 
     def _match_local_map(self, match: ScanMatch, motions: list[MotionCandidate], prior: Array) -> ScanMatch:
@@ -418,7 +418,6 @@ class PreciseEstimator:
             local = self._local_map.to_local(modes[0].pose)
         poses = np.array([mode.pose for mode in modes])
         evidence = view.surface_evidence(poses)
-        self._last_log_fit = _log_fit(view, evidence)
         seen, appeared = self._local_map.find_seen_and_appeared(local, view, evidence.weights[0] > 0.5)
         small = view.surfaces.small
         ignored = seen | appeared | small
@@ -640,6 +639,7 @@ class PreciseEstimator:
         if self._is_key_scan_due():
             self._add_key_scan(view)
         self._last = LocalScan(self._local_pose, view)
+        self._last_log_fit = _log_fit(view, view.surface_evidence(self.modes[0].pose[None]))
         same_beams = np.array_equal(view.angles, observation.angles)
         predicted = (
             self._predicted(view.expected(poses[0])) if same_beams else self.predict(poses[0][None], observation.angles)
