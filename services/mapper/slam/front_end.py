@@ -147,9 +147,13 @@ class FrontEnd:
         self.stamps.append(stamp)
         if len(self.stamps) == 1:
             return self._begin_piece(np.zeros(3), scan)
-        if self._odom is None and len(self._local.elements) < MIN_CORRESPONDENCES <= len(scan.elements):
-            return self._begin_piece(self.poses[-1], scan)  # so far there was nothing that a scan could match
         prior, covariance = self._prior(motion, deviation)
+        shows_first_surfaces = len(self._local.elements) < MIN_CORRESPONDENCES <= len(scan.elements)
+        if shows_first_surfaces and self.is_empty:
+            self._remove_key_scans()
+            return self._begin_piece(prior.mean, scan)
+        if shows_first_surfaces and self._odom is None:
+            return self._begin_piece(self.poses[-1], scan)  # so far there was nothing that a scan could match
         self._since_key = self._since_key + PRIOR_INFLATION**2 * covariance
         found = self._register(scan, prior, period)
         contradiction = self._contradiction(scan, found, prior)
@@ -165,7 +169,14 @@ class FrontEnd:
         self.unmatched += 1
         if used_odometry:
             self._velocity = None
-        return self._add_suspect(scan, prior.mean) if suspect else self._add_unmatched(scan, prior.mean)
+        if suspect:
+            return self._add_suspect(scan, prior.mean)
+        return self._add_unmatched(scan, prior.mean, is_key=shows_first_surfaces)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether the only key scan shows too little for others to match; the first that shows enough replaces it."""
+        return len(self.keys) == 1 and len(self._elements[0]) < MIN_CORRESPONDENCES
 
     def key_scans(self) -> KeyScanGraph:
         """Returns the key scans so far."""
@@ -274,12 +285,15 @@ class FrontEnd:
             self._add_linked_key(scan, found.information)
         return scan_pose
 
-    def _add_unmatched(self, scan: _Scan, pose: Array) -> ScanPose:
-        """Adds a scan of which too little matches, at the pose that the motion model predicts."""
+    def _add_unmatched(self, scan: _Scan, pose: Array, *, is_key: bool) -> ScanPose:
+        """Adds a scan of which too little matches, at the pose that the motion model predicts.
+
+        It is a key scan if ``is_key``, or if the robot has moved far enough.
+        """
         scan_pose = ScanPose(pose, self._since_key, matched=False, piece=self._key_pieces[-1])
         self._append(scan_pose)
         # A scan that sees something new is a key scan sooner, but not this one: its pose is only predicted.
-        if self._is_key_due(scan, familiar=True):
+        if is_key or self._is_key_due(scan, familiar=True):
             self._add_linked_key(scan, np.zeros((3, 3)))
         return scan_pose
 
@@ -301,6 +315,10 @@ class FrontEnd:
         self._append(scan_pose)
         self._add_key(scan)
         return scan_pose
+
+    def _remove_key_scans(self) -> None:
+        for each in (self.keys, self._key_pieces, self._elements, self._ranges, self._links):
+            each.clear()
 
     def _append(self, scan_pose: ScanPose) -> None:
         self.poses.append(scan_pose.pose)

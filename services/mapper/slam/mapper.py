@@ -57,7 +57,12 @@ class Mapper:
 
     @property
     def outdated(self) -> bool:
-        """Whether there are key scans that are not in the map yet."""
+        """Whether there are key scans that are not in the map yet.
+
+        A first key scan that shows too little does not count: another one will replace it.
+        """
+        if self._front_end.is_empty:
+            return False
         return self.map is None or len(self.map.poses) < len(self._front_end.keys)
 
     def key_scans(self) -> KeyScanGraph:

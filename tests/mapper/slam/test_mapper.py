@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from common.geometry import se2
+from common.geometry.occupancy_grid import FREE
 from common.geometry.world import load_world
 from lab.accuracy.scenes import Scene
 from services.mapper.slam.mapper import Mapper
@@ -63,3 +64,25 @@ def test_gap_in_the_scans():
     _, places = mapped(replace(drive, stamps=drive.stamps[kept], ranges=drive.ranges[kept]))
     error = se2.compose(truth[0], np.array([place.pose for place in places]))[:, :2] - truth[kept, :2]
     assert np.hypot(*error.T).max() < 0.1
+
+
+@pytest.mark.parametrize("with_odometry", [True, False])
+@pytest.mark.parametrize("first_step", [0.0, 0.2])
+def test_first_scans_without_return(with_odometry, first_step):
+    """A robot that stands is localised, and gets a map, as soon as its scanner sees something."""
+    x = 3 + first_step * np.minimum(np.arange(12), 5)  # m; while the scanner sees nothing, the robot may drive
+    truth = np.column_stack([x, np.full(12, 1.5), np.zeros(12)])
+    drive = driven(OFFICE, truth)
+    drive.ranges[:6] = np.inf
+    odom = truth if with_odometry else [None] * len(truth)
+    mapper, places = Mapper(drive.laser, 0.05), []
+    for stamp, ranges, pose in zip(drive.stamps, drive.ranges, odom, strict=True):
+        places.append(mapper.add(stamp, ranges, pose))
+        if mapper.outdated:
+            mapper.use(mapper.update(mapper.key_scans()))
+    assert all(place.matched for place in places[7:])
+    assert (mapper.map.grid.values == FREE).any()
+    assert mapper.trajectory()[1][-1] == pytest.approx(places[-1].pose)
+    if with_odometry:
+        error = se2.between(places[0].pose, places[-1].pose) - se2.between(truth[0], truth[-1])
+        assert np.abs(error).max() < 0.01
