@@ -13,7 +13,7 @@ from services.mapper.slam.front_end import KeyScanGraph
 from services.mapper.slam.joining import PieceJoiner, is_contradicted, largest_component
 from services.mapper.slam.loop_closure import MAX_SQUARED_DEVIATION, LoopClosure, find_closures
 from services.mapper.slam.pose_graph import LinkTable, PoseLink, Uncertainty, components, optimise
-from services.mapper.slam.segments import Segment, segments_of
+from services.mapper.slam.submaps import Submap, divide_into_submaps
 
 
 class BackEnd:
@@ -25,8 +25,8 @@ class BackEnd:
         self.poses = np.zeros((0, 3))
         self.closures: list[LoopClosure] = []
         self._unconfirmed: list[LoopClosure] = []  # found by a wide search, and not yet supported by another one
-        self._uncertainty: Uncertainty | None = None  # of the segments; computed again after a change
-        self._tried: set[tuple[int, int]] = set()  # pairs of segments that were matched, with or without success
+        self._uncertainty: Uncertainty | None = None  # of the submaps; computed again after a change
+        self._tried: set[tuple[int, int]] = set()  # pairs of submaps that were matched, with or without success
         self._joiner = PieceJoiner()
         self._cuts: set[int] = set()  # key scans whose link to the one before turned out to be wrong
 
@@ -46,16 +46,16 @@ class BackEnd:
         *,
         growing: bool = False,
     ) -> None:
-        """Matches pairs of segments whose relative position is known to within ``window`` m, each pair once.
+        """Matches pairs of submaps whose relative position is known to within ``window`` m, each pair once.
 
-        If the drive is still ``growing``, its last segment is left out until it is complete.
+        If the drive is still ``growing``, its last submap is left out until it is complete.
         """
-        segments = self._segments(scans, growing=growing)
+        submaps = self._submaps(scans, growing=growing)
         if self._uncertainty is None:
-            references = np.array([segment.reference for segment in segments], int)
+            references = np.array([submap.reference for submap in submaps], int)
             self._uncertainty = Uncertainty(self.poses, self._links(scans), references)
         found, self._unconfirmed = find_closures(
-            segments, self.poses, self._uncertainty, self._tried, self._unconfirmed, window, report
+            submaps, self.poses, self._uncertainty, self._tried, self._unconfirmed, window, report
         )
         self._add(found, scans)
 
@@ -63,12 +63,12 @@ class BackEnd:
         """Cuts off pieces that contradict the map, then tries to join one; returns whether one was joined."""
         if not scans.pieces.any():
             return False
-        segments = self._segments(scans, growing=growing)
-        self._separate_contradicted(scans, segments)
+        submaps = self._submaps(scans, growing=growing)
+        self._separate_contradicted(scans, submaps)
         component = self._components(scans)
         if not component.any():
             return False
-        found = self._joiner.find(segments, self.poses, component)
+        found = self._joiner.find(submaps, self.poses, component)
         if not found:
             return False
         self._move_later_component(found[0].link, component)
@@ -100,38 +100,40 @@ class BackEnd:
         self._drop_implausible()
         self.poses = optimise(self.poses, self._links(scans))
 
-    def _separate_contradicted(self, scans: KeyScanGraph, segments: list[Segment]) -> None:
+    def _separate_contradicted(self, scans: KeyScanGraph, submaps: list[Submap]) -> None:
         """Cuts the drive where a piece begins that contradicts the ones before: all links across are removed."""
-        for piece in range(1, segments[-1].piece + 1):
-            component = self._components(scans)[[each.reference for each in segments]]
-            before = [k for k, each in enumerate(segments) if each.piece < piece]
+        for piece in range(1, submaps[-1].piece + 1):
+            component = self._components(scans)[[each.reference for each in submaps]]
+            before = [k for k, each in enumerate(submaps) if each.piece < piece]
             if any(
                 each.piece == piece
                 and is_contradicted(
                     k,
                     self.poses[each.reference],
                     [other for other in before if component[other] == component[k]],
-                    segments,
+                    submaps,
                     self.poses,
                 )
-                for k, each in enumerate(segments)
+                for k, each in enumerate(submaps)
             ):
                 self._cut(len(before), int(np.searchsorted(scans.pieces, piece)), scans)
 
-    def _cut(self, segment: int, key: int, scans: KeyScanGraph) -> None:
-        """Removes all links across the beginning of a ``segment``, whose first key scan is number ``key``."""
+    def _cut(self, submap: int, key: int, scans: KeyScanGraph) -> None:
+        """Removes all links across the beginning of a ``submap``, whose first key scan is number ``key``."""
         self._cuts.add(key)
         self.closures, self._unconfirmed = (
-            [each for each in closures if (each.first < segment) == (each.second < segment)]
+            [each for each in closures if (each.first < submap) == (each.second < submap)]
             for closures in (self.closures, self._unconfirmed)
         )
-        self._tried = {pair for pair in self._tried if (pair[0] < segment) == (pair[1] < segment)}
+        self._tried = {pair for pair in self._tried if (pair[0] < submap) == (pair[1] < submap)}
         self._uncertainty = None
         self.poses = optimise(self.poses, self._links(scans))
 
-    def _segments(self, scans: KeyScanGraph, *, growing: bool) -> list[Segment]:
+    def _submaps(self, scans: KeyScanGraph, *, growing: bool) -> list[Submap]:
         laser, ranges = self.laser, np.array(scans.ranges)
-        return segments_of(self.poses, scans.pieces, scans.elements, ranges, laser.angles, laser.mount, growing=growing)
+        return divide_into_submaps(
+            self.poses, scans.pieces, scans.elements, ranges, laser.angles, laser.mount, growing=growing
+        )
 
     def _links(self, scans: KeyScanGraph) -> list[PoseLink]:
         return [

@@ -16,7 +16,7 @@ CELL_M = 0.15  # of the grid that is searched
 BLOCK = 4  # cells, edge length of a block of shifts that are bounded together
 SECTORS = 8  # of the directions of normals, one bit of a cell each
 TURN_STEP = 0.03  # rad
-MAX_ELEMENTS = 200  # of the moved group that are used
+MAX_ELEMENTS = 200  # of the source that are used
 PEAKS = 4  # poses returned
 PEAK_DISTANCE_M, PEAK_TURN = 0.5, 0.15  # between them
 FIRST_BLOCKS = 512  # blocks that are scored first; then twice as many, and so on
@@ -24,18 +24,18 @@ MAX_RANKED = 2000  # poses among which peaks are looked for
 
 
 def correlative_search(
-    target: Elements, moved: Elements, around: Array, window: Array, turn_step: float = TURN_STEP
+    target: Elements, source: Elements, around: Array, window: Array, turn_step: float = TURN_STEP
 ) -> Array:
-    """The best poses (K, 3) of ``moved`` in the frame of ``target``, at most ``window`` (3,) from ``around`` (3,).
+    """The best poses (K, 3) of ``source`` in the frame of ``target``, at most ``window`` (3,) from ``around`` (3,).
 
-    A pose's score is the number of elements of ``moved`` in or beside cells with similar elements of ``target``; those
+    A pose's score is the number of elements of ``source`` in or beside cells with similar elements of ``target``; those
     with a score of 0 are left out. Among equal scores, a pose near ``around`` is better; a turn by ``turn_step`` counts
     as a cell. Branch and bound (Hess et al., ICRA 2016): blocks of shifts whose bound is too low are not scored.
     """
-    if not len(moved):
+    if not len(source):
         return np.zeros((0, 3))
     window = np.minimum(window, [np.inf, np.inf, np.pi])
-    sample = moved.part(np.linspace(0, len(moved) - 1, min(len(moved), MAX_ELEMENTS)).astype(int))
+    sample = source.part(np.linspace(0, len(source) - 1, min(len(source), MAX_ELEMENTS)).astype(int))
     reach = np.hypot(*sample.points.T).max() + np.hypot(*window[:2])
     low = around[:2] - reach - 2 * CELL_M
     grid = _rasterise(target, low, int(2 * (reach + 2 * CELL_M) / CELL_M) + 2)

@@ -35,7 +35,7 @@ from services.mapper.slam.registration import (
     Surface,
     register,
 )
-from services.mapper.slam.segments import PosedScans, Segment, compare_segments
+from services.mapper.slam.submaps import PosedScans, Submap, compare_submaps
 
 KEY_DISTANCE_M, KEY_TURN_RAD = 0.4, 0.5  # a key scan is taken after a motion of either size since the last one
 KEY_RANGE_SHARE = 0.1  # in large rooms, the distance is this share of the median range instead
@@ -128,7 +128,7 @@ class FrontEnd:
         self._links: list[PoseLink] = []
         # The local map: the surfaces of the last key scans, and the scans themselves, to check what they saw through.
         self._surface: Surface
-        self._local: Segment
+        self._local: Submap
         self._first_local = 0  # number of the first key scan with a link to those that follow
         # The motion.
         self._odom: Array | None = None  # (3,) of the last scan
@@ -258,7 +258,7 @@ class FrontEnd:
             return 0.0
         scans = PosedScans(self.laser.mount[None], self._evenly_spaced(scan)[None], self.laser.angles)
         pose = prior.mean if found is None else found.pose
-        counted = compare_segments(self._local, self._surface, Segment(0, 0, scan.elements, scans), pose)
+        counted = compare_submaps(self._local, self._surface, Submap(0, 0, scan.elements, scans), pose)
         return counted.contradicting / (counted.agreeing + PRIOR_AGREEMENT + counted.contradicting)
 
     def _exceeds_recent_contradiction(self, contradiction: float) -> bool:
@@ -351,7 +351,7 @@ class FrontEnd:
         scans = PosedScans(
             se2.compose(poses, self.laser.mount), np.array([self._ranges[k] for k in recent]), self.laser.angles
         )
-        self._surface, self._local = Surface(local), Segment(0, 0, local, scans)
+        self._surface, self._local = Surface(local), Submap(0, 0, local, scans)
 
     def _evenly_spaced(self, scan: _Scan) -> Array:
         """The ranges (B,) of a scan at the laser's own angles."""

@@ -14,10 +14,10 @@ from services.mapper.slam.back_end import BackEnd
 from services.mapper.slam.drive import Laser
 from services.mapper.slam.front_end import FrontEnd, KeyScanGraph, ScanPose
 from services.mapper.slam.grid import grid_of_scans
-from services.mapper.slam.segments import KEY_SCANS_PER_SEGMENT
+from services.mapper.slam.submaps import KEY_SCANS_PER_SUBMAP
 from services.mapper.slam.trajectory import poses_of_all_scans
 
-WINDOWS_M = (1.0, 3.0, 10.0, 30.0)  # of the rounds of loop closing after each segment
+WINDOWS_M = (1.0, 3.0, 10.0, 30.0)  # of the rounds of loop closing after each submap
 
 
 @dataclass(frozen=True)
@@ -70,11 +70,11 @@ class Mapper:
         return self._front_end.key_scans()
 
     def update(self, scans: KeyScanGraph) -> MapSnapshot:
-        """The map of the key scans, after loop closing if they complete a segment."""
+        """The map of the key scans, after loop closing if they complete a submap."""
         back_end = self._back_end
-        segments_before = len(back_end.poses) // KEY_SCANS_PER_SEGMENT
+        submaps_before = len(back_end.poses) // KEY_SCANS_PER_SUBMAP
         back_end.extend(scans)
-        if len(back_end.poses) // KEY_SCANS_PER_SEGMENT > segments_before:
+        if len(back_end.poses) // KEY_SCANS_PER_SUBMAP > submaps_before:
             for window in WINDOWS_M:
                 back_end.close_loops(scans, window, growing=True)
             back_end.join_pieces(scans, growing=True)

@@ -7,7 +7,7 @@ import pytest
 
 from services.mapper.slam.elements import Elements, elements_of_scan
 from services.mapper.slam.registration import MATCHED_M, Surface
-from services.mapper.slam.segments import PosedScans
+from services.mapper.slam.submaps import PosedScans
 
 ANGLES = np.deg2rad(np.arange(-60.0, 61.0))
 

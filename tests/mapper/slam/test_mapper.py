@@ -13,7 +13,7 @@ from common.geometry.occupancy_grid import FREE
 from common.geometry.world import load_world
 from lab.accuracy.scenes import Scene
 from services.mapper.slam.mapper import Mapper
-from services.mapper.slam.segments import KEY_SCANS_PER_SEGMENT
+from services.mapper.slam.submaps import KEY_SCANS_PER_SUBMAP
 from services.mapper.slam.trajectory import build_trajectory
 from services.simulator.odometry import Odometer, OdometryNoise
 from tests.mapper.drives import driven
@@ -30,12 +30,12 @@ def odometry(truth):
 
 
 def mapped(drive):
-    """A mapper after a drive, updated after every segment, and the places of the scans when they came."""
+    """A mapper after a drive, updated after every submap, and the places of the scans when they came."""
     mapper, places = Mapper(drive.laser, 0.05), []
     for k, (stamp, ranges) in enumerate(zip(drive.stamps, drive.ranges, strict=True)):
         places.append(mapper.add(stamp, ranges, None if drive.odom is None else drive.odom[k]))
         scans = mapper.key_scans()
-        if mapper.outdated and len(scans.poses) % KEY_SCANS_PER_SEGMENT == 0:
+        if mapper.outdated and len(scans.poses) % KEY_SCANS_PER_SUBMAP == 0:
             mapper.use(mapper.update(scans))
     mapper.use(mapper.update(mapper.key_scans()))
     return mapper, places

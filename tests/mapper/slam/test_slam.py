@@ -150,10 +150,10 @@ def test_search_finds_the_best_of_all_poses(seed):
         normals = np.column_stack([np.cos(yaw), np.sin(yaw)])
         return Elements(rng.uniform(-3, 3, (count, 2)), normals, np.full(count, 0.1))
 
-    target, moved = random_elements(60), random_elements(30)
+    target, source = random_elements(60), random_elements(30)
     around, window, turn_step = rng.normal(size=3), np.array([0.5, 0.8, 0.4]), 0.1
     cell = correlative.CELL_M
-    corner = around[:2] - np.hypot(*moved.points.T).max() - np.hypot(*window[:2]) - 2 * cell  # of cell (0, 0)
+    corner = around[:2] - np.hypot(*source.points.T).max() - np.hypot(*window[:2]) - 2 * cell  # of cell (0, 0)
 
     def cells_and_sectors(elements):
         angle = np.arctan2(*elements.normals.T[::-1])
@@ -162,14 +162,14 @@ def test_search_finds_the_best_of_all_poses(seed):
     target_cells, target_sectors = cells_and_sectors(target)
 
     def score(turn, shift):
-        cells, sectors = cells_and_sectors(moved.transformed(np.array([*around[:2], turn])))
+        cells, sectors = cells_and_sectors(source.transformed(np.array([*around[:2], turn])))
         near = (np.abs(cells[:, None] + shift - target_cells) <= 1).all(axis=-1)
         alike = np.isin((sectors[:, None] - target_sectors) % 8, [0, 1, 7])
         return int((near & alike).any(axis=1).sum())
 
     turns = around[2] + turn_step * np.arange(-4, 5)
     everywhere = [score(turn, (x, y)) for turn in turns for x in range(-4, 5) for y in range(-6, 7)]
-    found = correlative_search(target, moved, around, window, turn_step)
+    found = correlative_search(target, source, around, window, turn_step)
     scores = [score(pose[2], np.round((pose[:2] - around[:2]) / cell)) for pose in found]
     assert scores[0] == max(everywhere)
     assert scores == sorted(scores, reverse=True)

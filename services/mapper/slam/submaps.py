@@ -1,4 +1,4 @@
-"""Segments: a few successive key scans as one rigid submap, which shows more of the surroundings than one scan."""
+"""Submaps: a few successive key scans as one rigid group, which shows more of the surroundings than one scan."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from common.robot.scan_geometry import Sweep
 from services.mapper.slam.elements import Elements, concatenate
 from services.mapper.slam.registration import MATCHED_M, Surface
 
-KEY_SCANS_PER_SEGMENT = 8  # successive ones that form a segment
+KEY_SCANS_PER_SUBMAP = 8  # successive ones that form a submap
 PERSON_M, GAP_M = 0.7, 0.3  # size of a person, the largest moving object, and largest gap between its parts
 PASSED_M = 0.3  # behind an element, along its normal, from where a beam counts as having passed through it
 
@@ -45,7 +45,7 @@ class PosedScans:
 
 
 @dataclass(frozen=True)
-class Segment:
+class Submap:
     """Successive key scans, in the frame of the one in their middle, the reference."""
 
     reference: int  # number of the key scan
@@ -54,7 +54,7 @@ class Segment:
     scans: PosedScans  # the same key scans
 
 
-def segments_of(
+def divide_into_submaps(
     poses: Array,
     pieces: npt.NDArray[np.int_],
     elements: Sequence[Elements],
@@ -63,31 +63,31 @@ def segments_of(
     mount: Array,
     *,
     growing: bool = False,
-) -> list[Segment]:
-    """Divides key scans at ``poses`` (N, 3) of ``pieces`` (N,), with ``ranges`` (N, B), into segments.
+) -> list[Submap]:
+    """Divides key scans at ``poses`` (N, 3) of ``pieces`` (N,), with ``ranges`` (N, B), into submaps.
 
-    If the drive is still ``growing``, its last segment is left out until it is complete.
+    If the drive is still ``growing``, its last submap is left out until it is complete.
     """
     found, ends = [], np.append(np.flatnonzero(np.diff(pieces)) + 1, len(pieces))
     first = 0
     while first < len(poses):
-        end = min(first + KEY_SCANS_PER_SEGMENT, int(ends[np.searchsorted(ends, first, side="right")]))
-        if growing and end == len(poses) and end < first + KEY_SCANS_PER_SEGMENT:
+        end = min(first + KEY_SCANS_PER_SUBMAP, int(ends[np.searchsorted(ends, first, side="right")]))
+        if growing and end == len(poses) and end < first + KEY_SCANS_PER_SUBMAP:
             break
         keys = np.arange(first, end)
         reference = int(keys[len(keys) // 2])
         local = se2.between(poses[reference], poses[keys])
         placed = concatenate([elements[key].transformed(pose) for key, pose in zip(keys.tolist(), local, strict=True)])
         scans = PosedScans(se2.compose(local, mount), ranges[keys], angles)
-        found.append(Segment(reference, int(pieces[first]), placed, scans))
+        found.append(Submap(reference, int(pieces[first]), placed, scans))
         first = end
     return found
 
 
-def submap(segments: Sequence[Segment], middle: int, poses: Array) -> Segment:
-    """A segment and its neighbours in time, in its frame; ``poses`` (N, 3) are of all key scans."""
-    reference, piece = segments[middle].reference, segments[middle].piece
-    around = [each for each in segments[max(0, middle - 1) : middle + 2] if each.piece == piece]
+def merge_with_neighbours(submaps: Sequence[Submap], middle: int, poses: Array) -> Submap:
+    """Merges a submap with its neighbours in time, in its frame; ``poses`` (N, 3) are of all key scans."""
+    reference, piece = submaps[middle].reference, submaps[middle].piece
+    around = [each for each in submaps[max(0, middle - 1) : middle + 2] if each.piece == piece]
     offsets = [se2.between(poses[reference], poses[each.reference]) for each in around]
     scans = PosedScans(
         np.concatenate([se2.compose(off, each.scans.poses) for off, each in zip(offsets, around, strict=True)]),
@@ -95,14 +95,14 @@ def submap(segments: Sequence[Segment], middle: int, poses: Array) -> Segment:
         around[0].scans.angles,
     )
     placed = [each.elements.transformed(off) for off, each in zip(offsets, around, strict=True)]
-    return Segment(reference, piece, concatenate(placed), scans)
+    return Submap(reference, piece, concatenate(placed), scans)
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well two segments agree, in numbers of elements. Elements outside the other segment's view do not count."""
+    """How well two submaps agree, in numbers of elements. Elements outside the other submap's view do not count."""
 
-    matched: int  # elements of the second segment that match
+    matched: int  # elements of the second submap that match
     agreeing: int  # elements of both that match
     contradicting: int  # elements of both, of objects larger than a person, through which the other one saw
 
@@ -112,8 +112,8 @@ class Agreement:
         return self.agreeing / max(1, self.agreeing + self.contradicting)
 
 
-def compare_segments(first: Segment, surface: Surface, second: Segment, pose: Array) -> Agreement:
-    """Compares two segments, the second at ``pose`` (3,) in the first; ``surface`` has the elements of the first."""
+def compare_submaps(first: Submap, surface: Surface, second: Submap, pose: Array) -> Agreement:
+    """Compares two submaps, the second at ``pose`` (3,) in the first; ``surface`` has the elements of the first."""
     placed = second.elements.transformed(pose)
     second_matches = surface.correspondence_distances(placed) < MATCHED_M
     first_matches = Surface(placed).correspondence_distances(first.elements) < MATCHED_M
