@@ -39,18 +39,18 @@ from services.mapper.slam.submaps import PosedScans, Submap, compare_submaps
 
 KEY_DISTANCE_M, KEY_TURN_RAD = 0.4, 0.5  # a key scan is taken after a motion of either size since the last one
 KEY_RANGE_SHARE = 0.1  # in large rooms, the distance is this share of the median range instead
-# A scan of which a smaller share matches sees something new. It becomes a key scan after this share of the distance.
-FAMILIAR_SHARE, EARLY_KEY_SHARE = 0.7, 0.25
+# A scan of which a smaller fraction matches sees something new. It becomes a key scan after this part of the distance.
+FAMILIAR_FRACTION, EARLY_KEY_PROGRESS = 0.7, 0.25
 SEARCH_WINDOW = np.array([0.3, 0.3, 0.4])  # m, m, rad to either side of the prior's mean
 SEARCH_RANGE_M = 10.0  # farther elements take no part in the search
 LOCAL_SCANS = 12  # key scans in the local map
-MIN_MATCHED_SHARE = 0.2  # share of a scan's elements that must match the local map
+MIN_MATCHED_FRACTION = 0.2  # of a scan's elements that must match the local map
 # Largest share of contradicting elements, among those that agree with or contradict the local map, at a pose that may
 # be right. This many agreeing elements are added as a pseudo-count, so that a few contradictions prove nothing.
 MAX_CONTRADICTION, PRIOR_AGREEMENT = 0.22, 10
-# A scan is doubtful if its share of contradictions exceeds the first limit, and the recent maximum by the ratio. The
+# A scan begins a piece if its share of contradictions exceeds the first limit, and the recent maximum by the ratio. The
 # recent maximum decays with a time constant of this many scans.
-DOUBTFUL_CONTRADICTION, DOUBTFUL_RATIO, FADING_SCANS = 0.05, 1.5, 50
+UNUSUAL_CONTRADICTION, UNUSUAL_RATIO, FADING_SCANS = 0.05, 1.5, 50
 MAX_SUSPECT_SCANS = 10  # after this many suspect scans in a row, the last of them begins another piece
 MAX_SLIP = 6.0  # standard deviations of the motion; a scan that matches farther from the prior begins a piece
 CLOSE_TO_PRIOR = np.array([0.1, 0.1, 0.1])  # m, m, rad: after a suspect scan, a match farther away may be accidental
@@ -129,7 +129,7 @@ class FrontEnd:
         # The local map: the surfaces of the last key scans, and the scans themselves, to check what they saw through.
         self._surface: Surface
         self._local: Submap
-        self._first_local = 0  # number of the first key scan with a link to those that follow
+        self._first_local = 0  # first key scan that links connect to the latest one; the local map starts no earlier
         # The motion.
         self._odom: Array | None = None  # (3,) of the last scan
         self._velocity: Array | None = None  # (3,) base_link
@@ -163,9 +163,9 @@ class FrontEnd:
         confirmed = self._suspect_scans + 1 >= MAX_SUSPECT_SCANS and used_odometry and not _is_far(found, prior)
         if found is not None and (confirmed or not suspect):
             # In a suspect scan, the contradiction is not due to moving objects.
-            unusual = not suspect and self._exceeds_recent_contradiction(contradiction)
-            doubtful = suspect or unusual or prior.difference(found.pose)[1] > MAX_SLIP**2
-            return self._add_matched(scan, found, prior, deviation, period, doubtful=doubtful)
+            unusual = not suspect and self._update_recent_contradiction(contradiction)
+            begins_piece = suspect or unusual or prior.difference(found.pose)[1] > MAX_SLIP**2
+            return self._add_matched(scan, found, prior, deviation, period, begins_piece=begins_piece)
         self.unmatched += 1
         if used_odometry:
             self._velocity = None
@@ -228,7 +228,7 @@ class FrontEnd:
         """
         surface, elements = self._surface, scan.elements
         found = register(surface, elements, prior.mean, prior)
-        if found is not None and found.share > FAMILIAR_SHARE:
+        if found is not None and found.matched_fraction > FAMILIAR_FRACTION:
             return found
         last = self.poses[-1]
         starts = [last if self._velocity is None else se2.compose(last, self._velocity * period)]
@@ -237,7 +237,7 @@ class FrontEnd:
         others = [register(surface, elements, start, prior) for start in starts]
         matches = [each for each in (found, *others) if each is not None]
         best = min(matches, key=lambda each: each.cost, default=None)
-        return None if best is None or best.share < MIN_MATCHED_SHARE else best
+        return None if best is None or best.matched_fraction < MIN_MATCHED_FRACTION else best
 
     def _is_suspect(self, found: Registration | None, prior: PosePrior, known: list[Array], period: float) -> bool:
         """Whether a registration implies that the robot was kidnapped, or may match by chance.
@@ -248,40 +248,42 @@ class FrontEnd:
         pose = prior.mean if found is None else found.pose
         if all((np.abs(se2.between(each, pose)) > MAX_VELOCITY * period).any() for each in known):
             return True
-        if found is not None and found.share > FAMILIAR_SHARE:
+        if found is not None and found.matched_fraction > FAMILIAR_FRACTION:
             return False
         return self._suspect_scans > 0 and _is_far(found, prior)
 
     def _contradiction(self, scan: _Scan, found: Registration | None, prior: PosePrior) -> float:
         """Share of contradictions between a scan and the local map; 0 if most of the scan matches."""
-        if found is not None and found.share > FAMILIAR_SHARE:
+        if found is not None and found.matched_fraction > FAMILIAR_FRACTION:
             return 0.0
         scans = PosedScans(self.laser.mount[None], self._evenly_spaced(scan)[None], self.laser.angles)
         pose = prior.mean if found is None else found.pose
         counted = compare_submaps(self._local, self._surface, Submap(0, 0, scan.elements, scans), pose)
         return counted.contradicting / (counted.agreeing + PRIOR_AGREEMENT + counted.contradicting)
 
-    def _exceeds_recent_contradiction(self, contradiction: float) -> bool:
-        """Remembers a share of contradictions; returns whether it is more than moving objects caused recently."""
+    def _update_recent_contradiction(self, contradiction: float) -> bool:
+        """Updates the recent maximum.
+
+        Returns whether ``contradiction`` was clearly above it, that is, more than moving objects caused lately.
+        """
         before = self._recent_contradiction
         self._recent_contradiction = max(contradiction, before * (1 - 1 / FADING_SCANS))
-        return contradiction > max(DOUBTFUL_CONTRADICTION, DOUBTFUL_RATIO * before)
+        return contradiction > max(UNUSUAL_CONTRADICTION, UNUSUAL_RATIO * before)
 
     def _add_matched(
-        self, scan: _Scan, found: Registration, prior: PosePrior, deviation: Array, period: float, *, doubtful: bool
+        self, scan: _Scan, found: Registration, prior: PosePrior, deviation: Array, period: float, *, begins_piece: bool
     ) -> ScanPose:
-        """Adds a scan at its pose; a ``doubtful`` one begins a piece."""
+        """Adds a scan at its pose. If ``begins_piece``, it starts another piece, linked to the last key scan."""
         self._suspect_scans = 0
-        self._velocity = None if doubtful else se2.between(self.poses[-1], found.pose) / period
-        familiar = found.share > FAMILIAR_SHARE
+        self._velocity = None if begins_piece else se2.between(self.poses[-1], found.pose) / period
+        familiar = found.matched_fraction > FAMILIAR_FRACTION
         if familiar:
             self._scale = _learn_scale(self._scale, self._scale * deviation, prior.mean, found)
         covariance = found.covariance + np.diag(REGISTRATION_DEVIATION**2)
-        scan_pose = ScanPose(
-            found.pose, covariance, matched=True, piece=self._key_pieces[-1] + doubtful, linked=doubtful
-        )
+        piece = self._key_pieces[-1] + (1 if begins_piece else 0)
+        scan_pose = ScanPose(found.pose, covariance, matched=True, piece=piece, linked=begins_piece)
         self._append(scan_pose)
-        if doubtful or self._is_key_due(scan, familiar=familiar):
+        if begins_piece or self._is_key_due(scan, early=not familiar):
             self._add_linked_key(scan, found.information)
         return scan_pose
 
@@ -293,7 +295,7 @@ class FrontEnd:
         scan_pose = ScanPose(pose, self._since_key, matched=False, piece=self._key_pieces[-1])
         self._append(scan_pose)
         # A scan that sees something new is a key scan sooner, but not this one: its pose is only predicted.
-        if is_key or self._is_key_due(scan, familiar=True):
+        if is_key or self._is_key_due(scan, early=False):
             self._add_linked_key(scan, np.zeros((3, 3)))
         return scan_pose
 
@@ -324,12 +326,12 @@ class FrontEnd:
         self.poses.append(scan_pose.pose)
         self.pieces.append(scan_pose.piece)
 
-    def _is_key_due(self, scan: _Scan, *, familiar: bool) -> bool:
-        """Whether the last scan is so far from the last key scan that it has to become one."""
+    def _is_key_due(self, scan: _Scan, *, early: bool) -> bool:
+        """Whether the last scan is so far from the last key scan that it has to become one, sooner if ``early``."""
         off = se2.between(self.poses[self.keys[-1]], self.poses[-1])
         distance = max(KEY_DISTANCE_M, KEY_RANGE_SHARE * _median_range(scan.elements))
-        share = max(np.hypot(off[0], off[1]) / distance, abs(off[2]) / KEY_TURN_RAD)
-        return bool(share >= (1.0 if familiar else EARLY_KEY_SHARE))
+        progress = max(np.hypot(off[0], off[1]) / distance, abs(off[2]) / KEY_TURN_RAD)
+        return bool(progress >= (EARLY_KEY_PROGRESS if early else 1.0))
 
     def _add_linked_key(self, scan: _Scan, information: Array) -> None:
         """Makes the last scan, registered with an ``information`` (3, 3), a key scan with a link to the last one."""

@@ -23,7 +23,7 @@ MIN_APART = 3  # submaps that are closer than this in the sequence are not match
 MAX_TARGETS = 2  # submaps with which one submap is matched in one round
 SEARCH_SIGMAS = 3.0  # half the width of the search window, in standard deviations of the graph
 NO_SEARCH_WINDOW = np.array([0.3, 0.3, 0.1])  # m, m, rad: a smaller window needs no search
-MIN_MATCHED, MIN_SHARE = 60, 0.85  # elements, and their share among those that match or contradict
+MIN_MATCHED, MIN_AGREEING_FRACTION = 60, 0.85  # elements, and their fraction of those that agree or contradict
 RIVAL_SHARE = 0.8  # of the best score: a better match at another place means that the place is not unique
 SAME_PLACE_M, SAME_PLACE_RAD = 0.3, 0.15  # two matches that differ by more are of different places
 MAX_SQUARED_DEVIATION = 16.3  # chi squared with three degrees of freedom, 0.1 %
@@ -103,12 +103,13 @@ class SubmapMatch:
     @property
     def score(self) -> float:
         """Number of matched elements, less where others contradict."""
-        return self.agreement.matched * self.agreement.share
+        return self.agreement.matched * self.agreement.agreeing_fraction
 
     @property
     def is_good(self) -> bool:
         """Whether enough elements match, and few contradict."""
-        return self.agreement.matched >= MIN_MATCHED and self.agreement.share >= MIN_SHARE
+        agreement = self.agreement
+        return agreement.matched >= MIN_MATCHED and agreement.agreeing_fraction >= MIN_AGREEING_FRACTION
 
     def closure(self, first: int, second: int, references: tuple[int, int], *, wide: bool) -> LoopClosure:
         """The loop closure between two submaps with these ``references``."""

@@ -64,7 +64,7 @@ class Registration:
     pose: Array  # (3,)
     information: Array  # (3, 3) of the scan alone, without the prior
     covariance: Array  # (3, 3) with the prior
-    share: float  # of the elements that are matched
+    matched_fraction: float  # of the elements
     cost: float  # negative logarithm of the probability of elements and prior, up to a constant
 
 

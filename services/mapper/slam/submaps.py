@@ -107,8 +107,8 @@ class Agreement:
     contradicting: int  # elements of both, of objects larger than a person, through which the other one saw
 
     @property
-    def share(self) -> float:
-        """Share of agreeing elements."""
+    def agreeing_fraction(self) -> float:
+        """Fraction of the elements that agree, among those that agree or contradict."""
         return self.agreeing / max(1, self.agreeing + self.contradicting)
 
 
