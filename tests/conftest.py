@@ -25,7 +25,7 @@ from common.processes import end_with_this_process
 from tests.fork_server import Child
 
 ROOT = Path(__file__).resolve().parent.parent
-WAIT_TIMEOUT_S = 120.0  # for events that take well under a second on an idle machine
+WAIT_TIMEOUT_S = 300.0  # for events that take well under a second on an idle machine
 numbers = itertools.count(1)
 
 # Tests of what is not installed: PyTorch for preset paper, and pybullet for the simulator's physics.
@@ -140,7 +140,7 @@ def received_messages(inbox, kind):
             yield message
 
 
-def wait_for_message(inbox, kind, condition, timeout=60.0):
+def wait_for_message(inbox, kind, condition, timeout=WAIT_TIMEOUT_S):
     """Waits for the first message of class ``kind`` that meets a condition, and returns it."""
     matches = []
 
@@ -179,7 +179,7 @@ class Running:
         wait_until(lambda: text in self.output or not self.running, timeout)
         assert text in self.output, f"{self.name} did not print {text!r}:\n{self.output}"
 
-    def wait(self, timeout: float = 10.0) -> int:
+    def wait(self, timeout: float = WAIT_TIMEOUT_S) -> int:
         """Waits until the process ends by itself. Returns its exit status."""
         try:
             return self.child.wait(timeout)
@@ -189,7 +189,7 @@ class Running:
     def send(self, number: int) -> None:
         self.child.send_signal(number)
 
-    def stop(self, number: int = signal.SIGTERM, timeout: float = 10.0) -> int:
+    def stop(self, number: int = signal.SIGTERM, timeout: float = WAIT_TIMEOUT_S) -> int:
         """Sends a signal and waits for the end. Returns the exit status."""
         self.send(number)
         return self.wait(timeout)

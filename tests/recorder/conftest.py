@@ -15,7 +15,7 @@ from common.messages.topics import HEALTH, ODOM, RECORDING, WORLD
 from common.robot.robot import Robot
 from common.runtime.service import Service, ServiceLoop
 from services.recorder.settings import RecorderSettings
-from tests.conftest import Running
+from tests.conftest import WAIT_TIMEOUT_S, Running
 from tests.recorder import sessions
 
 
@@ -63,7 +63,7 @@ def recorder_health(bus):
                         return True
             return False
 
-        assert wait_until(met, 30)
+        assert wait_until(met, WAIT_TIMEOUT_S)
 
     return wait
 

@@ -19,6 +19,7 @@ from presage.recordings.info import collect_facts
 from services.recorder.files.message_counts import from_metadata
 from services.recorder.reader import read_recording
 from services.recorder.recover import recover
+from tests.conftest import WAIT_TIMEOUT_S
 from tests.recorder import sessions
 
 
@@ -239,7 +240,7 @@ def test_presage_record_beside_a_recorder(recorder, request_recording, process, 
             heard[Health.decode(entry.payload).instance] += 1
         return len(heard) == 2 and min(heard.values()) >= 2
 
-    assert wait_until(both_publish, 30), second.output
+    assert wait_until(both_publish, WAIT_TIMEOUT_S), second.output
     state = request_recording("stop")
     assert (state.ok, state.recording) == (True, False)
     assert state.file.endswith("first.mcap")

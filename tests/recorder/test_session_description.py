@@ -19,6 +19,7 @@ from common.messages.topics import CONFIG, MODEL, WORLD
 from common.robot.robot import Robot
 from services.recorder import session_description
 from services.recorder.session_description import AttachmentRecord, DescriptionCollector, MetadataRecord, records_of
+from tests.conftest import WAIT_TIMEOUT_S
 from tests.recorder.sessions import SCANNER
 from tests.recorder.sessions import WORLD as HALL
 
@@ -142,7 +143,7 @@ def next_answers(collector, count):
         found.extend(collector.new_replies())
         return len(found) >= count
 
-    assert wait_until(check, 10), found
+    assert wait_until(check, WAIT_TIMEOUT_S), found
     return found
 
 

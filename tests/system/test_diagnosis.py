@@ -207,7 +207,7 @@ def test_missing_services_of_two_robots(presage, process, bus, link):
         outputs.append(output)
         return row_of(output, "controller").startswith("controller alive")
 
-    assert wait_until(controller_alive, 60), outputs[-1]  # before its first health message it is starting
+    assert wait_until(controller_alive, WAIT_TIMEOUT_S), outputs[-1]  # before its first health message it is starting
     output = outputs[-1]
     assert row_of(output, "estimator").startswith("estimator missing")
     start = f"python -m services.simulator --robot {bus.robot} --connect {link.connect[0]}"

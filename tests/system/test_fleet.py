@@ -133,7 +133,7 @@ def test_robot_limit(process, bus, link, names, simulate):
     simulators = [simulate(k) for k in NUMBERS]
     assert wait_until(lambda: all("simulator" in bus.alive(robot=name) for name in names.values()), 60)
     fleet = process("estimator", "--robots", f"{link.robot}-*", "--max-robots", "1")
-    fleet.wait_for("too many robots", 60)
+    fleet.wait_for("too many robots")
     fleet.wait_for("ready robot=")
     served = [k for k in (2, 3) if f"ready robot={names[k]}" in fleet.output]
     assert len(served) == 1

@@ -11,6 +11,7 @@ from common.bus.bus import wait_until
 from common.geometry.rasterisation import rasterise
 from common.geometry.ros_map_writer import write_grid
 from tests.common.geometry.maps import ROOM
+from tests.conftest import WAIT_TIMEOUT_S
 from tests.controller.driving import box, room
 
 TOWER = """
@@ -32,7 +33,7 @@ def tower(process, bus, link, tmp_path, monkeypatch):
     for name in SERVICES:
         world = {"PRESAGE_WORLD": str(tmp_path / "tower.yaml"), "PRESAGE_MODEL": "exact"}
         process(name, env={**world, "PRESAGE_PACE": "lockstep"})  # however slow the machine is
-    assert wait_until(lambda: set(SERVICES) <= bus.alive(), 60)
+    assert wait_until(lambda: set(SERVICES) <= bus.alive(), WAIT_TIMEOUT_S)
 
 
 @pytest.mark.usefixtures("tower")
@@ -47,7 +48,7 @@ def test_goal_on_another_floor(process, presage):
         status, output = presage(*command.split())
         assert (status, says in output) == (2, True), output
     assert presage("teleport", "1", "2", "0", "--floor", "first")[0] == 0
-    assert going.wait(180) == 0, going.output
+    assert going.wait() == 0, going.output
     assert going.output.startswith("going to (2, 2) on floor 'first'\n")
     assert going.output.splitlines()[-1].startswith("reached: within 0.02 m of the goal")
     lines = going.output.splitlines()

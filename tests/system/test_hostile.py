@@ -88,7 +88,7 @@ def next_message(bus, topic, kind, condition=lambda _: True):
                 found.append(message)
         return bool(found)
 
-    assert wait_until(check, 30), f"no {kind.__name__}"
+    assert wait_until(check, WAIT_TIMEOUT_S), f"no {kind.__name__}"
     return found[-1]
 
 

@@ -142,7 +142,7 @@ def test_time_that_jumps_back(process, bus, link, tmp_path):
         return back >= 3 and answered and {"estimator", "controller"} <= failed.keys()
 
     try:
-        assert wait_until(three_jumps, 60), [s.output for s in services]
+        assert wait_until(three_jumps, WAIT_TIMEOUT_S), [s.output for s in services]
     finally:
         stop.set()
         thread.join(WAIT_TIMEOUT_S)

@@ -69,7 +69,7 @@ def test_interrupted_paper_training(process, bus, world, train, tmp_path):
     state = tmp_path / "models" / ".closet-paper-61.unfinished" / "state.safetensors"
     assert wait_until(lambda: state.exists() or not training.running, 60)
     assert "samples come from the running scanner tim571 in closet" in training.output
-    assert training.stop(signal.SIGINT, 30) == 130, training.output
+    assert training.stop(signal.SIGINT) == 130, training.output
     assert not list((tmp_path / "models").glob("*.safetensors"))
     again = train("paper", 100)
     assert again.wait(150) == 0, again.output

@@ -16,7 +16,7 @@ from common.messages.topics import BELIEF, GOAL, HEALTH, SCAN, STATUS, TRUTH
 from presage.live.latest_messages import LatestMessages
 from presage.session.demo import FIRST_BELIEF_TIMEOUT_S, _check_estimator
 from services.recorder.reader import read_recording
-from tests.conftest import ended
+from tests.conftest import WAIT_TIMEOUT_S, ended
 from tests.recorder import sessions as made
 from tests.viewer.client import Page
 
@@ -131,10 +131,10 @@ def test_up_with_page_and_dead_service(up):
         page.wait_for("services", lambda message: len(message["services"]) == 5 and not message["missing"])
         assert page.done("record", action="status")["recording"] is False
     next(child for child in children if "services.estimator" in child.cmdline()).kill()
-    running.wait_for("estimator ended with status -9", 20)
+    running.wait_for("estimator ended with status -9")
     assert "python -m services.estimator" in running.output
     assert [ended(child) for child in children].count(False) == 5
-    assert running.stop(signal.SIGINT, 20) == 130
+    assert running.stop(signal.SIGINT) == 130
     assert wait_until(lambda: all(map(ended, children)), 10)
 
 
@@ -145,13 +145,15 @@ def test_up_with_two_robots(up):
     for robot in ("r-1", "r-2"):
         with open_bus(Link(robot, (f"tcp/127.0.0.1:{port}",))) as bus:
             messages = LatestMessages(bus, BELIEF, TRUTH)
-            assert messages.wait_for(Belief, lambda belief: belief.state == "tracking", 60)
+            assert messages.wait_for(Belief, lambda belief: belief.state == "tracking", WAIT_TIMEOUT_S)
             belief = messages.latest["belief"]
-            truth = messages.wait_for(Truth, lambda truth, stamp=belief.stamp_ns: truth.stamp_ns >= stamp, 60)
+            truth = messages.wait_for(
+                Truth, lambda truth, stamp=belief.stamp_ns: truth.stamp_ns >= stamp, WAIT_TIMEOUT_S
+            )
             assert abs(belief.pose.x - truth.pose.x) < 0.3
             alive = {"estimator", "simulator", "controller"}
             assert wait_until(lambda bus=bus, alive=alive: bus.alive() == alive, 60), bus.alive()
-    assert running.stop(signal.SIGTERM, 60) == 130
+    assert running.stop(signal.SIGTERM) == 130
     assert wait_until(lambda: all(map(ended, children)), 10)
 
 

@@ -14,6 +14,7 @@ from common.messages.definitions import Belief, Pose
 from common.messages.topics import BELIEF, SCAN
 from lab.benchmarks.fleet import max_robots_served
 from lab.benchmarks.fleet_load import CLEARANCE, RADIUS, FleetLoad
+from tests.conftest import WAIT_TIMEOUT_S
 
 
 @pytest.mark.parametrize("limit", [0, 1, 2, 3, 7, 8, 9, 15, 16, 31, 32])
@@ -50,7 +51,7 @@ def test_load(bus):
             stamps.setdefault(sample.key.split("/")[1], []).append(SCAN.message.decode(sample.payload).stamp_ns)
         return sum(map(len, stamps.values())) == 6
 
-    assert wait_until(all_received, 10)
+    assert wait_until(all_received, WAIT_TIMEOUT_S)
     load.play(2, 0.1)
     assert wait_until(lambda: all_received() or sum(map(len, stamps.values())) > 6, 10)
     for of_one in stamps.values():
