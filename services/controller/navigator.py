@@ -101,7 +101,7 @@ class Navigator:
             self._set_goal(goal)
 
     def _explore(self, request: Goal) -> None:
-        self.policy.set_goal(None)
+        self._cancel_goal()
         if self.chosen_policy is None:
             reason = "preset paper cannot explore: use preset geodesic, and start with `presage up --mapping`"
             self.goal_state.start(request, reason)
@@ -109,7 +109,6 @@ class Navigator:
         if self.world is not None:
             self.goal_state.start(request, "cannot explore in a known world: start with `presage up --mapping`")
             return
-        self.goal_state.cancel()
         self._exploration_request = request
         self._begin_exploration()
 
