@@ -1,6 +1,13 @@
 """Imported by the fork server: loads numba's compiled code, so that forked estimators need not."""
 
+import os
+import signal
+
+from common.processes import end_with_parent
 from services.estimator.factory import EstimatorOptions, prepare_factory
 
 for model in ("learned", "exact"):
     prepare_factory(EstimatorOptions(model=model))
+
+# A fork server outlives a worker that pytest-timeout has ended, as long as there are children; these end with it.
+end_with_parent(os.getppid(), signal.SIGKILL)
