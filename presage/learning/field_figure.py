@@ -17,16 +17,16 @@ def draw_model(model: FieldModel, card: FieldCard, png: Path) -> None:
     """Draws the learned distance field into ``png``, beside the calibration of its model if the card has one."""
     if card.calibration is None:
         figure = empty_figure(9, 4.6)
-        draw_field(figure.add_subplot(), model, card.world.name)
+        _draw_field(figure.add_subplot(), model, card.world.name)
     else:
         figure = empty_figure(12, 4.8)
         left, right = figure.subplots(1, 2, width_ratios=(1.7, 1))
-        draw_field(left, model, card.world.name)
+        _draw_field(left, model, card.world.name)
         calibration_curve(right, card.calibration)
     figure.savefig(png, dpi=120, bbox_inches="tight")  # else the title of a narrow world is cut off
 
 
-def draw_field(axes: Axes, model: FieldModel, name: str) -> None:
+def _draw_field(axes: Axes, model: FieldModel, name: str) -> None:
     """Draws the learned distance and its zero, with white where nothing was observed."""
     field = model.field
     ny, nx = field.phi.shape

@@ -122,13 +122,8 @@ class MapperService(Service):
 
     def on_timer(self) -> None:
         """Replaces the map by the updated one, and publishes it."""
-        self._finish_update()
-
-    def _finish_update(self) -> None:
-        assert self.mapper is not None  # noqa: S101 - only a mapper starts updates
         update, self._update = self._update, None
-        if update is None:
-            return
+        assert self.mapper is not None and update is not None  # noqa: S101, PT018 - see `due`; only a mapper starts updates
         try:
             self.mapper.use(update.result())
             self.note = ""

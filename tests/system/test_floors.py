@@ -30,9 +30,10 @@ def tower(process, bus, link, tmp_path, monkeypatch):
     (tmp_path / "tower.yaml").write_text(TOWER)
     monkeypatch.setenv("PRESAGE_CONNECT", link.connect[0])
     monkeypatch.setenv("PRESAGE_ROBOT", link.robot)
+    environment = {"PRESAGE_WORLD": str(tmp_path / "tower.yaml"), "PRESAGE_MODEL": "exact"}
+    environment["PRESAGE_PACE"] = "lockstep"  # however slow the machine is
     for name in SERVICES:
-        world = {"PRESAGE_WORLD": str(tmp_path / "tower.yaml"), "PRESAGE_MODEL": "exact"}
-        process(name, env={**world, "PRESAGE_PACE": "lockstep"})  # however slow the machine is
+        process(name, env=environment)
     assert wait_until(lambda: set(SERVICES) <= bus.alive(), WAIT_TIMEOUT_S)
 
 

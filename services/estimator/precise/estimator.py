@@ -53,7 +53,6 @@ if TYPE_CHECKING:
 
     from common.geometry.se2 import Array
     from services.estimator.precise.global_seeds import Seeds
-    from services.estimator.precise.surface_evidence import SurfaceEvidence
     from services.estimator.shared.generative_models import Expected, GenerativeModel
 
 START_COVARIANCE = np.diag([0.25, 0.25, 0.09])  # m², m², rad², of a start that is given without one
@@ -303,7 +302,7 @@ class PreciseEstimator:
         widest = _prior_of([each[-1] for each in motions])
         predicted = np.array([expected_motion(each).mean for each in motions])
         poses, evidence = view.descend(predicted, widest)
-        if _log_fit(view, view.surface_evidence(poses)) < self._last_log_fit - MAX_FIT_DROP:
+        if _log_fit(view, poses) < self._last_log_fit - MAX_FIT_DROP:
             extra_starts = np.zeros((0, 3))
             if not with_odometry:
                 extra_starts = reachable_poses(self.settings.motion, self.modes[0].pose, period, COARSE_SIGMA_M)
@@ -639,7 +638,7 @@ class PreciseEstimator:
         if self._is_key_scan_due():
             self._add_key_scan(view)
         self._last = LocalScan(self._local_pose, view)
-        self._last_log_fit = _log_fit(view, view.surface_evidence(self.modes[0].pose[None]))
+        self._last_log_fit = _log_fit(view, self.modes[0].pose[None])
         same_beams = np.array_equal(view.angles, observation.angles)
         predicted = (
             self._predicted(view.expected(poses[0])) if same_beams else self.predict(poses[0][None], observation.angles)
@@ -733,9 +732,9 @@ def _log_reference(view: View, skip: npt.NDArray[np.bool_]) -> float:
     return float(view.surfaces.known_log_density[~skip].sum())
 
 
-def _log_fit(view: View, evidence: SurfaceEvidence) -> float:
-    """Log likelihood in nats of all beams at the first pose of the ``evidence``, minus `_log_reference`."""
-    return float(evidence.log_likelihood[0] - view.surfaces.known_log_density.sum())
+def _log_fit(view: View, poses: Array) -> float:
+    """Log likelihood in nats of all beams at the first of the ``poses`` (N, 3), minus `_log_reference`."""
+    return float(view.surface_evidence(poses).log_likelihood[0] - view.surfaces.known_log_density.sum())
 
 
 def _log_unmapped_surfaces(view: View, skip: npt.NDArray[np.bool_]) -> float:

@@ -46,7 +46,7 @@ class Mode:
     curvature: Array  # (3, 3) Gauss-Newton Hessian of accuracy
     explained: float = 0.0  # fraction of the last scan's beams that end at surfaces of the map
     log_evidence: float = 0.0  # nats, of the key scans and the prior; unnormalised
-    # nats, of the present scan; absolute in the result of a search, in the estimator minus `_log_reference`
+    # nats, of the present scan; in the result of a search absolute, in the estimator relative to `_log_reference`
     scan_log_likelihood: float = 0.0
     surroundings: Array = field(default_factory=lambda: FIRST_SURROUNDINGS)  # (3,) probabilities at the last key scan
     scan_surroundings: Array = field(default_factory=lambda: FIRST_SURROUNDINGS)  # (3,) at the present scan
