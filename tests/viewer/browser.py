@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Error, Page, sync_playwright
 
 from tests.conftest import WAIT_TIMEOUT_S
 
@@ -19,6 +19,12 @@ ARGUMENTS = [
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
     "--disable-component-update", "--disable-sync", "--force-color-profile=srgb",
 ]  # fmt: skip
+
+CONNECTED = "() => window.presage && presage.store.connected"
+# Chromium drops what it is loading whenever the containers of another test come or go. The page then loads itself
+# again, unless it was the document that was dropped.
+NETWORK_CHANGED = "ERR_NETWORK_CHANGED"
+MAX_LOADS = 100
 
 # An answer is on the screen for some seconds only, and a busy machine may look too late: keep them all.
 KEEP_TOASTS = """window.toasts = [];
@@ -55,9 +61,13 @@ class Visit:
 
     def __post_init__(self) -> None:
         """Listen before anything is loaded."""
-        self.page.on("console", lambda m: self.complaints.append(m.text) if m.type in {"error", "warning"} else None)
-        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
-        self.page.on("requestfailed", lambda request: self.complaints.append(f"failed: {request.url}"))
+        self.page.on("console", lambda m: self._complain(m.text) if m.type in {"error", "warning"} else None)
+        self.page.on("pageerror", lambda error: self._complain(str(error)))
+        self.page.on("requestfailed", lambda request: self._complain(f"{request.failure}: {request.url}"))
+
+    def _complain(self, text: str) -> None:
+        if NETWORK_CHANGED not in text:
+            self.complaints.append(text)
 
     def see(self, expression: str, argument: Any = None) -> Any:
         """A JavaScript expression's value; `store`, `view` and the like are the page's own."""
@@ -100,7 +110,15 @@ def visit(browser: Browser, address: str, *, width: int = 1100, height: int = 76
     context = browser.new_context(viewport={"width": width, "height": height}, **options)
     context.add_init_script(KEEP_TOASTS)
     seen = Visit(context.new_page())
-    seen.page.goto(address)
-    connected = "() => window.presage && presage.store.connected"
-    seen.page.wait_for_function(connected, polling=POLLING_MS, timeout=1000 * WAIT_TIMEOUT_S)
+    for _ in range(MAX_LOADS):
+        try:
+            seen.page.goto(address)
+            break
+        except Error as error:
+            if NETWORK_CHANGED not in str(error):
+                raise
+    try:
+        seen.page.wait_for_function(CONNECTED, polling=POLLING_MS, timeout=1000 * WAIT_TIMEOUT_S)
+    except Error as error:
+        raise AssertionError(f"the page did not connect; its console: {seen.complaints}") from error
     return seen

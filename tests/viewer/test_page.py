@@ -72,7 +72,10 @@ def test_sources():
     assert {name: found for name, text in code.items() if (found := forbidden.findall(text))} == {}
     text = (STATIC / "index.html").read_text() + "".join(path.read_text() for path in STATIC.rglob("*.css"))
     assert not re.search(r"https?://|\bstyle=|\bon[a-z]+=|<style|@import", text)
-    assert re.findall(r"<script[^>]*>", text) == ['<script type="module" src="js/main.js">']
+    assert re.findall(r"<script[^>]*>", text) == [
+        '<script src="js/reload.js">',
+        '<script type="module" src="js/main.js">',
+    ]
 
 
 def test_frames(page):

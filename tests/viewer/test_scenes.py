@@ -299,6 +299,17 @@ def test_server_that_comes_back(browser, processes):
     seen.page.context.close()
 
 
+@pytest.mark.parametrize("part", ["js/map.js", "css/base.css"])
+def test_page_that_was_loaded_in_part(browser, stub, part):
+    context = browser.new_context()
+    context.route(f"**/{part}", lambda route: route.abort(), times=1)
+    page = context.new_page()
+    page.goto(f"{stub}/planning/")
+    complete = "window.presage?.store.connected && document.styleSheets.length === 3"
+    page.wait_for_function(complete, polling=browser_tools.POLLING_MS, timeout=1000 * WAIT_TIMEOUT_S)
+    context.close()
+
+
 def test_messages_that_are_no_frame(look):
     seen = look("tracking")
     seen.wait("store.world && store.frame")
