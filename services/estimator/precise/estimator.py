@@ -13,13 +13,13 @@ from services.estimator.precise.gauss_newton import COARSE_SIGMA_M, GaussNewton,
 from services.estimator.precise.hypotheses import (
     FIRST_SURROUNDINGS,
     NEXT_SURROUNDINGS,
-    Mode,
+    TrackedHypothesis,
     UnknownPlace,
     clip_to_map,
     probability_of_being_near,
     project_evidence,
     unobserved_directions,
-    update_mode,
+    update_hypothesis,
     weigh,
 )
 from services.estimator.precise.likelihood import Evidence, Likelihood
@@ -134,7 +134,7 @@ class PreciseEstimator:
         The default covariance is that of standard deviations of 0.5 m, 0.5 m and 0.3 rad. A ``pose`` (2,) is a position
         with an unknown heading.
         """
-        self.modes: list[Mode] = []  # the hypotheses, best first
+        self.hypotheses: list[TrackedHypothesis] = []  # best first
         self._start: tuple[Array, Array] | None = None  # pose and covariance, until the first search
         if pose is not None:
             self._start = start_belief(pose, START_COVARIANCE if covariance is None else covariance)
@@ -170,12 +170,12 @@ class PreciseEstimator:
     def track(self, observation: Observation) -> Posterior | None:
         """Returns the posterior after one more scan, or None if `search` must be called for it."""
         view = self._view(observation)
-        if not self.modes:
+        if not self.hypotheses:
             self._scan = view, observation
             return None
         # Motion prior
         period, odom = self._period(observation.stamp), self._odometry_since_last_scan(observation)
-        motions = [self._predict_motion(mode, period, odom, observation.command) for mode in self.modes]
+        motions = [self._predict_motion(each, period, odom, observation.command) for each in self.hypotheses]
         # Optimisation
         match = self._match_map(view, motions, period, with_odometry=odom is not None)
         # Local map
@@ -190,10 +190,10 @@ class PreciseEstimator:
             match = self._correct_motion_again(match, observation, period)
         # Fusion of match and motion prior
         view = match.view
-        modes = [self._fuse(k, match, motions[k][-1], observation) for k in range(len(match.poses))]
-        modes += self._find_alternatives(view, modes[0], match.motions[0], motions[0][-1])
+        hypotheses = [self._fuse(k, match, motions[k][-1], observation) for k in range(len(match.poses))]
+        hypotheses += self._find_alternatives(view, hypotheses[0], match.motions[0], motions[0][-1])
         # Weights, also of the unknown place
-        self._weigh_hypotheses(view, modes, match.local_pose, period)
+        self._weigh_hypotheses(view, hypotheses, match.local_pose, period)
         self._scan = view, observation
         # Global search
         self._scans_since_search += 1
@@ -211,7 +211,7 @@ class PreciseEstimator:
         if self._scan is None:
             raise RuntimeError("there is no scan to search with: call track first")
         view, observation = self._scan
-        start, is_first = self._start, not self.modes
+        start, is_first = self._start, not self.hypotheses
         # The map's errors are unknown until a key scan has shown them.
         views = [view] if self._precision.scans else [view, _with_rough_map(view)]
         view = self._search_for_hypotheses(views)
@@ -245,7 +245,7 @@ class PreciseEstimator:
             self._precision.offset,
         )
         return self._correct_motion(
-            view, observation, self._velocity(self.modes[0], observation) if self.modes else None
+            view, observation, self._velocity(self.hypotheses[0], observation) if self.hypotheses else None
         )
 
     def _correct_motion(self, view: View, observation: Observation, velocity: Array | None) -> View:
@@ -253,11 +253,11 @@ class PreciseEstimator:
         corrected = correct_motion(observation, velocity, self.mount)
         return replace(view, angles=corrected.angles, ranges=corrected.ranges).thinned(TARGET_BEAMS)
 
-    def _velocity(self, mode: Mode, observation: Observation) -> Array | None:
+    def _velocity(self, hypothesis: TrackedHypothesis, observation: Observation) -> Array | None:
         """Velocity (3,) in base_link from the last poses or else from odometry, or None if it is unknown."""
         odom = self._odometry_since_last_scan(observation)
-        if mode.velocity is not None or odom is None:
-            return mode.velocity
+        if hypothesis.velocity is not None or odom is None:
+            return hypothesis.velocity
         return odom / self._period(observation.stamp)
 
     def _odometry_since_last_scan(self, observation: Observation) -> Array | None:
@@ -271,24 +271,27 @@ class PreciseEstimator:
         return stamp - self._stamp
 
     def _predict_motion(
-        self, mode: Mode, period: float, odom: Array | None, command: Array | None
+        self, hypothesis: TrackedHypothesis, period: float, odom: Array | None, command: Array | None
     ) -> list[MotionCandidate]:
         """Predicts the motions that the robot may have made since the last scan; the last one is the widest."""
         return predict_motion(
             self.settings.motion,
-            mode.pose,
-            mode.noise_covariance,
+            hypothesis.pose,
+            hypothesis.noise_covariance,
             period,
             odom,
             command,
-            mode.velocity,
-            mode.drift_covariance,
+            hypothesis.velocity,
+            hypothesis.drift_covariance,
         )
 
     def _predict_local_motion(self, period: float, odom: Array | None, command: Array | None) -> list[MotionCandidate]:
         """Predicts the motions in the local frame, where the last pose is known far better than in the map."""
         last = replace(
-            self.modes[0], pose=self._local_pose, noise_covariance=np.zeros((3, 3)), drift_covariance=np.zeros((3, 3))
+            self.hypotheses[0],
+            pose=self._local_pose,
+            noise_covariance=np.zeros((3, 3)),
+            drift_covariance=np.zeros((3, 3)),
         )
         return self._predict_motion(last, period, odom, command)
 
@@ -305,7 +308,7 @@ class PreciseEstimator:
         if _log_fit(view, poses) < self._last_log_fit - MAX_FIT_DROP:
             extra_starts = np.zeros((0, 3))
             if not with_odometry:
-                extra_starts = reachable_poses(self.settings.motion, self.modes[0].pose, period, COARSE_SIGMA_M)
+                extra_starts = reachable_poses(self.settings.motion, self.hypotheses[0].pose, period, COARSE_SIGMA_M)
             wider_poses, wider_evidence = search_around(view, predicted, widest, extra_starts)
             fit = view.surface_evidence(np.concatenate([poses, wider_poses])).log_likelihood.reshape(2, -1)
             chosen = np.arange(len(poses)) + len(poses) * (fit[1] > fit[0])
@@ -327,33 +330,33 @@ class PreciseEstimator:
             return match
         moved = self._local_map.candidate(found, prior)
         # All hypotheses share the relative motion.
-        step = se2.between(self.modes[0].pose, moved.mean)
-        moves = [replace(moved, mean=se2.compose(mode.pose, step)) for mode in self.modes]
+        step = se2.between(self.hypotheses[0].pose, moved.mean)
+        moves = [replace(moved, mean=se2.compose(each.pose, step)) for each in self.hypotheses]
         poses, evidence = view.descend(np.array([each.mean for each in moves]), _prior_of(moves))
         by_local_map = ScanMatch(view, [[each] for each in moves], poses, evidence, found.pose)
         # The local map is wrong where people move all around the robot, the map where much has changed.
         both = np.stack([match.poses[0], poses[0]])
         map_evidence, local_evidence = _log_at_poses(
-            view, both, view.surfaces.small, np.tile(self.modes[0].surroundings, (2, 1))
+            view, both, view.surfaces.small, np.tile(self.hypotheses[0].surroundings, (2, 1))
         )[0]
         return match if map_evidence + np.log(LOCAL_MISMATCH_PROBABILITY) > local_evidence else by_local_map
 
     def _correct_motion_again(self, match: ScanMatch, observation: Observation, period: float) -> ScanMatch:
         """Corrects the scan for the motion that the match has shown, and matches it again."""
         # Not `between(last, this)`: beams are moved in base_link at this scan.
-        velocity = -se2.between(match.poses[0], self.modes[0].pose) / period
+        velocity = -se2.between(match.poses[0], self.hypotheses[0].pose) / period
         view = self._correct_motion(match.view, observation, velocity)
         poses, evidence = view.descend(match.poses, _prior_of([each[-1] for each in match.motions]))
         return replace(match, view=view, poses=poses, evidence=evidence)
 
-    def _fuse(self, k: int, match: ScanMatch, widest: MotionCandidate, observation: Observation) -> Mode:
+    def _fuse(self, k: int, match: ScanMatch, widest: MotionCandidate, observation: Observation) -> TrackedHypothesis:
         """Fuses the k-th hypothesis with the scan.
 
         A motion of which the robot is hardly capable, according to the ``widest`` candidate, is evidence against the
         hypothesis: the robot may have been carried there instead. Where the stamp is earlier than that of the last
         scan, as when a replay starts again, the duration of the motion is unknown, and this evidence is left out.
         """
-        mode, period = self.modes[k], self._period(observation.stamp)
+        hypothesis, period = self.hypotheses[k], self._period(observation.stamp)
         candidates, pose, evidence = match.motions[k], match.poses[k], match.evidence
         unobserved = match.unobserved[k]
         project_evidence(evidence, k, unobserved)
@@ -363,7 +366,7 @@ class PreciseEstimator:
         unknown_motion = len(unobserved) > 0 and match.local_pose is None
         if unknown_motion and self._odometry_since_last_scan(observation) is None:
             candidates = [
-                widen_unobserved(self.settings.motion, each, unobserved, mode.unobserved_scans, period)
+                widen_unobserved(self.settings.motion, each, unobserved, hypothesis.unobserved_scans, period)
                 for each in candidates
             ]
             widest = candidates[-1]
@@ -377,21 +380,21 @@ class PreciseEstimator:
             for each in candidates
         ]
         best = min(fused, key=lambda each: each.negative_log_evidence)
-        updated = update_mode(mode, best, evidence, k, period, unobserved=unknown_motion)
+        updated = update_hypothesis(hypothesis, best, evidence, k, period, unobserved=unknown_motion)
         if observation.stamp is not None and self._stamp is not None and observation.stamp < self._stamp:
             return updated
         return replace(updated, log_evidence=updated.log_evidence - widest.excess(best.mean))
 
     def _find_alternatives(
-        self, view: View, best: Mode, candidates: list[MotionCandidate], widest: MotionCandidate
-    ) -> list[Mode]:
+        self, view: View, best: TrackedHypothesis, candidates: list[MotionCandidate], widest: MotionCandidate
+    ) -> list[TrackedHypothesis]:
         """Other hypotheses within the motion prior that fit the scan, if it made the ``best`` one far more certain.
 
         The pose was uncertain before this scan, and a descent from one pose finds only the nearest match. An
         alternative loses evidence if its motion is less probable than that of the best match, and gains none if it is
         more probable. As in `_fuse`, a motion of which the robot is hardly capable costs evidence as well.
         """
-        before = self.modes[0]
+        before = self.hypotheses[0]
         doubt = 1 - self._probability_of_being_near(before)
         certain = doubt <= 1 - self.settings.tracking_probability
         if certain or 1 - self._probability_of_being_near(best) > 0.5 * doubt:
@@ -401,21 +404,23 @@ class PreciseEstimator:
         at_best = before.log_evidence + _prior_of([motion]).energy(best.pose[None])[0]
         return [
             replace(
-                mode,
-                log_evidence=min(before.log_evidence, at_best + mode.log_evidence) - widest.excess(mode.pose),
+                each,
+                log_evidence=min(before.log_evidence, at_best + each.log_evidence) - widest.excess(each.pose),
                 surroundings=before.surroundings,
             )
-            for mode in found
+            for each in found
         ]
 
-    def _weigh_hypotheses(self, view: View, modes: list[Mode], local: Array | None, period: float) -> None:
+    def _weigh_hypotheses(
+        self, view: View, hypotheses: list[TrackedHypothesis], local: Array | None, period: float
+    ) -> None:
         """Weighs hypotheses by how well the map predicts those surfaces of the scan that were not seen before.
 
         ``local`` (3,) is the pose in the local frame, or None if the motion does not come from the local map.
         """
         if local is None:
-            local = self._local_map.to_local(modes[0].pose)
-        poses = np.array([mode.pose for mode in modes])
+            local = self._local_map.to_local(hypotheses[0].pose)
+        poses = np.array([each.pose for each in hypotheses])
         evidence = view.surface_evidence(poses)
         seen, appeared = self._local_map.find_seen_and_appeared(local, view, evidence.weights[0] > 0.5)
         small = view.surfaces.small
@@ -432,35 +437,35 @@ class PreciseEstimator:
             self._search_interval = 1
 
         log_likelihood, surroundings = _log_at_poses(
-            view, poses, ignored, np.array([mode.surroundings for mode in modes])
+            view, poses, ignored, np.array([each.surroundings for each in hypotheses])
         )
-        modes = [
+        hypotheses = [
             replace(
-                mode,
+                hypothesis,
                 explained=evidence.explained[k],
                 scan_log_likelihood=log_likelihood[k] + log_change,
                 scan_surroundings=surroundings[k],
             )
-            for k, mode in enumerate(modes)
+            for k, hypothesis in enumerate(hypotheses)
         ]
         self._local_pose, self._ignored_beams, self._log_change = local, ignored, log_change
 
-        log_kidnapping = max(mode.log_evidence for mode in self.modes) + float(
+        log_kidnapping = max(each.log_evidence for each in self.hypotheses) + float(
             np.log(self.settings.unknown_probability)
         )
         self._unknown_place.allow_kidnapping(log_kidnapping, self.settings.off_map_probability)
-        # Alternatives found for this scan come last in `modes`, and have no counterpart in `self.modes`.
-        pairs = zip(self.modes, modes, strict=False)
+        # Alternatives found for this scan come last in `hypotheses`, and have no counterpart in `self.hypotheses`.
+        pairs = zip(self.hypotheses, hypotheses, strict=False)
         self._unknown_place.allow_mismatch(max(self._log_mismatch(before, after) for before, after in pairs))
         # Either the surroundings have changed, or the robot was carried to another place and all surfaces are new.
         self._unknown_place.scan_log_likelihood = max(
             _log_unmapped_surfaces(view, ignored) + log_change, _log_unmapped_surfaces(view, small)
         )
-        self._set_hypotheses(modes)
-        if not np.array_equal(self.modes[0].pose, modes[0].pose):  # another hypothesis is best now
-            self._local_map.place(local, self.modes[0].pose)
+        self._set_hypotheses(hypotheses)
+        if not np.array_equal(self.hypotheses[0].pose, hypotheses[0].pose):  # another hypothesis is best now
+            self._local_map.place(local, self.hypotheses[0].pose)
 
-    def _log_mismatch(self, before: Mode, after: Mode) -> float:
+    def _log_mismatch(self, before: TrackedHypothesis, after: TrackedHypothesis) -> float:
         """Evidence in nats that the scan was matched at a wrong pose.
 
         If it has made a pose certain that was uncertain ``before``, the probability gained may be due to a wrong match.
@@ -468,19 +473,19 @@ class PreciseEstimator:
         gained = self._probability_of_being_near(after) - self._probability_of_being_near(before)
         return before.log_evidence + (float(np.log(gained)) if gained > 0 else -np.inf)
 
-    def _probability_of_being_near(self, mode: Mode) -> float:
-        return probability_of_being_near(self._covariance(mode))
+    def _probability_of_being_near(self, hypothesis: TrackedHypothesis) -> float:
+        return probability_of_being_near(self._covariance(hypothesis))
 
-    def _set_hypotheses(self, modes: list[Mode]) -> None:
+    def _set_hypotheses(self, hypotheses: list[TrackedHypothesis]) -> None:
         """Sets the hypotheses and their weights."""
         unknown = self._unknown_place
-        min_log_unknown = max(mode.log_weight for mode in modes) + float(np.log(self.settings.unknown_probability))
+        min_log_unknown = max(each.log_weight for each in hypotheses) + float(np.log(self.settings.unknown_probability))
         log_unknown = max(unknown.log_evidence + unknown.scan_log_likelihood, min_log_unknown)
-        self.modes, unknown.weight = weigh(modes, log_unknown, self.settings.max_hypotheses)
+        self.hypotheses, unknown.weight = weigh(hypotheses, log_unknown, self.settings.max_hypotheses)
 
     def _add_key_scan(self, view: View) -> None:
         """Makes the present scan a key scan: keeps its evidence, and adds its surfaces to the local map."""
-        best, log_unknown = self.modes[0], self._unknown_place.log_evidence
+        best, log_unknown = self.hypotheses[0], self._unknown_place.log_evidence
         mapped, tracked = view.surface_evidence(best.pose[None]).weights[0] > 0.5, self._is_tracked()
         if tracked:
             self._precision.learn_changes(view, best.pose)
@@ -488,14 +493,19 @@ class PreciseEstimator:
         self._unknown_place.add_key_scan()
         key = LocalMapScan(self._local_pose, view, self._ignored_beams, mapped, tracked, self._log_change, log_unknown)
         self._local_map.add(key, best.pose, best.noise_covariance)
-        self.modes = [
-            replace(mode, log_evidence=mode.log_weight, scan_log_likelihood=0.0, surroundings=mode.scan_surroundings)
-            for mode in self.modes
+        self.hypotheses = [
+            replace(
+                each,
+                log_evidence=each.log_weight,
+                scan_log_likelihood=0.0,
+                surroundings=each.scan_surroundings,
+            )
+            for each in self.hypotheses
         ]
 
     def _may_be_elsewhere(self) -> bool:
         """Whether the pose is uncertain, or another place could fit the scans much better."""
-        best = self.modes[0]
+        best = self.hypotheses[0]
         if not self._is_tracked():
             return True
         # Prior against another place: the volume of all poses, divided by that of the poses at one place.
@@ -529,9 +539,9 @@ class PreciseEstimator:
                 return view
         found = self._search_everywhere(views)
         view = _most_probable(views, found[0].pose)
-        if self.modes:
+        if self.hypotheses:
             self._add_hypotheses(found, view)
-            view = _most_probable(views, self.modes[0].pose)
+            view = _most_probable(views, self.hypotheses[0].pose)
             self._add_key_scan(view)
         else:
             self._start_with(view, found, self.settings.off_map_probability, self.settings.off_map_probability)
@@ -544,16 +554,16 @@ class PreciseEstimator:
         """
         precision = replace(self._precision)
         if not precision.scans:
-            precision.learn_map_error(view, self.modes[0].pose)
+            precision.learn_map_error(view, self.hypotheses[0].pose)
         error, offset = precision.map_error, precision.offset
         significant = SIGNIFICANT_MAP_ERROR * view.likelihood.sigma
         if error < max(view.map_error, significant) and abs(offset - view.map_offset) < significant:
             return view
         view = replace(view, map_error=error, correlated_fraction=precision.correlated_fraction, map_offset=offset)
-        self.modes, self._start = [], start
+        self.hypotheses, self._start = [], start
         return self._search_for_hypotheses([view])
 
-    def _search_everywhere(self, views: list[View]) -> list[Mode]:
+    def _search_everywhere(self, views: list[View]) -> list[TrackedHypothesis]:
         """The hypotheses in the whole map at which the scan is more probable than at an unknown place, or the best."""
         if self._precision.scans:  # the map's errors were learned in one room, but the robot may be in another
             elsewhere = self._precision.map_error_elsewhere
@@ -561,10 +571,10 @@ class PreciseEstimator:
         found, view = search_everywhere(views, self.seeds, self.settings), views[0]
         small = view.surfaces.small
         log_at_unknown_place = _log_reference(view, small) + _log_unmapped_surfaces(view, small)
-        return [mode for mode in found if mode.scan_log_likelihood > log_at_unknown_place + MIN_GAIN] or found[:1]
+        return [each for each in found if each.scan_log_likelihood > log_at_unknown_place + MIN_GAIN] or found[:1]
 
     def _start_with(
-        self, view: View, found: list[Mode], unknown: float, off_map: float, all_changed: float = 0.0
+        self, view: View, found: list[TrackedHypothesis], unknown: float, off_map: float, all_changed: float = 0.0
     ) -> None:
         """Starts with the hypotheses ``found``, and the probability ``unknown`` that the robot is at none.
 
@@ -576,9 +586,12 @@ class PreciseEstimator:
         reference = _log_reference(view, self._ignored_beams)
         unknown_place = self._unknown_place
         log_all_changed = unknown_place.scan_log_likelihood + float(np.log(all_changed)) if all_changed else -np.inf
-        log_likelihoods = [max(mode.scan_log_likelihood - reference, log_all_changed) for mode in found]
+        log_likelihoods = [max(each.scan_log_likelihood - reference, log_all_changed) for each in found]
         self._set_hypotheses(
-            [replace(mode, scan_log_likelihood=each) for mode, each in zip(found, log_likelihoods, strict=True)]
+            [
+                replace(hypothesis, scan_log_likelihood=each)
+                for hypothesis, each in zip(found, log_likelihoods, strict=True)
+            ]
         )
 
     def _restart_local_map(self, view: View) -> None:
@@ -587,32 +600,32 @@ class PreciseEstimator:
         self._local_pose, self._ignored_beams, self._log_change = np.zeros(3), view.surfaces.small, 0.0
         self._unknown_place.scan_log_likelihood = _log_unmapped_surfaces(view, self._ignored_beams)
 
-    def _add_hypotheses(self, found: list[Mode], view: View) -> None:
+    def _add_hypotheses(self, found: list[TrackedHypothesis], view: View) -> None:
         """Adds hypotheses: the robot may have been there since one of the key scans, or was carried there just now."""
         stayed, surroundings = self._log_stayed(found, view)
-        log_likelihood = np.array([mode.scan_log_likelihood for mode in found])
+        log_likelihood = np.array([each.scan_log_likelihood for each in found])
         carried = self._unknown_place.log_evidence + log_likelihood - _log_reference(view, view.surfaces.small)
-        evidence = np.array([mode.log_evidence for mode in found]) + np.maximum(stayed, carried)
+        evidence = np.array([each.log_evidence for each in found]) + np.maximum(stayed, carried)
         surroundings[carried >= stayed] = FIRST_SURROUNDINGS
         added = [
-            replace(mode, log_evidence=evidence[k], scan_log_likelihood=0.0, scan_surroundings=surroundings[k])
-            for k, mode in enumerate(found)
+            replace(hypothesis, log_evidence=evidence[k], scan_log_likelihood=0.0, scan_surroundings=surroundings[k])
+            for k, hypothesis in enumerate(found)
         ]
         best = int(np.argmax(evidence))
-        if evidence[best] > self.modes[0].log_weight:
+        if evidence[best] > self.hypotheses[0].log_weight:
             self._search_interval = 1
             if carried[best] > stayed[best]:
                 self._change_rate.forget_latest()
                 self._restart_local_map(view)
         self._unknown_place.exclude_mapped_places()
-        self._set_hypotheses([*self.modes, *added])
+        self._set_hypotheses([*self.hypotheses, *added])
 
-    def _log_stayed(self, found: list[Mode], view: View) -> tuple[Array, Array]:
+    def _log_stayed(self, found: list[TrackedHypothesis], view: View) -> tuple[Array, Array]:
         """Evidence (N,) in nats that the robot has been at each hypothesis since the key scan for which it is largest.
 
         Also returns the probabilities (N, 3) of the surroundings of the present scan in that case.
         """
-        poses = np.array([mode.pose for mode in found])
+        poses = np.array([each.pose for each in found])
         stayed = np.full((1, len(found)), -np.inf)  # the first row is for no key scan, then one row per key scan
         first = np.tile(FIRST_SURROUNDINGS, (1, len(found), 1))
         surroundings = first
@@ -629,16 +642,16 @@ class PreciseEstimator:
 
     def _finish_scan(self, view: View, observation: Observation) -> Posterior:
         """Stores what the next scan needs, and returns the posterior."""
-        self.modes = clip_to_map(self.modes, self.bounds)
+        self.hypotheses = clip_to_map(self.hypotheses, self.bounds)
         period = self._period(observation.stamp)
         poses = [
-            pose_at_stamp(mode.pose, self._velocity(mode, observation), period, observation) for mode in self.modes
+            pose_at_stamp(each.pose, self._velocity(each, observation), period, observation) for each in self.hypotheses
         ]
         self._stamp, self._odom = observation.stamp, observation.odom
         if self._is_key_scan_due():
             self._add_key_scan(view)
         self._last = LocalScan(self._local_pose, view)
-        self._last_log_fit = _log_fit(view, self.modes[0].pose[None])
+        self._last_log_fit = _log_fit(view, self.hypotheses[0].pose[None])
         same_beams = np.array_equal(view.angles, observation.angles)
         predicted = (
             self._predicted(view.expected(poses[0])) if same_beams else self.predict(poses[0][None], observation.angles)
@@ -654,12 +667,12 @@ class PreciseEstimator:
 
     def _posterior(self, view: View, poses: list[Array], predicted: Predicted) -> Posterior:
         """The posterior, with the hypotheses at their ``poses`` at the stamp of the scan."""
-        best = self.modes[0]
+        best = self.hypotheses[0]
         error = EstimateError.from_scan(view, best.pose, self._covariance(best), best.explained)
-        covariances = [error.total_covariance(float(best.pose[2])), *map(self._covariance, self.modes[1:])]
+        covariances = [error.total_covariance(float(best.pose[2])), *map(self._covariance, self.hypotheses[1:])]
         hypotheses = tuple(
-            Hypothesis(pose, covariance, mode.weight)
-            for pose, covariance, mode in zip(poses, covariances, self.modes, strict=True)
+            Hypothesis(pose, covariance, hypothesis.weight)
+            for pose, covariance, hypothesis in zip(poses, covariances, self.hypotheses, strict=True)
         )
         elsewhere = 1 - best.weight * (1 - self._unknown_place.weight)
         return Posterior(
@@ -675,13 +688,13 @@ class PreciseEstimator:
             protection=error.protection_level(elsewhere),
         )
 
-    def _covariance(self, mode: Mode) -> Array:
+    def _covariance(self, hypothesis: TrackedHypothesis) -> Array:
         floor = np.array([self.settings.floor_position] * 2 + [self.settings.floor_heading])
-        return np.asarray(mode.covariance(self.settings.inflation) + np.diag(floor**2))
+        return np.asarray(hypothesis.covariance(self.settings.inflation) + np.diag(floor**2))
 
     def _probability(self) -> float:
         """Probability that the best hypothesis is within 0.2 m and 5 degrees of the truth."""
-        best = self.modes[0]
+        best = self.hypotheses[0]
         at_best = best.weight * (1 - self._unknown_place.weight)
         return at_best * self._probability_of_being_near(best)
 
@@ -693,9 +706,11 @@ class PreciseEstimator:
         if self._is_tracked():
             return "tracking"
         known = 1 - self._unknown_place.weight
-        if len(self.modes) > 1:
-            tracked_alone = known * self._probability_of_being_near(self.modes[0]) >= self.settings.tracking_probability
-            if tracked_alone or self.modes[1].weight * known > self.settings.ambiguous_weight:
+        if len(self.hypotheses) > 1:
+            tracked_alone = (
+                known * self._probability_of_being_near(self.hypotheses[0]) >= self.settings.tracking_probability
+            )
+            if tracked_alone or self.hypotheses[1].weight * known > self.settings.ambiguous_weight:
                 return "ambiguous"
         return "lost" if self._has_tracked else "localising"
 

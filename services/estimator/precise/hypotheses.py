@@ -34,7 +34,7 @@ NEXT_SURROUNDINGS = np.array([[0.784, 0.214, 0.002], [0.498, 0.5, 0.002], [0.014
 
 
 @dataclass(frozen=True)
-class Mode:
+class TrackedHypothesis:
     """One hypothesis about the pose (a mode of the posterior), and the evidence of the last scan."""
 
     pose: Array  # (3,) base_link in map
@@ -68,7 +68,7 @@ class Mode:
 
 @dataclass
 class UnknownPlace:
-    """The hypothesis that the robot is at none of the other ones; evidence in nats, unnormalised as for a `Mode`."""
+    """The hypothesis that the robot is at none of the other ones; evidence in nats, unnormalised as theirs."""
 
     log_evidence: float = 0.0  # of the key scans and the prior
     log_off_map: float = 0.0  # the same for places that are not on the map, which remain after a search of all of it
@@ -138,9 +138,9 @@ def project_evidence(evidence: Evidence, k: int, unobserved: Array) -> None:
         matrix[k] = projection @ matrix[k] @ projection
 
 
-def mode_from_search(
+def hypothesis_from_search(
     pose: Array, evidence: Evidence, k: int, prior: Prior | None, volume: float, spread: Array
-) -> Mode:
+) -> TrackedHypothesis:
     """A hypothesis found by a search: one more step from ``pose`` (3,), where the scan has the k-th evidence.
 
     Without a prior, all poses in ``volume`` m² rad were equally likely, and ``spread`` (3, 3), the covariance of an
@@ -158,7 +158,7 @@ def mode_from_search(
         complexity -= 0.5 * float(np.linalg.slogdet(information)[1])
     else:
         complexity = float(np.log(volume)) + 0.5 * (logdet - 3 * np.log(2 * np.pi * np.e))
-    return Mode(
+    return TrackedHypothesis(
         pose=pose,
         noise_covariance=inverse @ (evidence.xi_noise_covariance[k] + information) @ inverse,
         model_covariance=inverse @ evidence.xi_model_covariance[k] @ inverse,
@@ -179,7 +179,9 @@ def _log_volume_of_place(curvature: Array) -> float:
     return float(1.5 * np.log(2 * np.pi) - 0.5 * float(np.linalg.slogdet(curvature + place)[1]))
 
 
-def update_mode(mode: Mode, fused: FusedMotion, evidence: Evidence, k: int, period: float, *, unobserved: bool) -> Mode:
+def update_hypothesis(
+    hypothesis: TrackedHypothesis, fused: FusedMotion, evidence: Evidence, k: int, period: float, *, unobserved: bool
+) -> TrackedHypothesis:
     """The hypothesis after a scan, from its motion fused with the scan, and from the k-th evidence.
 
     The scan's information reduces the noise covariance. The model's errors are alike from scan to scan, so their
@@ -190,14 +192,14 @@ def update_mode(mode: Mode, fused: FusedMotion, evidence: Evidence, k: int, peri
     inverse = np.linalg.inv(fused.information)
     prior_information = fused.information - evidence.curvature[k]
     inverse_of_scan = np.linalg.inv(evidence.curvature[k] + WEAK_PRIOR)
-    deviation_before = _root(mode.model_covariance)
+    deviation_before = _root(hypothesis.model_covariance)
     scan_deviation = _root(inverse_of_scan @ evidence.xi_model_covariance[k] @ inverse_of_scan)
     model_deviation = deviation_before + inverse @ evidence.curvature[k] @ (scan_deviation - deviation_before)
     # A velocity is dropped unless it was observed in every direction, at this scan and the one before.
     velocity = None
-    if not unobserved and not mode.unobserved_scans:
-        velocity = smooth_velocity(mode.velocity, se2.between(mode.pose, fused.mean) / period, period)
-    return Mode(
+    if not unobserved and not hypothesis.unobserved_scans:
+        velocity = smooth_velocity(hypothesis.velocity, se2.between(hypothesis.pose, fused.mean) / period, period)
+    return TrackedHypothesis(
         pose=fused.mean,
         noise_covariance=inverse @ (evidence.xi_noise_covariance[k] + prior_information) @ inverse,
         model_covariance=model_deviation @ model_deviation.T,
@@ -205,11 +207,11 @@ def update_mode(mode: Mode, fused: FusedMotion, evidence: Evidence, k: int, peri
         complexity=fused.complexity,
         xi=evidence.xi[k],
         curvature=evidence.curvature[k],
-        log_evidence=mode.log_evidence,
-        surroundings=mode.surroundings,
+        log_evidence=hypothesis.log_evidence,
+        surroundings=hypothesis.surroundings,
         velocity=velocity,
         drift_covariance=inverse @ prior_information @ fused.candidate.drift_covariance,
-        unobserved_scans=mode.unobserved_scans + 1 if unobserved else 0,
+        unobserved_scans=hypothesis.unobserved_scans + 1 if unobserved else 0,
     )
 
 
@@ -219,11 +221,13 @@ def _root(covariance: Array) -> Array:
     return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
 
 
-def clip_to_map(modes: list[Mode], bounds: tuple[float, float, float, float]) -> list[Mode]:
+def clip_to_map(
+    hypotheses: list[TrackedHypothesis], bounds: tuple[float, float, float, float]
+) -> list[TrackedHypothesis]:
     """The hypotheses with their positions clipped to the map's bounds x0, y0, x1, y1 (m)."""
     x0, y0, x1, y1 = bounds
     low, high = np.array([x0, y0, -np.inf]), np.array([x1, y1, np.inf])
-    return [replace(mode, pose=np.clip(mode.pose, low, high)) for mode in modes]
+    return [replace(each, pose=np.clip(each.pose, low, high)) for each in hypotheses]
 
 
 def same_place(poses: Array, pose: Array) -> npt.NDArray[np.bool_]:
@@ -243,19 +247,19 @@ def select_best(poses: Array, log_weights: Array, count: int) -> list[int]:
     return kept
 
 
-def weigh(modes: list[Mode], log_unknown: float, count: int) -> tuple[list[Mode], float]:
+def weigh(hypotheses: list[TrackedHypothesis], log_unknown: float, count: int) -> tuple[list[TrackedHypothesis], float]:
     """Normalises the weights of the best hypothesis at each place, and drops those of negligible weight.
 
     Returns up to ``count`` hypotheses, best first, whose weights sum to 1, and the probability that the robot is at
     none of them. ``log_unknown`` is the unnormalised logarithm of that.
     """
-    logs = np.array([mode.log_weight for mode in modes])
-    best = select_best(np.array([mode.pose for mode in modes]), logs, count)
+    logs = np.array([each.log_weight for each in hypotheses])
+    best = select_best(np.array([each.pose for each in hypotheses]), logs, count)
     log_known = np.logaddexp.reduce(logs[best])
     weights = np.exp(logs[best] - log_known)
     kept = weights > MIN_WEIGHT
     weights /= weights[kept].sum()
-    weighted = [replace(modes[k], weight=float(w)) for k, w, keep in zip(best, weights, kept, strict=True) if keep]
+    weighted = [replace(hypotheses[k], weight=float(w)) for k, w, keep in zip(best, weights, kept, strict=True) if keep]
     return weighted, float(np.exp(log_unknown - np.logaddexp(log_known, log_unknown)))
 
 

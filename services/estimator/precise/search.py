@@ -15,8 +15,8 @@ from services.estimator.precise.gauss_newton import (
     View,
 )
 from services.estimator.precise.hypotheses import (
-    Mode,
-    mode_from_search,
+    TrackedHypothesis,
+    hypothesis_from_search,
     project_evidence,
     select_best,
     unobserved_directions,
@@ -37,7 +37,7 @@ SEED_SCHEDULE_M = (MEDIUM_SIGMA_M, MEDIUM_SIGMA_M, 0.05, 0.05)
 NEAR_SCHEDULE_M = (COARSE_SIGMA_M, COARSE_SIGMA_M, MEDIUM_SIGMA_M, MEDIUM_SIGMA_M)
 
 
-def search_everywhere(views: list[View], seeds: Seeds, settings: PreciseSettings) -> list[Mode]:
+def search_everywhere(views: list[View], seeds: Seeds, settings: PreciseSettings) -> list[TrackedHypothesis]:
     """Returns the hypotheses that fit best in the whole map, best first.
 
     ``views`` are the same scan with different errors of the map. Descends from those of the best seeds that have the
@@ -51,7 +51,7 @@ def search_everywhere(views: list[View], seeds: Seeds, settings: PreciseSettings
     poses, _ = few.descend(starts, None, SEED_SCHEDULE_M)
     fit = few.surface_evidence(poses, SEED_SCHEDULE_M[-1]).log_likelihood
     starts = poses[select_best(poses, fit, settings.search_results)]
-    return _best_first([_best_modes(each, *each.descend(starts), None, seeds, settings) for each in views])
+    return _best_first([_best_hypotheses(each, *each.descend(starts), None, seeds, settings) for each in views])
 
 
 def search_near(
@@ -61,7 +61,7 @@ def search_near(
     seeds: Seeds,
     settings: PreciseSettings,
     rng: np.random.Generator,
-) -> list[Mode]:
+) -> list[TrackedHypothesis]:
     """Returns the hypotheses that fit best near ``pose`` (3,), which is known within ``covariance`` (3, 3).
 
     ``views`` are the same scan with different errors of the map.
@@ -73,7 +73,7 @@ def search_near(
     fit = views[0].surface_evidence(poses, NEAR_SCHEDULE_M[-1]).log_likelihood - prior.energy(poses)
     starts = poses[select_best(poses, fit, settings.search_results)]
     prior = Prior.repeated(len(starts), pose, covariance)
-    return _best_first([_best_modes(each, *each.descend(starts, prior), prior, seeds, settings) for each in views])
+    return _best_first([_best_hypotheses(each, *each.descend(starts, prior), prior, seeds, settings) for each in views])
 
 
 def search_around(view: View, starts: Array, prior: Prior, extra_starts: Array) -> tuple[Array, Evidence]:
@@ -93,27 +93,27 @@ def search_around(view: View, starts: Array, prior: Prior, extra_starts: Array) 
     return poses[keep], evidence.part(keep)
 
 
-def _best_modes(
+def _best_hypotheses(
     view: View, poses: Array, evidence: Evidence, prior: Prior | None, seeds: Seeds, settings: PreciseSettings
-) -> list[Mode]:
+) -> list[TrackedHypothesis]:
     """The hypotheses with most evidence by surfaces among ``poses`` (N, 3), best first."""
     surfaces = view.surface_evidence(poses)
     log_likelihood = surfaces.without(view.surfaces.small)
     log_prior = -prior.energy(poses) if prior else np.zeros(len(poses))
-    modes, kept = [], select_best(poses, log_likelihood + log_prior, settings.max_hypotheses)
+    hypotheses, kept = [], select_best(poses, log_likelihood + log_prior, settings.max_hypotheses)
     for k, unobserved in zip(kept, unobserved_directions(view, poses[kept], evidence.curvature[kept]), strict=True):
         project_evidence(evidence, k, unobserved)
-        mode = mode_from_search(poses[k], evidence, k, prior, seeds.volume, seeds.spread)
-        modes.append(
+        hypothesis = hypothesis_from_search(poses[k], evidence, k, prior, seeds.volume, seeds.spread)
+        hypotheses.append(
             replace(
-                mode,
+                hypothesis,
                 explained=float(surfaces.explained[k]),
-                log_evidence=view.log_prior + mode.log_evidence + float(log_prior[k]),
+                log_evidence=view.log_prior + hypothesis.log_evidence + float(log_prior[k]),
                 scan_log_likelihood=float(log_likelihood[k]),
             )
         )
-    return modes
+    return hypotheses
 
 
-def _best_first(found: list[list[Mode]]) -> list[Mode]:
-    return sorted((mode for modes in found for mode in modes), key=lambda mode: -mode.log_weight)
+def _best_first(found: list[list[TrackedHypothesis]]) -> list[TrackedHypothesis]:
+    return sorted((each for hypotheses in found for each in hypotheses), key=lambda each: -each.log_weight)

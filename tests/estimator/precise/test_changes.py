@@ -111,9 +111,9 @@ def test_standing_robot():
     path = np.tile([5.5, CORRIDOR_Y, 0.5], (100, 1))
     made.restart(path[0], CLOSE)
     found = drive(made, scene, path[:1])
-    evidence = [mode.log_evidence for mode in made.modes]
+    evidence = [each.log_evidence for each in made.hypotheses]
     found += drive(made, scene, path[1:], 1)
-    assert [mode.log_evidence for mode in made.modes] == evidence
+    assert [each.log_evidence for each in made.hypotheses] == evidence
     assert found[-1].probability == pytest.approx(found[0].probability, abs=1e-3)
 
 
@@ -165,13 +165,13 @@ def test_alternatives_are_in_the_same_surroundings():
     made.restart(np.array([3.0, CORRIDOR_Y, 0.0]), CLOSE)
     drive(made, scene, [[3.0, CORRIDOR_Y, 0.0]])
     view = made._scan[0]
-    (before,) = made.modes
+    (before,) = made.hypotheses
     unmapped = np.array([0.0, 0.0, 1.0])
-    made.modes = [replace(before, noise_covariance=0.1 * np.eye(3), surroundings=unmapped)]
+    made.hypotheses = [replace(before, noise_covariance=0.1 * np.eye(3), surroundings=unmapped)]
     motion = MotionCandidate(before.pose, 0.1 * np.eye(3), 1.0)
     found = made._find_alternatives(view, before, [motion], motion)
     assert found
-    assert all(np.array_equal(mode.surroundings, unmapped) for mode in found)
+    assert all(np.array_equal(each.surroundings, unmapped) for each in found)
 
 
 @pytest.fixture(scope="module")
@@ -230,7 +230,7 @@ def test_odometry_with_the_wrong_sign(driven):
 def test_motion_from_recent_scans_ignores_the_map(driven):
     """After a pose that the map has pulled aside, recent scans still show how the robot moves."""
     made, scene, path = copy.deepcopy(driven)
-    made.modes = [replace(mode, pose=mode.pose + np.array([0.0, 0.25, 0.05])) for mode in made.modes]
+    made.hypotheses = [replace(each, pose=each.pose + np.array([0.0, 0.25, 0.05])) for each in made.hypotheses]
     found = drive(made, scene, path[-1:], len(path))[0]
     assert np.hypot(*(found.pose - path[-1])[:2]) < 0.1
     assert not made._change_rate.remembered

@@ -172,7 +172,7 @@ def test_motion_along_a_hall_by_what_the_map_lacks():
     scene = Scene.of(World(name="hall", boundary=HALL.boundary, obstacles=columns), 360, 4)
     path = straight(27.0, 1.0, 0.0, 3.0, speed=0.8)
     found = drive(made, scene, path)
-    assert made.modes[0].explained > made.settings.min_explained_fraction
+    assert made.hypotheses[0].explained > made.settings.min_explained_fraction
     error, stated = off(found[-1], path[-1]), np.sqrt(np.diag(found[-1].covariance))
     assert abs(error[0]) < min(0.2, 3 * stated[0])
 
@@ -324,7 +324,7 @@ def test_belief_stays_in_the_map(hall_estimator, kinds, seed, period):
     made.restart(pose, np.diag([1e-4] * 3))
     clean = scene.clean(pose[None])[0]
     for k, kind in enumerate(["ordinary", *kinds]):
-        before = np.array([mode.pose[:2] for mode in made.modes])
+        before = np.array([hypothesis.pose[:2] for hypothesis in made.hypotheses])
         ranges = odd_scan(kind, clean, rng)
         observation = Observation(ranges, scene.scanner.angles(), 25.0, k * period)
         posterior = made.track(observation)
@@ -337,8 +337,8 @@ def test_belief_stays_in_the_map(hall_estimator, kinds, seed, period):
             assert 0 <= each.pose[1] <= 2
             assert np.diag(each.covariance)[:2].max() < 2 * 60**2
         if not searched:
-            for mode in made.modes:
-                moved = np.abs(mode.pose[:2] - before).max(axis=1).min()
+            for hypothesis in made.hypotheses:
+                moved = np.abs(hypothesis.pose[:2] - before).max(axis=1).min()
                 assert moved <= 20 * 0.5 + 3 * made.settings.motion.speed * period
 
 

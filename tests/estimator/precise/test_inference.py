@@ -15,7 +15,7 @@ from common.geometry.world import World
 from services.estimator.precise import beam_sums, global_seeds
 from services.estimator.precise.gauss_newton import MAX_STEP, Prior, View
 from services.estimator.precise.global_seeds import Seeds, thin_places
-from services.estimator.precise.hypotheses import Mode, select_best, unobserved_directions, weigh
+from services.estimator.precise.hypotheses import TrackedHypothesis, select_best, unobserved_directions, weigh
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.motion_model import (
     MotionCandidate,
@@ -263,20 +263,25 @@ def test_unobserved_motion():
     assert np.sqrt(np.diag(every.covariance)) == pytest.approx([3, 3, 6], rel=1e-3)
 
 
-def mode(x, log_evidence, log_likelihood=0.0):
+def make_hypothesis(x, log_evidence, log_likelihood=0.0):
     pose, zero, one = np.array([x, 0.0, 0.0]), np.zeros((3, 3)), np.eye(3)
     evidence = {"log_evidence": log_evidence, "scan_log_likelihood": log_likelihood}
-    return Mode(pose, one, zero, 1.0, 0.0, np.zeros(3), one, **evidence)
+    return TrackedHypothesis(pose, one, zero, 1.0, 0.0, np.zeros(3), one, **evidence)
 
 
 def test_hypothesis_weights():
-    modes = [mode(5.0, -1.0), mode(0.0, 3.0, -3.0), mode(0.01, -3.0), mode(9.0, -5000.0)]
-    found, unknown = weigh(modes, -2.0, 8)
+    hypotheses = [
+        make_hypothesis(5.0, -1.0),
+        make_hypothesis(0.0, 3.0, -3.0),
+        make_hypothesis(0.01, -3.0),
+        make_hypothesis(9.0, -5000.0),
+    ]
+    found, unknown = weigh(hypotheses, -2.0, 8)
     assert [m.pose[0] for m in found] == [0.0, 5.0]
     assert found[0].weight / found[1].weight == pytest.approx(np.e)
     assert sum(m.weight for m in found) == pytest.approx(1)
     assert unknown / (1 - unknown) == pytest.approx(np.exp(-2) / (1 + np.exp(-1)))
-    (best,), unknown = weigh(modes, 5000.0, 1)
+    (best,), unknown = weigh(hypotheses, 5000.0, 1)
     assert best.weight == unknown == 1
 
 

@@ -62,7 +62,10 @@ def test_improbable_room(weight, state):
     """The robot is not lost if nothing but another room keeps the belief from being tracked."""
     made, scene = begun("exact", 0)
     made.update(scene.observe(scene.clean(np.array([[2.0, 2.2, 0.0]]))[0], 0.0))
-    made.modes = [replace(mode, weight=share) for mode, share in zip(made.modes, (1 - weight, weight), strict=True)]
+    made.hypotheses = [
+        replace(hypothesis, weight=share)
+        for hypothesis, share in zip(made.hypotheses, (1 - weight, weight), strict=True)
+    ]
     assert made._state() == state
     made._unknown_place.weight = 0.5
     assert (made._state() == "ambiguous") == (weight > 0.1)
