@@ -62,7 +62,8 @@ class Page:
         parts = urlsplit(link)
         query = f"?{parts.query}" if parts.query else ""
         waits = {"open_timeout": WAIT_TIMEOUT_S, "ping_timeout": WAIT_TIMEOUT_S, "close_timeout": 2}
-        options = {"compression": None, "max_size": None, **waits, **options}
+        # Like a browser, it reads whatever comes: otherwise pings are not answered, and the server closes the socket.
+        options = {"compression": None, "max_size": None, "max_queue": None, **waits, **options}
         origin = origin or f"http://{parts.netloc}"
         self.socket = connect(f"ws://{parts.netloc}/ws{query}", origin=origin, **options).__enter__()
         self.numbers = itertools.count(1)

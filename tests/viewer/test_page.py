@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from tests.conftest import ROOT, WAIT_TIMEOUT_S
-from tests.viewer.client import Page, page_of
+from tests.viewer.client import Page
+from tests.viewer.live_system import System
 
 STATIC = ROOT / "services" / "viewer" / "static"
 AWAY = "Math.hypot({0}.x - arg[0], {0}.y - arg[1])"  # m from a given place
@@ -28,40 +29,9 @@ COLOURS = """(() => {
 })()"""
 
 
-class System:
-    """Everything that `presage up` starts."""
-
-    def __init__(self, processes):
-        self.processes = processes
-        _, port = self.processes.start_router()
-        self.environment = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{port}", "PRESAGE_ROBOT": "robot"}
-        self.folder, self.running = processes.folder / "recordings", {}
-        self.folder.mkdir()
-        for name in ("simulator", "estimator", "controller"):
-            self.start(name)
-        self.start("recorder", "--idle", "--directory", str(self.folder))
-        self.address = page_of(self.start("viewer", "--port", "0", "--recordings", str(self.folder)))
-
-    def start(self, name, *args):
-        self.running[name] = self.processes.start(name, *args, env=self.environment)
-        return self.running[name]
-
-
 @pytest.fixture(scope="module")
 def system(module_processes):
     return System(module_processes)
-
-
-@pytest.fixture
-def page(browser, system):
-    """A visitor of a robot that is tracked."""
-    from tests.viewer.browser import visit  # without playwright these tests are skipped
-
-    seen = visit(browser, system.address)
-    seen.wait("store.frame?.belief?.state === 'tracking' && store.world")
-    yield seen
-    seen.page.context.close()
-    assert seen.complaints == []
 
 
 def test_sources():
@@ -93,38 +63,6 @@ def test_frames(page):
     page.wait("document.querySelector('#estimator-badge b').innerText === 'tracking'")
     page.wait("document.querySelectorAll('#services tr').length >= 5")
     page.wait(f"{COLOURS} > 20")  # more than an empty canvas has
-
-
-def test_goals(page):
-    page.page.keyboard.press("g")
-    page.click(9.0, 0.05)
-    assert "wall" in page.toast(ok=False)
-    x, y = page.see("[store.frame.truth.x, store.frame.truth.y]")
-    goal = (x + (1.5 if x < 9 else -1.5), y)
-    page.click(*goal)
-    assert page.toast().startswith("Going to (")
-    page.wait(f"store.frame.status?.goal && {AWAY.format('store.frame.status.goal')} < 0.1", argument=goal)
-    page.wait("store.frame.status.state === 'reached'")
-    page.wait(f"{AWAY.format('store.frame.truth')} < 0.35", argument=goal)
-
-
-def test_kidnapping(page):
-    x = page.see("store.frame.truth.x")
-    there = (13.0, 1.2) if x < 9 else (5.0, 1.2)
-    page.wait("store.frame.error < 0.1")
-    page.see(SEEN)
-    page.page.mouse.move(*page.at(*there))
-    page.page.keyboard.down("Shift")
-    page.click(*there)
-    page.page.keyboard.up("Shift")
-    page.toast("Carried")
-    page.page.locator("#journal b", has_text="carried").first.wait_for(timeout=1000 * WAIT_TIMEOUT_S)
-    found = f"store.frame.belief?.state === 'tracking' && {AWAY.format('store.frame.belief')} < 0.6"
-    page.wait(f"{found} && store.frame.error < 0.1", argument=there)
-    off = [error for _, _, error in page.see("window.seen") if error >= 0]
-    assert off[0] < 0.1  # it was localised,
-    assert max(off) > 3  # then metres off on the map,
-    assert off[-1] < 0.1  # and localised again
 
 
 def test_obstacles_and_keys(page):
