@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.conftest import WAIT_TIMEOUT_S
+
 ROOT = Path(__file__).resolve().parent.parent
 
 
@@ -33,7 +35,9 @@ def install(tmp_path):
 
     def run(*args, target="install"):
         command = ["make", "--dry-run", target, *args]
-        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=60).stdout
+        return subprocess.run(
+            command, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=WAIT_TIMEOUT_S
+        ).stdout
 
     return run
 

@@ -29,7 +29,9 @@ def objects(text: str) -> list[dict]:
 def test_lines_as_json():
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     noisy = Path(__file__).with_name("noisy_process.py")
-    done = subprocess.run([sys.executable, str(noisy)], env=environment, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, str(noisy)], env=environment, capture_output=True, text=True, timeout=WAIT_TIMEOUT_S
+    )
     assert done.returncode == 1
     assert done.stdout == "printed text\n"
     found = {line["event"]: line for line in objects(done.stderr)}

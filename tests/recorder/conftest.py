@@ -41,7 +41,7 @@ def request_recording(bus):
     """A function that sends a RecordRequest."""
 
     def send(action: str) -> RecordReply:
-        reply: RecordReply = bus.query(RECORDING, RecordRequest(action=action), RecordReply, timeout=20)
+        reply: RecordReply = bus.query(RECORDING, RecordRequest(action=action), RecordReply, timeout=WAIT_TIMEOUT_S)
         return reply
 
     return send

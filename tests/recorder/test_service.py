@@ -219,7 +219,7 @@ def test_parts_by_time(recorder, recorder_health, bus, logs):
             sent[key] += payloads
         return len(list(logs.glob("*.mcap"))) >= 2
 
-    assert wait_until(two_parts, 20, 0.05)
+    assert wait_until(two_parts, WAIT_TIMEOUT_S, 0.05)
     recorder_health(received(bus, sum(map(len, sent.values()))))
     assert running.stop() == 0
     files = sorted(logs.iterdir())

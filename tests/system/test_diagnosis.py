@@ -178,7 +178,7 @@ def test_read_only_disk_and_no_weights(tmp_path, free_port):
     )
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "PRESAGE_DIRECTORY": str(disk)}
     done = subprocess.run(
-        ["unshare", "-m", "sh", "-c", command], env=environment, capture_output=True, text=True, timeout=120
+        ["unshare", "-m", "sh", "-c", command], env=environment, capture_output=True, text=True, timeout=WAIT_TIMEOUT_S
     )
     assert done.returncode == 1, done.stderr
     found = read_findings(tmp_path)

@@ -47,7 +47,7 @@ class RobotListener:
             return False
         return np.hypot(message.pose.x - truth.pose.x, message.pose.y - truth.pose.y) < MAX_ERROR
 
-    def wait(self, condition, what, timeout=60.0):
+    def wait(self, condition, what, timeout=WAIT_TIMEOUT_S):
         assert wait_until(lambda: self.matches(condition), timeout), f"{self.robot}: not {what}"
 
 

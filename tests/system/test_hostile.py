@@ -73,7 +73,7 @@ def system(module_processes, router):
     environment = {"PRESAGE_CONNECT": link.connect[0], "PRESAGE_ROBOT": link.robot, "PRESAGE_DIRECTORY": str(folder)}
     with open_bus(link) as bus:
         running = {name: module_processes.start(name, env=environment) for name in SERVICES}
-        assert wait_until(lambda: set(SERVICES) <= bus.alive(), 60)
+        assert wait_until(lambda: set(SERVICES) <= bus.alive(), WAIT_TIMEOUT_S)
         yield bus, running, folder
 
 
@@ -125,7 +125,7 @@ def test_requests(system, before, query):
     @settings(max_examples=EXAMPLES, suppress_health_check=list(HealthCheck))
     @given(malformed_payloads(query.request))
     def ask(payload):
-        (answer,) = bus._session.get(query.key(bus.robot, service), payload=payload, timeout=30)
+        (answer,) = bus._session.get(query.key(bus.robot, service), payload=payload, timeout=WAIT_TIMEOUT_S)
         assert answer.err is not None
         assert query.request.__name__ in answer.err.payload.to_string()
 

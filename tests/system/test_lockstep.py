@@ -15,7 +15,7 @@ from common.messages.topics import BELIEF, CMD_VEL, GOAL, HEALTH, ODOM, PREDICTI
 from presage.logs.importing import ImportOptions, import_command
 from services.recorder.files.writer import RecordingWriter
 from services.recorder.reader import read_recording
-from tests.conftest import ROOT, wait_for_message
+from tests.conftest import ROOT, WAIT_TIMEOUT_S, wait_for_message
 from tests.estimator.models import change_weights
 from tests.presage.logs.drives import Bag, write_bag
 
@@ -60,7 +60,7 @@ class Session:
                 self.start("estimator", "--initial-pose", "3.2,1.4", "--models", str(self.models)),
                 self.start("simulator", "--pace", "lockstep", "--seed", "3", "--beams", "622", "--wait-for", wait_for),
             ]
-            assert wait_until(lambda: bus.alive() >= SERVICES, 60), [each.output for each in started]
+            assert wait_until(lambda: bus.alive() >= SERVICES, WAIT_TIMEOUT_S), [each.output for each in started]
             key = GOAL.key(bus.robot)
             bus.put(GOAL, Goal(stamp_ns=0, pose=Pose(x=15.5, y=1.5)).encode())
             wait_for_message(inbox, Health, lambda h: any(t.key == key and t.received for t in h.topics))

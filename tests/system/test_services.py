@@ -12,7 +12,7 @@ from common.bus.bus import wait_until
 from common.bus.inbox import Inbox
 from common.messages.definitions import Goal, Pose
 from common.messages.topics import BELIEF, CMD_VEL, GOAL, STATUS, TRUTH
-from tests.conftest import wait_for_message
+from tests.conftest import WAIT_TIMEOUT_S, wait_for_message
 
 SERVICES = dict.fromkeys(("recorder", "controller"), signal.SIGINT)
 SERVICES |= dict.fromkeys(("simulator", "estimator"), signal.SIGTERM)
@@ -49,7 +49,7 @@ def test_clean_end_alone(process, bus, tmp_path):
         name: process(name, *(("--directory", str(tmp_path)) if name == "recorder" else ()), fresh=True)
         for name in SERVICES
     }
-    assert wait_until(lambda: SERVICES.keys() <= bus.alive(), 60)
+    assert wait_until(lambda: SERVICES.keys() <= bus.alive(), WAIT_TIMEOUT_S)
     for name, number in SERVICES.items():
         assert started[name].stop(number) == 0, started[name].output
         assert "Traceback" not in started[name].output
@@ -70,7 +70,7 @@ def test_death_and_restart(process, bus):
     running = {}
     for name in ("controller", "estimator", "simulator"):
         running[name] = process(name, *(("--initial-pose", "3,1.5,90") if name == "estimator" else ()))
-        assert wait_until(lambda n=name: n in bus.alive(), 60)
+        assert wait_until(lambda n=name: n in bus.alive(), WAIT_TIMEOUT_S)
     next_message(bus, BELIEF, lambda belief: belief.state == "tracking")
     assert bus.wait_matching(GOAL, 10)
     bus.put(GOAL, Goal(stamp_ns=0, pose=Pose(x=15.5, y=1.5)).encode())

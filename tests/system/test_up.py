@@ -115,7 +115,7 @@ def up(process, free_port, tmp_path):
         port = free_port()
         args = ("up", "--port", str(port), *args)
         running = process(tmp_path / "background.py", *args, env={"PRESAGE_VIEWER_PORT": "0", **env})
-        running.wait_for("all alive", 120)
+        running.wait_for("all alive", WAIT_TIMEOUT_S)
         return running, psutil.Process(running.child.pid).children(), port
 
     return start
@@ -152,7 +152,7 @@ def test_up_with_two_robots(up):
             )
             assert abs(belief.pose.x - truth.pose.x) < 0.3
             alive = {"estimator", "simulator", "controller"}
-            assert wait_until(lambda bus=bus, alive=alive: bus.alive() == alive, 60), bus.alive()
+            assert wait_until(lambda bus=bus, alive=alive: bus.alive() == alive, WAIT_TIMEOUT_S), bus.alive()
     assert running.stop(signal.SIGTERM) == 130
     assert wait_until(lambda: all(map(ended, children)), 10)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from common.geometry.world import load_world
+from tests.conftest import WAIT_TIMEOUT_S
 from tests.viewer.client import page_of
 
 
@@ -52,7 +53,7 @@ def test_drive_explore_and_save(browser, processes):
     # The next session, in a known world, on the same page.
     for service in processes.started:
         if service.name in {"simulator", "mapper", "controller"}:
-            service.stop(timeout=60)
+            service.stop(timeout=WAIT_TIMEOUT_S)
     processes.start("simulator", "--world", "maze", env=environment)
     seen.wait("store.map === null && store.world?.name === 'maze' && store.frame.truth !== null")
     seen.page.context.close()

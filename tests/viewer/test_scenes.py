@@ -291,10 +291,10 @@ def test_server_that_comes_back(browser, processes):
     seen = browser_tools.visit(browser, f"http://127.0.0.1:{port}/planning/")
     seen.wait("store.arrivals.length > 5 && store.prior")
     first.stop(signal.SIGKILL)
-    seen.page.locator("#banner").wait_for(timeout=10_000)
+    seen.page.locator("#banner").wait_for(timeout=1000 * WAIT_TIMEOUT_S)
     assert "No connection" in seen.page.locator("#banner").inner_text()
     processes.start("tests.viewer.stub_server", "--port", port)
-    seen.page.locator("#banner").wait_for(state="hidden", timeout=30_000)
+    seen.page.locator("#banner").wait_for(state="hidden", timeout=1000 * WAIT_TIMEOUT_S)
     seen.wait("store.connected && store.prior && performance.now() - store.arrivals.at(-1) < 500")
     seen.page.context.close()
 

@@ -18,6 +18,7 @@ from common.messages.definitions import Scan
 from common.messages.topics import SCAN
 from common.runtime.heartbeat import Heartbeat, read_beats
 from common.runtime.service_monitor import Report
+from tests.conftest import WAIT_TIMEOUT_S
 
 ROOT = Path(__file__).resolve().parents[3]
 SMALL = Path(__file__).parents[1] / "small_service.py"
@@ -62,7 +63,7 @@ def check(service, folder=None, **environment):
     variables = {"PYTHONPATH": str(ROOT), **({"PRESAGE_HEARTBEAT": str(folder)} if folder else {})}
     done = subprocess.run(
         [sys.executable, "-m", "common.containers.healthcheck", service],
-        env={**clean, **variables, **environment}, capture_output=True, text=True, timeout=60,
+        env={**clean, **variables, **environment}, capture_output=True, text=True, timeout=WAIT_TIMEOUT_S,
     )  # fmt: skip
     return done.returncode, done.stderr.strip()
 

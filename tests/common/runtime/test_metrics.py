@@ -56,7 +56,7 @@ def address_of(running) -> str:
 
 
 def scrape(address: str) -> str:
-    with urllib.request.urlopen(address, timeout=10) as answer:
+    with urllib.request.urlopen(address, timeout=WAIT_TIMEOUT_S) as answer:
         return answer.read().decode()
 
 

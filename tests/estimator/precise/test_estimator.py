@@ -21,6 +21,7 @@ from services.estimator.precise.estimator import TARGET_BEAMS, PreciseEstimator
 from services.estimator.precise.global_seeds import Seeds, thin_places
 from services.estimator.shared.generative_models import RayCaster
 from services.estimator.shared.interface import Observation
+from tests.conftest import WAIT_TIMEOUT_S
 from tests.estimator.models import ROOM
 
 BEAMS = 271
@@ -393,4 +394,4 @@ for model in ("learned", "exact"):
 
 
 def test_no_scan_waits_for_compilation():
-    subprocess.run([sys.executable, "-c", COUNT_COMPILED], check=True, timeout=300)
+    subprocess.run([sys.executable, "-c", COUNT_COMPILED], check=True, timeout=WAIT_TIMEOUT_S)

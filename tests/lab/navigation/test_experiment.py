@@ -28,7 +28,7 @@ from lab.navigation import shortest_path as shortest
 from lab.navigation.shortest_path import NavigationTask, ShortestPaths, draw_task, length, load_shortest_paths
 from lab.navigation.worlds import RULES, StartGoalRule, seed_of, world_of
 from lab.pages import tables_page as page
-from tests.conftest import ended
+from tests.conftest import WAIT_TIMEOUT_S, ended
 
 QUIET = Console(quiet=True)
 ROBOT, TURNING = Robot(), Robot(drive="differential")
@@ -350,7 +350,7 @@ def test_interrupted_and_killed_runs(process, tmp_path):
             c for c in psutil.Process(run.child.pid).children(recursive=True) if "services" in " ".join(c.cmdline())
         ]
 
-    assert wait_until(services, 90), run.output
+    assert wait_until(services, WAIT_TIMEOUT_S), run.output
     children = psutil.Process(run.child.pid).children(recursive=True)
     run.kill()
     assert wait_until(lambda: all(map(ended, children)), 20)

@@ -21,6 +21,7 @@ from services.recorder.files.writer import RecordingWriter
 from services.recorder.replaying import player as core
 from services.recorder.replaying import replay as shell
 from services.recorder.replaying.replay import ReplayOptions, replay
+from tests.conftest import WAIT_TIMEOUT_S
 from tests.recorder import sessions
 
 SECOND_NS = 10**9
@@ -108,7 +109,7 @@ def control(bus):
     """A function that sends a request to the replay."""
 
     def send(action, value=0.0):
-        return bus.query(PLAYER, PlayerRequest(action=action, value=value), PlayerReply, timeout=20)
+        return bus.query(PLAYER, PlayerRequest(action=action, value=value), PlayerReply, timeout=WAIT_TIMEOUT_S)
 
     return send
 
@@ -226,7 +227,7 @@ def test_hostile_requests(start, bus, control):
     start(ON_REQUEST)
 
     def refused(payload):
-        (answer,) = bus._session.get(PLAYER.key(bus.robot), payload=payload, timeout=30)
+        (answer,) = bus._session.get(PLAYER.key(bus.robot), payload=payload, timeout=WAIT_TIMEOUT_S)
         return answer.err is not None and "PlayerRequest" in answer.err.payload.to_string()
 
     @settings(max_examples=50, suppress_health_check=list(HealthCheck))
@@ -244,15 +245,15 @@ def test_hostile_requests(start, bus, control):
 
 def test_descriptions(start, bus, session):
     start(replace(ON_REQUEST, paused=True), session)
-    reply = bus.query(CONFIG, Request(), ConfigReply, timeout=20, service="replay")
+    reply = bus.query(CONFIG, Request(), ConfigReply, timeout=WAIT_TIMEOUT_S, service="replay")
     assert json.loads(reply.config)["file"] == str(session)
-    world = bus.query(WORLD, Request(), WorldReply, timeout=20)
+    world = bus.query(WORLD, Request(), WorldReply, timeout=WAIT_TIMEOUT_S)
     assert (world.world, world.scanner, world.robot.radius) == (sessions.WORLD, sessions.SCANNER, 0.3)
 
 
 def test_recording_without_world(start, bus):
     start(ON_REQUEST)
-    reply = bus.query(WORLD, Request(), WorldReply, timeout=20)
+    reply = bus.query(WORLD, Request(), WorldReply, timeout=WAIT_TIMEOUT_S)
     assert (reply.ok, reply.reason) == (False, "run.mcap does not hold its world")
 
 
@@ -263,7 +264,7 @@ def test_world_beside_a_simulator(start, session, bus):
     start(replace(ON_REQUEST, paused=True, force=True), session)
     answering = threading.Thread(target=lambda: inbox.get(20).reply(WorldReply(ok=False, reason="mine").encode()))
     answering.start()
-    assert bus.query(WORLD, Request(), WorldReply, timeout=20).reason == "mine"
+    assert bus.query(WORLD, Request(), WorldReply, timeout=WAIT_TIMEOUT_S).reason == "mine"
     answering.join()
 
 
