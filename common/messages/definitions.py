@@ -185,6 +185,11 @@ class Map(Stamped):
     frame_id: Name = "map"
 
     @property
+    def key_scans(self) -> int:
+        """Number of key scans so far, connected to the map or not."""
+        return len(self.connected) or len(self.poses)
+
+    @property
     def numbers(self) -> npt.NDArray[np.intp]:
         """Number (K,) of each key scan in `poses`: its index among all so far, the same in all versions of the map."""
         return np.flatnonzero(self.connected) if len(self.connected) else np.arange(len(self.poses))

@@ -13,13 +13,15 @@ import numpy as np
 import numpy.typing as npt
 
 from common.geometry.se2 import wrap
+from common.robot.motion_distortion import correct_scan
 from common.robot.ranges import NOT_MEASURED
 from common.robot.scan_geometry import Sweep
 
 if TYPE_CHECKING:
+    from common.geometry.se2 import Array
     from common.messages.definitions import Scan
 
-# A sector at least this wide is removed from the field of view; a narrower one, such as a post, is only masked.
+# A sector at least this wide can be removed from the field of view; a narrower one, such as a post, is only masked.
 MIN_TRIMMED_SECTOR_RAD = float(np.deg2rad(30))
 
 Mask = npt.NDArray[np.bool_]
@@ -41,12 +43,17 @@ class SelfFilter:
         """The scan to publish: masked beams are marked as not measured."""
         return self._mask(scan, NOT_MEASURED) if self.is_active else scan
 
-    def mask_for_planning(self, scan: Scan) -> Scan:
-        """The scan for braking and planning, not to be published: masked beams are NaN, and wide sectors are removed.
+    def correct_and_mask(self, scan: Scan, velocity: Array) -> Scan:
+        """The scan for braking and planning, not to be published; the robot moves with ``velocity`` (3,) in base_link.
 
-        A wide sector in the middle of a scan that does not cover the full circle cannot be removed and is NaN only.
+        It is corrected for that motion, see `correct_scan`. Masked beams are NaN, or 0 if the scan was corrected. A
+        wide sector at an end of the scan is removed from the field of view; of a scan that covers the full circle, the
+        widest sector.
         """
-        return _trim_wide_sectors(self._mask(scan, np.nan), self._in_sectors(scan)) if self.is_active else scan
+        if not self.is_active:
+            return correct_scan(scan, velocity)
+        corrected = correct_scan(self._mask(scan, np.nan), velocity)
+        return _trim_wide_sectors(corrected, self._in_sectors(corrected))
 
     def _in_sectors(self, scan: Scan) -> Mask:
         angles, inside = scan.angles(), np.zeros(len(scan.ranges), bool)
@@ -63,20 +70,27 @@ class SelfFilter:
 
 
 def _trim_wide_sectors(scan: Scan, in_sector: Mask) -> Scan:
-    """Removes the beams ``in_sector`` (B,) from both ends of a scan, as far as they form wide sectors."""
+    """Removes the beams ``in_sector`` (B,) from both ends of a scan, as far as they form wide sectors.
+
+    The scan takes as long as before. The times of its beams are not kept, so it must have been corrected for motion.
+    """
     sweep, shift = Sweep.of(scan), 0
     if in_sector.all() or not in_sector.any() or not sweep.spacing:
         return scan
+    ranges = scan.ranges
     if sweep.all_round:
+        beams = min(len(ranges), round(2 * np.pi / sweep.spacing))  # further ones repeat the directions of the first
+        ranges, in_sector = ranges[:beams], in_sector[:beams]
         shift = _end_of_longest_run(in_sector)  # rotate the longest run to the end, where it can be removed
-        in_sector = np.roll(in_sector, -shift)
+        ranges, in_sector = np.roll(ranges, -shift), np.roll(in_sector, -shift)
     min_beams = max(1, round(MIN_TRIMMED_SECTOR_RAD / sweep.spacing))
     first, last = (run if run >= min_beams else 0 for run in (_leading_run(in_sector), _leading_run(in_sector[::-1])))
     if not (first or last):
         return scan
-    ranges = np.roll(scan.ranges, -shift)[first : len(in_sector) - last]
+    ranges = ranges[first : len(ranges) - last]
+    time_increment = scan.time_increment * (len(scan.ranges) - 1) / max(1, len(ranges) - 1)
     angle_min = float(wrap(scan.angle_min + scan.angle_increment * (shift + first)))
-    return scan.model_copy(update={"ranges": ranges, "angle_min": angle_min})
+    return scan.model_copy(update={"ranges": ranges, "angle_min": angle_min, "time_increment": time_increment})
 
 
 def _leading_run(mask: Mask) -> int:

@@ -33,16 +33,19 @@ ROOM_WIDTH_M, DOOR_WIDTH_M = 6.0, 1.2
 def bench_map(
     world: str, size: int, beams: int, out: Path | None, seed: int, json_file: Path | None, console: Console
 ) -> int:
-    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0.
+
+    Without ``world``, it makes a map of ``size`` by ``size`` cells in the folder ``out``, if that is given.
+    """
     check_file(json_file, "--json")
-    if out is not None:
+    if out is not None and not world:
         make_folder(out)
     with tempfile.TemporaryDirectory() as folder:
         path = world or str(write_map(out or Path(folder), rooms(size, seed)))
         rows = measure(path, beams, seed)
     table = Table(title=f"{world or f'{size} x {size} cells'}, {beams} beams, processor time", title_justify="left")
-    table.add_column("what")
-    table.add_column("", justify="right")
+    table.add_column("step")
+    table.add_column("cost", justify="right")
     for name, value, unit in rows:
         table.add_row(name, f"{value:.3g} {unit}" if value < 1000 else f"{value:.0f} {unit}")
     console.print(table)
@@ -66,7 +69,7 @@ def measure(path: str, beams: int, seed: int) -> list[tuple[str, float, str]]:
     rows.append(("straight walls", float(len(timed("walls out of the cells", lambda: world.segments))), ""))
     scanner, rng = SCANNERS["tim571"].with_beams(beams), np.random.default_rng(seed)
     simulation = timed("simulator: start", lambda: Simulation(SimulationSetup(world, scanner)))
-    timed("simulator: drive and scan", lambda: _drive(simulation), SCANS)
+    timed("simulator: step and scan", lambda: _step_and_scan(simulation), SCANS)
     places = timed("5000 random places", lambda: world.sample_free(5000, rng, Robot().radius))
     poses = np.column_stack([places, rng.uniform(-np.pi, np.pi, len(places))])[:SCANS]
     timed("simulator: scans to learn from", lambda: simulation.sample(poses, None, None), SCANS)
@@ -82,7 +85,7 @@ def measure(path: str, beams: int, seed: int) -> list[tuple[str, float, str]]:
     return rows
 
 
-def _drive(simulation: Simulation) -> None:
+def _step_and_scan(simulation: Simulation) -> None:
     for _ in range(SCANS):
         simulation.advance()
         simulation.observe()

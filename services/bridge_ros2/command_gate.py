@@ -11,12 +11,13 @@ import numpy as np
 
 from common.geometry.se2 import Array
 from common.messages.definitions import CmdVel, Scan
-from common.robot.motion_distortion import correct_scan
 from common.robot.robot import Robot
+from common.robot.self_filter import SelfFilter
 from common.runtime import safety
 
 MIN_SPEED = 1e-3  # m/s and rad/s; smaller components become 0
 STOP_REPEAT_S = 0.5  # how long a stop is repeated; after that other publishers (a joystick, nav2) may use the topic
+NO_FILTER = SelfFilter()
 STOP_REPEAT_PERIOD_S = 0.1  # between repeated stops after commands have ended
 
 
@@ -26,8 +27,8 @@ class CommandGate:
     All times ``now`` are monotonic, in s.
     """
 
-    def __init__(self, robot: Robot, *, obstacle_stop: bool = True) -> None:
-        self.robot = robot
+    def __init__(self, robot: Robot, self_filter: SelfFilter = NO_FILTER, *, obstacle_stop: bool = True) -> None:
+        self.robot, self.self_filter = robot, self_filter
         self.obstacle_stop = obstacle_stop
         self.refused = 0  # commands that were too old, out of order, or newer than the newest scan
         self.stopped = False  # the last command was slowed down because of an obstacle
@@ -61,7 +62,8 @@ class CommandGate:
                 self._periods.append(min((scan.stamp_ns - before) * 1e-9, 1.0))
         self._scan = (scan.stamp_ns, now)
         velocity = self._current_velocity(now)
-        self._points = safety.scan_points(scan if velocity is None else correct_scan(scan, velocity))
+        corrected = self.self_filter.correct_and_mask(scan, np.zeros(3) if velocity is None else velocity)
+        self._points = safety.scan_points(corrected)
 
     def add_velocity(self, twist: Array, now: float) -> None:
         """Stores the robot's velocity (3,) from odometry."""

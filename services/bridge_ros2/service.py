@@ -67,8 +67,8 @@ class BridgeRos2Service(Service):
         self.options = settings
         self.graph = RosGraph(settings.ros_keys())
         self.motion = MountAndOdometry(settings.base_frame, settings.odom_frame, settings.build_mount())
-        self.gate = CommandGate(settings.build_robot(), obstacle_stop=settings.obstacle_stop)
         self.self_filter = settings.build_self_filter()
+        self.gate = CommandGate(settings.build_robot(), self.self_filter, obstacle_stop=settings.obstacle_stop)
         self.note, self.idle = f"waiting for the zenoh router at {settings.ros_connect}", True
         self._ros: RosSession | None = None
         self._publishers: dict[str, RosPublisher] = {}  # by the option's topic name
@@ -239,7 +239,7 @@ class BridgeRos2Service(Service):
             self.publish(ODOM, odom_of(odometry))
         else:
             self.counters["scans_without_odometry"] += 1
-        self.gate.add_scan(self.self_filter.mask_for_planning(scan), now)
+        self.gate.add_scan(scan, now)
         self.publish(SCAN, self.self_filter.mask_for_bus(scan))
         self._scan_at, self._problem = now, ""
 

@@ -6,12 +6,13 @@
 | EXPLORING, RETURNING | a viewpoint is worth a visit | EXPLORING |
 | EXPLORING, RETURNING | no viewpoint is worth a visit | RETURNING |
 | EXPLORING, RETURNING | no path can be planned from where the robot is | RETURNING; FAILED at the start |
-| EXPLORING, RETURNING | one of the last two, and the start is not connected to the map | FAILED |
+| EXPLORING, RETURNING | the robot should return, but its start is not connected to the map | FAILED |
+| EXPLORING, RETURNING | mapping has started again | FAILED |
 | RETURNING | the robot has arrived, and no viewpoint was worth a visit | FINISHED |
 | RETURNING | the way back stays refused, and the robot does not move | FAILED |
 
-A viewpoint is given up if it is refused, or if the robot does not move `STALLED_M` in `STALLED_NS`. The way back is
-given up only if both hold.
+A viewpoint is given up if it is refused, or if the robot does not move `STALLED_M` in `STALLED_NS`; the way back only
+if both hold.
 
 A goal of a user pauses the exploration until `PAUSE_NS` after that goal was reached or refused. Cancelling a goal ends
 the exploration.
@@ -40,6 +41,7 @@ PAUSE_NS = 2_000_000_000  # how long the robot stands at a goal of a user before
 STALLED_NS = 8_000_000_000  # after this time without a motion of `STALLED_M`, the goal counts as unreachable
 STALLED_M = 0.2
 VIEWPOINT_TOLERANCE_M = 0.1
+MAX_SPEED_FACTOR = 1.5  # a belief that moves faster than the robot can, by this factor, has jumped with the map
 RETURN_TOLERANCE_M = 0.01  # of the goal at the start, so that the robot stands within 2 cm of it
 AT_START_M = 0.1  # a robot that cannot plan this close to the start gains no room by returning
 
@@ -64,6 +66,8 @@ class Explorer:
         self._user_goal_over_since_ns: int | None = None
         self._last_moved = pose, 0  # pose and stamp in ns; the stamp is 0 before the first step towards a goal
         self._last_update_ns = 0  # stamp of the last step towards a goal
+        self._last_belief_ns = 0
+        self._map_jumped = False  # since the goal was chosen, so that it may now be at another place
 
     @property
     def active(self) -> bool:
@@ -80,19 +84,31 @@ class Explorer:
         """Where exploration began, (3,) in the present map; None while that is not connected to it."""
         return next(iter(self.map.locate([self._home])), None)
 
-    def use_map(self, planned: PlannedMap) -> None:
-        """Uses a new version of the map, in which another viewpoint may be better."""
+    def use_map(self, planned: PlannedMap) -> bool:
+        """Uses a new version of the map, in which another viewpoint may be better.
+
+        The exploration fails if it is another map, because the start is not known there. Returns whether that happened.
+        """
+        is_another = self.active and planned.message.key_scans < self.map.message.key_scans
+        if is_another:
+            self._fail("mapping has started again: explore again")
+        self._map_jumped |= planned.jumped_from(self.map)
         self.map, self.viewpoint_due = planned, self.sets_goals
+        return is_another
 
     def pause(self) -> None:
         """Pauses the exploration, because a user has set a goal."""
         self.goal, self.paused, self._user_goal_over_since_ns = None, True, None
 
-    def move(self, pose: Array, *, tracking: bool) -> None:
-        """Updates the robot's pose (3,), which is in the map only if the belief is in state `tracking`."""
-        if tracking == self.tracking:
-            self.path_m += float(np.hypot(*(pose - self._pose)[:2]))
-        self._pose, self.tracking = pose, tracking
+    def move(self, pose: Array, stamp_ns: int, max_speed: float, *, tracking: bool) -> None:
+        """Updates the robot's pose (3,), which is in the map only if the belief is in state `tracking`.
+
+        The robot drives at most at ``max_speed`` m/s.
+        """
+        step, period_s = float(np.hypot(*(pose - self._pose)[:2])), (stamp_ns - self._last_belief_ns) * 1e-9
+        if step <= MAX_SPEED_FACTOR * max_speed * period_s:
+            self.path_m += step
+        self._pose, self._last_belief_ns, self.tracking = pose, stamp_ns, tracking
 
     def exploration_state(self, field_of_view: FieldOfView, goal_count: int) -> ExplorationState:
         """The input for the choice of the next viewpoint, after ``goal_count`` goals of users."""
@@ -151,20 +167,20 @@ class Explorer:
                 self.phase = "finished"
         elif stalled:
             self._fail(f"cannot return to the start: {state.reason}")
-        # A refused return is tried again, because the next attempt may find another path. So is the choice of a
-        # viewpoint, because there may be more room at the start.
+        # A refused return is tried again, because the next attempt may find another path. After a return without a
+        # plan, a viewpoint is chosen again, because there may be more room at the start.
         return self.active
 
     def _fail(self, reason: str) -> None:
         self.phase, self._failure = "failed", reason
 
     def _update_viewpoint(self, goal: Goal, state: GoalState, *, stalled: bool) -> bool:
-        """Stores that the viewpoint was reached, or is given up; returns whether either is the case."""
+        """Stores that the viewpoint was reached, or is given up; returns whether a viewpoint has to be chosen."""
         if state.active and not stalled:
             return False
         if state.phase is Phase.REACHED:
             self._arrivals.append(self.map.anchor(self._pose))
-        else:
+        elif not self._map_jumped:
             self._unreachable.append(self.map.anchor(goal.pose.array()))
         self.goal, self._last_moved = None, (self._pose, 0)
         return True
@@ -196,6 +212,7 @@ class Explorer:
             yaw_tolerance = None if half_field_of_view >= np.pi else half_field_of_view / 2
             goal = goal.model_copy(update={"tolerance": VIEWPOINT_TOLERANCE_M, "yaw_tolerance": yaw_tolerance})
         # A goal within its tolerance of the present one does not replace it.
+        self._map_jumped = False
         same = self.goal is not None and np.hypot(*(self.goal.pose.array() - pose)[:2]) <= goal.tolerance
         if same and phase == self.phase and under_way:
             return None

@@ -11,8 +11,8 @@ import numpy as np
 from common.errors import UserError
 from common.geometry import se2
 from common.messages.definitions import Belief, CmdVel, Drive, Exploration, Goal, PolicyEnergy, Scan, Status
-from common.robot.motion_distortion import correct_scan
 from common.robot.robot import Robot
+from common.robot.self_filter import SelfFilter
 from common.runtime import safety
 from services.controller.docking import STANDING_TIME_S, Docking
 from services.controller.explorer import Explorer
@@ -54,6 +54,7 @@ class Navigator:
     parameters: ActionParameters = field(default_factory=ActionParameters)  # of preset `paper`
     world: World | None = None  # the map; None while the mapper builds it, or if preset `paper` drives without a map
     chosen_policy: Policy | None = None  # defaults to the straight-line policy, preset `paper`
+    self_filter: SelfFilter = field(default_factory=SelfFilter)
 
     def __post_init__(self) -> None:
         self.policy: Policy = self.chosen_policy or StraightLinePolicy(self.robot, self.parameters, self.world)
@@ -74,10 +75,10 @@ class Navigator:
         self._scan_points = np.zeros((0, 2))  # m in base_link
 
     def on_scan(self, scan: Scan) -> None:
-        """Stores the scan, corrected for the robot's motion, for the obstacle limits and the policy."""
+        """Stores the scan, without the robot itself and its motion, for the obstacle limits and the policy."""
         if self._scan is not None and scan.stamp_ns < self._scan.stamp_ns:  # the simulation was reset
             self._recent_scans.clear()
-        corrected = correct_scan(scan, self._command.velocity)
+        corrected = self.self_filter.correct_and_mask(scan, self._command.velocity)
         self._recent_scans.append(corrected)
         self._scan_points = safety.scan_points(corrected)
         self.policy.prepare(corrected)
@@ -135,8 +136,8 @@ class Navigator:
         if not len(planned.message.poses):
             return
         self._map = planned
-        if self.explorer is not None:
-            self.explorer.use_map(planned)
+        if self.explorer is not None and self.explorer.use_map(planned):
+            self._cancel_goal()
 
     def take_exploration_state(self) -> ExplorationState | None:
         """Returns the input for the choice of a viewpoint, or None if no choice is due.
@@ -259,7 +260,7 @@ class Navigator:
             self._pose = pose
         self._begin_exploration()
         if self.explorer is not None:
-            self.explorer.move(pose, tracking=self._tracking)
+            self.explorer.move(pose, belief.stamp_ns, self.robot.max_speed, tracking=self._tracking)
         self.policy.observe(self._scan_of(belief), belief)
         self._follow_floor()
         if manual_twist is not None:

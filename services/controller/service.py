@@ -86,7 +86,7 @@ class ControllerService(Service):
 
     def __init__(self, settings: ControllerSettings) -> None:
         super().__init__(settings)
-        self.navigator = Navigator()
+        self.navigator = Navigator(self_filter=settings.build_self_filter())
         self.geodesic: GeodesicPolicy | None = None  # the policy if the preset is `geodesic`
         self._last_map: Map | None = None  # from the mapper
         self._map: PlannedMap | None = None  # the mapper's, if the policy plans in it
@@ -94,7 +94,6 @@ class ControllerService(Service):
         self._viewpoint_job: BackgroundJob[tuple[Viewpoint | NoPath | None, ExplorationState]] = BackgroundJob(
             self._wake
         )
-        self.self_filter = settings.build_self_filter()
         self._wait: BeliefWait = NoBelief()
         self._belief_received_s = 0.0  # time.monotonic() of the latest belief
         self._latest_request = NO_REQUEST  # number of the latest request for predictions
@@ -120,7 +119,7 @@ class ControllerService(Service):
             keep_heading = settings.heading == "keep"
             self.geodesic = GeodesicPolicy(robot, world, keep_heading=keep_heading, epistemic=settings.epistemic)
         parameters = ActionParameters(gamma=settings.gamma)
-        self.navigator = Navigator(robot, parameters, world, self.geodesic)
+        self.navigator = Navigator(robot, parameters, world, self.geodesic, self.navigator.self_filter)
         # Declare the publishers now: the first message on a key that was just declared may be lost.
         for topic in (STATUS, CMD_VEL, PLAN, PREFERENCE):
             self.loop.bus.publisher(topic, self.name)
@@ -170,7 +169,7 @@ class ControllerService(Service):
         self.loop.inbox.wake()
 
     def _on_scan(self, scan: Scan) -> None:
-        self.navigator.on_scan(self.self_filter.mask_for_planning(scan))
+        self.navigator.on_scan(scan)
         if isinstance(self._wait, AwaitsScan) and self._wait.belief.stamp_ns <= scan.stamp_ns:
             self._process(self._wait.belief)
         # Manual driving needs no belief, so it works without an estimator.

@@ -150,7 +150,7 @@ class MapperService(Service):
 def save_map(folder: Path, name: str, mapper: Mapper) -> Path:
     """Writes map and trajectory; returns the path of NAME.yaml. Raises UserError if that fails."""
     if mapper.map is None:
-        raise UserError("there is no map yet: do scans arrive?")
+        raise UserError("there is no map yet: try again in some seconds; if that does not help, scans show too little")
     if re.fullmatch(FILE_NAME, name) is None or name in known_worlds():
         raise UserError(f"name {name!r}: give up to 64 letters, digits, - and _, and not the name of a shipped world")
     path = folder.resolve() / f"{name}.yaml"
@@ -162,6 +162,8 @@ def save_map(folder: Path, name: str, mapper: Mapper) -> Path:
         write_grid(path.parent, name, mapper.map.grid)
         write_tum(path.with_suffix(".tum"), *mapper.trajectory())
     except OSError as error:
+        for file in files:  # so that the name is free for the next attempt
+            file.unlink(missing_ok=True)
         raise UserError(f"{path}: cannot be written ({error.strerror}): choose another folder with --maps") from None
     return path
 

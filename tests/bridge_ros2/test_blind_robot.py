@@ -8,6 +8,7 @@ import pytest
 from common.messages.definitions import Scan
 from common.messages.topics import SCAN
 from common.robot.ranges import is_surface
+from common.runtime import safety
 from services.bridge_ros2.ros_types import LASER_SCAN, decode
 from services.bridge_ros2.service import BridgeRos2Service
 from services.bridge_ros2.settings import BridgeRos2Settings
@@ -27,7 +28,7 @@ def test_the_bridge(monkeypatch, settings, visible):
     service = BridgeRos2Service(BridgeRos2Settings(mount="0,0,0", **settings))
     published, used = [], []
     monkeypatch.setattr(service, "publish", lambda topic, message: published.append((topic, message)))
-    monkeypatch.setattr(service.gate, "add_scan", lambda scan, now: used.append(scan))
+    monkeypatch.setattr(safety, "scan_points", used.append)
     service._on_scan(decode(LASER_SCAN, cdr.laser_scan(10**9, RANGES)))
     ((topic, scan),) = published
     assert topic is SCAN
@@ -40,7 +41,7 @@ def test_the_bridge(monkeypatch, settings, visible):
 def test_the_controller(monkeypatch, settings, visible):
     service = ControllerService(ControllerSettings(**settings))
     used = []
-    monkeypatch.setattr(service.navigator, "on_scan", used.append)
+    monkeypatch.setattr(service.navigator.policy, "prepare", used.append)
     monkeypatch.setattr(service.navigator, "step_without_belief", lambda stamp_ns: None)  # no manual driving
     scan = Scan(stamp_ns=0, angle_min=-1.0, angle_increment=0.5, range_min=0.1, range_max=10.0, ranges=[1, 2, -np.inf])
     service.on_message(SCAN, scan)

@@ -9,6 +9,7 @@ from common.geometry import se2
 from common.geometry.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from common.messages.definitions import Drive, Map, Twist
 from common.robot.robot import Robot
+from services.controller.goal_state import Phase
 from services.controller.growing_map import PlannedMap
 from services.controller.navigator import Navigator
 from services.controller.policies.exploration import NoPath, Viewpoint
@@ -419,3 +420,43 @@ def test_a_given_up_place_moves_with_its_surroundings():
     robot.until(lambda _: robot.navigator.explorer.viewpoint_due, moves=False)
     robot.use_map(map_with((7.0, 2.9, 0.0), START))
     np.testing.assert_allclose(robot.navigator.take_exploration_state().unreachable, [[8.0, 2.9]])
+
+
+def test_a_map_that_began_again_ends_it():
+    robot = exploring_robot()
+    robot.use_map(map_with(START, (3.0, 2.5, 0.0)))
+    robot.step()
+    robot.explore((8.0, 2.5))
+    robot.until(lambda _: robot.pose[0] > 3.0)
+    robot.use_map(map_with(START))
+    status = robot.step()
+    assert (status.exploration.phase, status.refused) == ("failed", True)
+    assert "mapping has started again" in status.reason
+    robot.until(lambda _: True)
+    place = robot.pose
+    for _ in range(SCANS_PER_S):
+        robot.step()
+    assert np.hypot(*(robot.pose - place)[:2]) < 0.6  # it has braked
+
+
+def test_a_jump_with_the_map_is_no_driving():
+    robot = exploring_robot()
+    robot.explore((8.0, 2.5))
+    robot.until(lambda _: robot.pose[0] > 3.0)
+    driven = robot.step().exploration.path
+    robot.pose = robot.pose + np.array([0.5, 0.0, 0.0])
+    assert robot.step().exploration.path < driven + 0.2
+
+
+def test_a_viewpoint_that_did_not_move_with_the_map_is_not_given_up():
+    robot = exploring_robot()
+    robot.explore((6.0, 2.5))
+    robot.until(lambda _: robot.pose[0] > 3.0)
+    values = GRID.values.copy()
+    values[40:60, 105:135] = OCCUPIED  # at the viewpoint's old coordinates
+    grid = OccupancyGrid.of(values, GRID.resolution, (0.0, 0.0, 0.0))
+    moved = Map(stamp_ns=0, grid=grid, poses=np.array([START]) + np.array([1.0, 0.0, 0.0]))
+    robot.use_map(PlannedMap.of(moved, 0.27))
+    robot.until(lambda _: robot.navigator.goal_state.phase is Phase.REFUSED)
+    assert robot.navigator.explorer.viewpoint_due
+    assert len(robot.navigator.take_exploration_state().unreachable) == 0

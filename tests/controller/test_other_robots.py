@@ -23,6 +23,7 @@ HALL = room(6, 4)
 # Parts of the robot in deg and m; the last is closer than the scanner's minimum range.
 POSTS = ((25, 0.12), (-110, 0.15), (110, 0.02))
 FILTERS = SelfFilter(tuple(tuple(np.deg2rad([at - 3, at + 3])) for at, _ in POSTS)), SelfFilter(radius=0.2)
+STANDING = np.zeros(3)
 
 
 def two_rooms(gap):
@@ -70,7 +71,7 @@ def test_robot_in_its_own_scan(kind, self_filter):
     def run(limit, seen):
         return drive(found, robot, (1.0, 2.0, 0.0), goal(5.0, 2.0), limit, known=HALL, seen=seen, stop=False)
 
-    _, statuses, contacts = run(400, lambda scan: self_filter.mask_for_planning(with_posts(scan)))
+    _, statuses, contacts = run(400, lambda scan: self_filter.correct_and_mask(with_posts(scan), STANDING))
     assert (statuses[-1].state, contacts) == ("reached", 0), statuses[-1]
     poses, statuses, _ = run(60, with_posts)
     assert statuses[-1].state != "reached"
@@ -81,7 +82,7 @@ def test_obstacle_stop_of_the_bridge():
     with closing(Simulation(SimulationSetup(HALL, SCANNER, Robot(), (1.0, 2.0, 0.0)))) as simulation:
         scan = with_posts(simulation.observe()[2])
     command, self_filter, outputs = CmdVel(stamp_ns=scan.stamp_ns, twist=Twist(vx=0.3)), SelfFilter(radius=0.2), []
-    for shown in (scan, self_filter.mask_for_bus(scan), self_filter.mask_for_planning(scan)):
+    for shown in (scan, self_filter.mask_for_bus(scan), self_filter.correct_and_mask(scan, STANDING)):
         gate = CommandGate(Robot())
         gate.add_scan(shown, 0.0)
         outputs.append(gate.command(command, 0.01))

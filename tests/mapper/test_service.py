@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 from rich.console import Console
 
 from common.bus.inbox import Inbox
+from common.errors import UserError
 from common.geometry import se2
 from common.geometry.occupancy_grid import OccupancyGrid
 from common.geometry.world import load_world
@@ -17,6 +21,7 @@ from common.robot.scan_geometry import Sweep
 from lab.accuracy import tasks
 from lab.accuracy.scenes import Scene
 from presage.live.commands import save_map
+from services.mapper import service
 from services.mapper.service import map_message
 from services.mapper.slam.mapper import MapSnapshot
 from tests.conftest import WAIT_TIMEOUT_S, wait_for_message
@@ -99,3 +104,17 @@ def test_save_before_the_first_scan(process, bus):
     assert bus.wait_matching(SCAN, WAIT_TIMEOUT_S)
     reply = bus.query(SAVE_MAP, SaveMapRequest(name="here"), SaveMapReply)
     assert "no scan has come" in reply.reason
+
+
+def test_a_failed_save_leaves_the_name_free(tmp_path, monkeypatch):
+    grid = OccupancyGrid.of(np.zeros((2, 2), np.uint8), 0.05, (0.0, 0.0, 0.0))
+    mapper = SimpleNamespace(
+        map=MapSnapshot(grid, np.zeros((1, 3)), np.zeros((0, 2), np.intp)),
+        trajectory=lambda: (np.zeros(1), np.zeros((1, 3))),
+    )
+    monkeypatch.setattr(service, "write_tum", Mock(side_effect=OSError(28, "No space left on device")))
+    with pytest.raises(UserError, match=r"here\.yaml: cannot be written \(No space left on device\)"):
+        service.save_map(tmp_path, "here", mapper)
+    assert list(tmp_path.iterdir()) == []
+    monkeypatch.undo()
+    assert service.save_map(tmp_path, "here", mapper) == tmp_path / "here.yaml"
