@@ -28,7 +28,7 @@ from services.mapper.slam.elements import elements_of_scan
 from services.mapper.slam.front_end import ScanPose
 from services.mapper.slam.mapper import Mapper, MapSnapshot
 
-MAX_LATE_NS = 1_000_000_000  # a scan that is earlier than the last one by less is ignored; by more, the clock was reset
+MAX_LATE_NS = 1_000_000_000  # a scan that is late by less is left out; a larger step back is a reset of the clock
 UPDATE_PERIOD_NS = 1_000_000_000  # between the beginnings of two updates of the map, which leaves time for the scans
 REPEAT_PERIOD_NS = 5_000_000_000  # an unchanged map is published again after this time, for later subscribers
 
@@ -110,7 +110,8 @@ class MapperService(Service):
         restarted = self._belief is not None and scan.stamp_ns < self._belief.stamp_ns
         if self.mapper is None or restarted or not np.allclose(mount, self.mapper.laser.mount, atol=1e-4):
             if self.mapper is not None:
-                self.log.warning("time went back or the scanner's mount changed: mapping starts again")
+                why = "time went back" if restarted else "the scanner's mount changed"
+                self.log.warning("mapping starts again", reason=why)
                 self._update = None  # its result belongs to the old map
             self.mapper = Mapper(Laser(scan.angles(), mount, scan.range_max, scan.time_increment), self.settings.cell)
             self._update_ns = self._published_ns = scan.stamp_ns - UPDATE_PERIOD_NS

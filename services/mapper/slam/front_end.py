@@ -42,7 +42,7 @@ KEY_RANGE_SHARE = 0.1  # in large rooms, the distance is this share of the media
 # A scan of which a smaller fraction matches sees something new. It becomes a key scan after this part of the distance.
 FAMILIAR_FRACTION, EARLY_KEY_PROGRESS = 0.7, 0.25
 SEARCH_WINDOW = np.array([0.3, 0.3, 0.4])  # m, m, rad to either side of the prior's mean
-SEARCH_RANGE_M = 10.0  # farther elements take no part in the search
+MAX_SEARCHED_M = 10.0  # farther elements take no part in the search
 LOCAL_SCANS = 12  # key scans in the local map
 MIN_MATCHED_FRACTION = 0.2  # of a scan's elements that must match the local map
 # Largest share of contradicting elements, among those that agree with or contradict the local map, at a pose that may
@@ -94,9 +94,11 @@ class TrackedDrive:
 class ScanPose:
     """The pose of one scan in the frame of the first, and how it was found."""
 
-    pose: Array  # (3,)
+    pose: Array  # (3,); of `Mapper.add`, in map
     covariance: Array  # (3, 3) relative to the last key scans
-    matched: bool  # to the local map; also true for the first scan of a piece, whose pose is arbitrary
+    # to the local map; also true for the first scan of a piece, whose pose is arbitrary. Of `Mapper.add`, only if the
+    # piece belongs to the map
+    matched: bool
     piece: int = 0  # of the drive, or `NO_PIECE` for a suspect scan
     linked: bool = False  # whether this scan begins a piece with a link to the one before
 
@@ -157,14 +159,14 @@ class FrontEnd:
         self._since_key = self._since_key + PRIOR_INFLATION**2 * covariance
         found = self._register(scan, prior, period)
         contradiction = self._contradiction(scan, found, prior)
-        known = [self.poses[-1], prior.mean] if used_odometry else [self.poses[-1]]
-        suspect = contradiction > MAX_CONTRADICTION or self._is_suspect(found, prior, known, period)
+        reachable_from = [self.poses[-1], prior.mean] if used_odometry else [self.poses[-1]]
+        suspect = contradiction > MAX_CONTRADICTION or self._is_suspect(found, prior, reachable_from, period)
         # If odometry and registration agree even after many suspect scans, the surroundings have changed.
         confirmed = self._suspect_scans + 1 >= MAX_SUSPECT_SCANS and used_odometry and not _is_far(found, prior)
         if found is not None and (confirmed or not suspect):
-            # In a suspect scan, the contradiction is not due to moving objects.
-            unusual = not suspect and self._update_recent_contradiction(contradiction)
-            begins_piece = suspect or unusual or prior.difference(found.pose)[1] > MAX_SLIP**2
+            begins_piece = suspect or self._is_unusual(contradiction) or prior.difference(found.pose)[1] > MAX_SLIP**2
+            if not suspect:  # in a suspect scan, the contradiction is not due to moving objects
+                self._update_recent_contradiction(contradiction)
             return self._add_matched(scan, found, prior, deviation, period, begins_piece=begins_piece)
         self.unmatched += 1
         if used_odometry:
@@ -232,21 +234,23 @@ class FrontEnd:
             return found
         last = self.poses[-1]
         starts = [last if self._velocity is None else se2.compose(last, self._velocity * period)]
-        near = elements.part(np.hypot(*elements.points.T) < SEARCH_RANGE_M)
+        near = elements.part(np.hypot(*elements.points.T) < MAX_SEARCHED_M)
         starts += list(correlative_search(surface.elements, near, prior.mean, SEARCH_WINDOW))
         others = [register(surface, elements, start, prior) for start in starts]
         matches = [each for each in (found, *others) if each is not None]
         best = min(matches, key=lambda each: each.cost, default=None)
         return None if best is None or best.matched_fraction < MIN_MATCHED_FRACTION else best
 
-    def _is_suspect(self, found: Registration | None, prior: PosePrior, known: list[Array], period: float) -> bool:
+    def _is_suspect(
+        self, found: Registration | None, prior: PosePrior, reachable_from: list[Array], period: float
+    ) -> bool:
         """Whether a registration implies that the robot was kidnapped, or may match by chance.
 
-        It was kidnapped if it is farther from all ``known`` poses (3,) than it can drive in ``period`` s. These are the
+        It was kidnapped if it is farther from all poses ``reachable_from`` (3,) than it can drive in ``period`` s: the
         last pose and, with odometry, the one that it predicts: after a pause it reports the motion of several scans.
         """
         pose = prior.mean if found is None else found.pose
-        if all((np.abs(se2.between(each, pose)) > MAX_VELOCITY * period).any() for each in known):
+        if all((np.abs(se2.between(each, pose)) > MAX_VELOCITY * period).any() for each in reachable_from):
             return True
         if found is not None and found.matched_fraction > FAMILIAR_FRACTION:
             return False
@@ -261,14 +265,12 @@ class FrontEnd:
         counted = compare_submaps(self._local, self._surface, Submap(0, 0, scan.elements, scans), pose)
         return counted.contradicting / (counted.agreeing + PRIOR_AGREEMENT + counted.contradicting)
 
-    def _update_recent_contradiction(self, contradiction: float) -> bool:
-        """Updates the recent maximum.
+    def _is_unusual(self, contradiction: float) -> bool:
+        """Whether a share of contradictions is clearly larger than moving objects caused lately."""
+        return contradiction > max(UNUSUAL_CONTRADICTION, UNUSUAL_RATIO * self._recent_contradiction)
 
-        Returns whether ``contradiction`` was clearly above it, that is, more than moving objects caused lately.
-        """
-        before = self._recent_contradiction
-        self._recent_contradiction = max(contradiction, before * (1 - 1 / FADING_SCANS))
-        return contradiction > max(UNUSUAL_CONTRADICTION, UNUSUAL_RATIO * before)
+    def _update_recent_contradiction(self, contradiction: float) -> None:
+        self._recent_contradiction = max(contradiction, self._recent_contradiction * (1 - 1 / FADING_SCANS))
 
     def _add_matched(
         self, scan: _Scan, found: Registration, prior: PosePrior, deviation: Array, period: float, *, begins_piece: bool

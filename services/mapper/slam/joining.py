@@ -24,12 +24,12 @@ from services.mapper.slam.registration import Surface
 from services.mapper.slam.submaps import Submap, compare_submaps, merge_with_neighbours
 
 TARGET_SPACING_M = 2.0  # between submaps of the map in which a submap is searched for
-SEARCH_RANGE_M, TURN_STEP = 4.0, 0.06  # m to either side of a target, and rad between the headings that are tried
-SAME_PLACE_M, SAME_PLACE_RAD = 0.5, 0.1  # two candidates agree if they place the piece this close together
+JOIN_WINDOW_M, TURN_STEP = 4.0, 0.06  # m to either side of a target, and rad between the headings that are tried
+AGREEING_M, AGREEING_RAD = 0.5, 0.1  # two candidates agree if they place the piece this close together
 MIN_SUPPORT = 2  # number of submaps that must agree
-# A place is rejected if the share of elements that contradict the nearest submaps exceeds this, plus twice the share
-# that is usual between successive submaps.
-MAX_CONTRADICTION, NEAREST_SUBMAPS = 0.03, 3
+# A pose of a piece is rejected if the share of elements that contradict the nearest submaps exceeds this, plus twice
+# the share that is usual between successive submaps.
+MAX_EXTRA_CONTRADICTION, NEAREST_SUBMAPS = 0.03, 3
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def _search_submap(submaps: Sequence[Submap], first: int, second: int, poses: Ar
     """The places near submap ``first`` where submap ``second`` may be."""
     target, source = merge_with_neighbours(submaps, first, poses), submaps[second]
     surface = Surface(target.elements)
-    window = np.array([SEARCH_RANGE_M, SEARCH_RANGE_M, np.pi])
+    window = np.array([JOIN_WINDOW_M, JOIN_WINDOW_M, np.pi])
     starts = correlative_search(surface.elements, source.elements, np.zeros(3), window, TURN_STEP)
     matches = [match_submaps(target, surface, source, start) for start in starts]
     references = target.reference, source.reference
@@ -118,8 +118,8 @@ def _agreed_closures(
     """
     if not candidates:
         return []
-    places = np.array([_place_of_piece(each.closure.link, poses) for each in candidates])
-    agree = _agreement_of_places(places, poses[[submaps[each.closure.second].reference for each in candidates]])
+    frames = np.array([_frame_of_piece(each.closure.link, poses) for each in candidates])
+    agree = _which_agree(frames, poses[[submaps[each.closure.second].reference for each in candidates]])
     groups = [[each for each, same in zip(candidates, row, strict=True) if same] for row in agree]
     scores = [_best_scores(group) for group in groups]
     totals = np.array([sum(each.values()) for each in scores])
@@ -128,19 +128,19 @@ def _agreed_closures(
         best = int(np.argmax(np.where(possible, totals, 0.0)))
         if len(scores[best]) < MIN_SUPPORT:
             return []
-        if not _is_place_contradicted(places[best], components, submaps, poses):
+        if not _is_frame_contradicted(frames[best], components, submaps, poses):
             rival = totals[possible & ~agree[best]].max(initial=0.0)
             return [] if rival > RIVAL_SHARE * totals[best] else [each.closure for each in groups[best]]
         possible &= ~agree[best]
     return []
 
 
-def _agreement_of_places(places: Array, references: Array) -> npt.NDArray[np.bool_]:
-    """Whether candidates agree (M, M): at both of their places (M, 3) of the piece, ``references`` (M, 3) are close."""
+def _which_agree(frames: Array, references: Array) -> npt.NDArray[np.bool_]:
+    """Which candidates agree (M, M): with both of their ``frames`` (M, 3), the ``references`` (M, 3) are close."""
     agree = []
-    for place in places:
-        off = se2.between(se2.compose(place, references), se2.compose(places, references))
-        agree.append((np.hypot(off[:, 0], off[:, 1]) < SAME_PLACE_M) & (np.abs(off[:, 2]) < SAME_PLACE_RAD))
+    for frame in frames:
+        off = se2.between(se2.compose(frame, references), se2.compose(frames, references))
+        agree.append((np.hypot(off[:, 0], off[:, 1]) < AGREEING_M) & (np.abs(off[:, 2]) < AGREEING_RAD))
     return np.array(agree)
 
 
@@ -152,18 +152,18 @@ def _best_scores(candidates: Sequence[JoinCandidate]) -> dict[int, float]:
     return best
 
 
-def _place_of_piece(link: PoseLink, poses: Array) -> Array:
+def _frame_of_piece(link: PoseLink, poses: Array) -> Array:
     """The frame (3,) of the piece in that of the map, according to a link."""
     return np.asarray(se2.compose(se2.compose(poses[link.first], link.pose), se2.inverse(poses[link.second])))
 
 
-def _is_place_contradicted(
-    place: Array, components: tuple[list[int], list[int]], submaps: Sequence[Submap], poses: Array
+def _is_frame_contradicted(
+    frame: Array, components: tuple[list[int], list[int]], submaps: Sequence[Submap], poses: Array
 ) -> bool:
-    """Whether, with the frame of the second component at ``place`` (3,), some submap of it contradicts the first."""
+    """Whether, with the frame of the second component at ``frame`` (3,), some submap of it contradicts the first."""
     targets, sources = components
     return any(
-        is_contradicted(number, se2.compose(place, poses[submaps[number].reference]), targets, submaps, poses)
+        is_contradicted(number, se2.compose(frame, poses[submaps[number].reference]), targets, submaps, poses)
         for number in sources
     )
 
@@ -177,7 +177,7 @@ def is_contradicted(number: int, pose: Array, targets: Sequence[int], submaps: S
     if not nearest:
         return False
     usual = max(_contradiction_among_successive(k, submaps, poses) for k in (number, *nearest))
-    return _contradicting_share(submaps[number], pose, nearest, submaps, poses) > MAX_CONTRADICTION + 2 * usual
+    return _contradicting_share(submaps[number], pose, nearest, submaps, poses) > MAX_EXTRA_CONTRADICTION + 2 * usual
 
 
 def _nearest(pose: Array, targets: Sequence[int], submaps: Sequence[Submap], poses: Array) -> list[int]:
