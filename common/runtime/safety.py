@@ -90,7 +90,7 @@ def limit_velocity(
     """
     if not np.isfinite(twist).all():
         return np.zeros(3), True
-    allowed = np.array([*(twist[:2] * _straight_scale(twist, points, robot)), twist[2]])
+    allowed = np.array([*(twist[:2] * _straight_scale(twist, points, robot, hold)), twist[2]])
     if current is None and twist[2] == 0:
         return allowed, bool((allowed != twist).any())
 
@@ -109,8 +109,11 @@ def limit_velocity(
     return allowed * [low, low, 1.0], True
 
 
-def _straight_scale(twist: Array, points: Array, robot: Robot) -> float:
-    """Factor of the speed with which the robot, driving straight, can stop ``robot.margin`` before the first point."""
+def _straight_scale(twist: Array, points: Array, robot: Robot, hold: float) -> float:
+    """Factor of the speed with which the robot, driving straight, can stop ``robot.margin`` before the first point.
+
+    It keeps its speed for ``hold`` s before it brakes.
+    """
     speed = float(np.hypot(twist[0], twist[1]))
     if speed < 1e-9 or len(points) == 0:
         return 1.0
@@ -121,8 +124,8 @@ def _straight_scale(twist: Array, points: Array, robot: Robot) -> float:
         return 1.0
     reach = np.sqrt(np.maximum((robot.radius + robot.margin) ** 2 - aside[in_way] ** 2, 0.0))
     gap = max(0.0, float(np.min(along[in_way] - reach)))
-    # Solve v REACTION_TIME_S + v² / 2a = gap for v.
-    allowed = robot.acceleration * (np.sqrt(REACTION_TIME_S**2 + 2 * gap / robot.acceleration) - REACTION_TIME_S)
+    # Solve v hold + v² / 2a = gap for v.
+    allowed = robot.acceleration * (np.sqrt(hold**2 + 2 * gap / robot.acceleration) - hold)
     return min(1.0, float(allowed) / speed)
 
 

@@ -96,6 +96,8 @@ def _follow(messages: LatestMessages, goal: Goal, console: Console) -> int:
                 raise UserError("the goal was replaced by another" if status.goal else "the goal was cancelled")
             if status.distance is not None and status.distance < least_distance - MIN_PROGRESS_M:
                 least_distance, blocked_ns = status.distance, 0
+            if status.distance is None and status.state == "navigating":  # to a lift; it drives again
+                blocked_ns = 0
             if previous_ns is not None and status.state == "blocked":
                 blocked_ns += max(0, status.stamp_ns - previous_ns)
             previous_ns = status.stamp_ns

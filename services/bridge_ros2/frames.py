@@ -52,6 +52,10 @@ class LatestTransforms:
                 return of_base[frame].inverse().then(transform)
         return None
 
+    def is_part_of(self, frame: str, ancestor: str) -> bool:
+        """Whether a frame is ``ancestor``, or tf attaches it to that, directly or through others."""
+        return ancestor in self._chain(frame)
+
     def names(self) -> list[str]:
         """Names of all known frames."""
         return sorted(self._parents.keys() | {parent for parent, _ in self._parents.values()})

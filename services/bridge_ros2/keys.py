@@ -21,7 +21,7 @@ from services.bridge_ros2.ros_types import NO_HASH, dds_name, ros_name, type_has
 
 Flavor = Literal["rmw_zenoh", "ros2dds"]
 Kind = Literal["NN", "MP", "MS"]  # node, publisher, subscription
-TOPIC_NAME = r"(~?/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*"
+TOPIC_NAME = r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*"
 DEFAULT_DEPTH = 42  # rmw_zenoh's default history depth (qos.cpp)
 # Tokens of every flavour and domain, to explain which nodes exist if no messages arrive: first those of
 # zenoh-bridge-ros2dds, then those of rmw_zenoh and of zenoh-bridge-ros2dds before 1.0.

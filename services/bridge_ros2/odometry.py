@@ -68,8 +68,8 @@ class MountAndOdometry:
     def add_tf(self, message: Any) -> None:
         """Adds a tf message: fixed joints, and odometry if it contains the odom frame."""
         for parent, child, stamp_ns, transform in self.frames.add(message):
-            if parent != self.odom:
-                continue
+            if parent != self.odom or not self.frames.is_part_of(self.base, child):
+                continue  # other children of the odom frame are not the robot, such as a tracked person
             base = self.frames.find(self.base, child)
             if base is not None:
                 self._add_tf_odometry(stamp_ns, transform.then(base))

@@ -94,8 +94,11 @@ class BridgeRos2Service(Service):
             self.loop.bus.publisher(topic, self.name)
 
     def close(self) -> None:
-        """Stops a moving robot and closes the session on the ROS side."""
+        """Stops a moving robot, as often as after commands have ended, and closes the session on the ROS side."""
         self._drive(self.gate.stop_for_silence(time.monotonic()))
+        while (due := self.gate.repeat_due(time.monotonic())) is not None:
+            time.sleep(max(0.0, due))
+            self._drive(self.gate.repeat_stop(time.monotonic()))
         if self._ros is not None:
             self._ros.close()
 
@@ -237,6 +240,7 @@ class BridgeRos2Service(Service):
         self._with_odometry = odometry is not None
         if odometry is not None:
             self.publish(ODOM, odom_of(odometry))
+            self.gate.add_velocity(odometry.twist, now)  # tf has no velocities of its own
         else:
             self.counters["scans_without_odometry"] += 1
         self.gate.add_scan(scan, now)

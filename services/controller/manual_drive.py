@@ -47,6 +47,8 @@ class ManualDrive:
         return self._twist
 
     def _expired(self, now_ns: int) -> bool:
-        if self._last_message_ns is not None and now_ns < self._last_message_ns:
-            self._last_message_ns = None  # time went back: the simulation was reset, and the message is from before
+        # A belief may be somewhat earlier than the latest scan. If time goes back farther, the simulation was reset,
+        # and the message is from before.
+        if self._last_message_ns is not None and now_ns < self._last_message_ns - MANUAL_TIMEOUT_NS:
+            self._last_message_ns = None
         return self._last_message_ns is None or now_ns - self._last_message_ns > MANUAL_TIMEOUT_NS

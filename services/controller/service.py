@@ -89,6 +89,7 @@ class ControllerService(Service):
         self.navigator = Navigator(self_filter=settings.build_self_filter())
         self.geodesic: GeodesicPolicy | None = None  # the policy if the preset is `geodesic`
         self._last_map: Map | None = None  # from the mapper
+        self._restored_goal: Goal | None = None  # of the previous controller instance; waits for the mapper's first map
         self._map: PlannedMap | None = None  # the mapper's, if the policy plans in it
         self._map_job: BackgroundJob[PlannedMap] = BackgroundJob(self._wake)
         self._viewpoint_job: BackgroundJob[tuple[Viewpoint | NoPath | None, ExplorationState]] = BackgroundJob(
@@ -133,8 +134,14 @@ class ControllerService(Service):
             return  # a new goal has arrived already
         under_way = status.state not in {"idle", "reached"} and not status.refused
         if under_way and status.goal == goal.pose_in_map(self.navigator.world) and status.goal_seq == goal.seq:
-            self.navigator.on_goal(goal)
-            self.log.warning("resuming the goal of the previous controller instance", x=goal.pose.x, y=goal.pose.y)
+            if self.geodesic is not None and not self.settings.world:
+                self._restored_goal = goal  # without a map it would be refused
+            else:
+                self._resume(goal)
+
+    def _resume(self, goal: Goal) -> None:
+        self.navigator.on_goal(goal)
+        self.log.warning("resuming the goal of the previous controller instance", x=goal.pose.x, y=goal.pose.y)
 
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
         """Answers a belief by a command with its stamp, and a goal by a status at once."""
@@ -143,6 +150,7 @@ class ControllerService(Service):
         elif isinstance(message, Drive):
             self.navigator.on_drive(message)
         elif isinstance(message, Goal):
+            self._restored_goal = None
             self.navigator.on_goal(message)
             x, y, floor = message.pose.x, message.pose.y, message.map_id
             self.log.info("goal", x=x, y=y, floor=floor, cancel=message.cancel, explore=message.explore)
@@ -283,6 +291,9 @@ class ControllerService(Service):
         self.geodesic.use_map(planned.graph, jumped=self._map is not None and planned.jumped_from(self._map))
         self._map = planned
         self.navigator.on_map(planned)
+        restored, self._restored_goal = self._restored_goal, None
+        if restored is not None:
+            self._resume(restored)
         self._choose_viewpoint()
 
     def _choose_viewpoint(self) -> None:

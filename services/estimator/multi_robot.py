@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from fnmatch import fnmatchcase
+from functools import partial
 from typing import TYPE_CHECKING
 
 from common.bus.inbox import Inbox, Sample
@@ -153,13 +154,13 @@ class FleetLoop:
 
     def _turn(self) -> None:
         for robot in list(self._robots.values()):
-            self._serve(robot)
+            self._guard(robot, partial(self._serve, robot))
         now = time.monotonic()
         if now >= self._next_health_check:
             self._next_health_check = now + HEALTH_CHECK_PERIOD_S
-            for robot in self._robots.values():
+            for robot in list(self._robots.values()):
                 if robot.active:
-                    robot.loop.publish_health_if_due()
+                    self._guard(robot, robot.loop.publish_health_if_due)
         if now >= self._next_discovery:
             self._next_discovery = now + DISCOVERY_PERIOD_S
             self._add_found_robots()
@@ -170,15 +171,19 @@ class FleetLoop:
 
     def _serve(self, robot: FleetRobot) -> None:
         """Handles the messages of a robot in order, until a search has to end first."""
+        for _ in range(MAX_MESSAGES_PER_TURN):
+            if not robot.has_work():
+                return
+            if robot.search is not None:
+                robot.loop.run_guarded(robot.publish_search)
+            else:
+                robot.loop.handle(robot.loop.inbox.get(0))
+
+    def _guard(self, robot: FleetRobot, work: Callable[[], None]) -> None:
+        """Does some work for a robot. An error of the user's, such as another protocol, concerns this robot only."""
         try:
-            for _ in range(MAX_MESSAGES_PER_TURN):
-                if not robot.has_work():
-                    return
-                if robot.search is not None:
-                    robot.loop.run_guarded(robot.publish_search)
-                else:
-                    robot.loop.handle(robot.loop.inbox.get(0))
-        except UserError as error:  # concerns this robot only
+            work()
+        except UserError as error:
             self.log.warning(str(error), robot=robot.robot)
             self._remove(robot)
             if robot.named:
@@ -208,7 +213,11 @@ class FleetLoop:
             if name in self._robots or not self._matches(name) or (name, "estimator") in self._alive:
                 continue
             if len(self._robots) < self.settings.max_robots:
-                self._add(name, named=False)
+                try:
+                    self._add(name, named=False)
+                except UserError as error:
+                    if self._may_log(name):
+                        self.log.warning(str(error), robot=name)
             elif self._may_log("many"):
                 self.log.warning("too many robots", not_served=name, max_robots=self.settings.max_robots)
 
@@ -234,8 +243,12 @@ class FleetLoop:
     def _add(self, name: str, *, named: bool) -> None:
         robot = FleetRobot(self.settings, name, self.models, self._start_search, named=named)
         loop = ServiceLoop(robot, self.bus.for_robot(name), Inbox(INBOX_MESSAGES, INBOX_BYTES, self._changed))
-        loop.open()
-        robot.active = loop.try_start()
+        try:
+            loop.open()
+            robot.active = loop.try_start()
+        except UserError:
+            loop.bus.undeclare_all()
+            raise
         self._robots[name] = robot
         self._count()
 

@@ -78,6 +78,20 @@ def test_unconnected_odometry():
     assert motion.unconnected_frame == ""
 
 
+def test_other_children_of_the_odom_frame():
+    """Only transforms of the base are odometry, whatever the stamps of others."""
+    motion = MountAndOdometry("base_link", "odom")
+    for k in range(3):
+        motion.add_tf(tf(
+            ("odom", "base_footprint", (0.1 * k, 0, 0), turned(), 10**9 + k * 10**8),
+            ("base_footprint", "base_link", (0, 0, 0), turned(), 0),
+            ("odom", "person", (5.0, k, 0), turned(), 10**9 + k * 10**8 + 10**7),
+            ("odom", "marker", (7.0, 0, 0), turned(), 0),
+        ))  # fmt: skip
+    np.testing.assert_allclose(motion.at(10**9 + 2 * 10**8).pose, [0.2, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(motion.at(10**9 + 5 * 10**7).pose, [0.05, 0, 0], atol=1e-9)
+
+
 def test_invalid_transforms():
     motion = MountAndOdometry("base_link", "odom")
     motion.add_tf(tf(

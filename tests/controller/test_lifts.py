@@ -7,9 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.messages.definitions import Status
+from common.geometry.occupancy_grid import FREE, OccupancyGrid
+from common.messages.definitions import Map, Status
 from common.messages.topics import GOAL, STATUS
 from common.robot.robot import Robot
+from services.controller.growing_map import PlannedMap
 from services.controller.lifts import RIDE_LENGTH_M, LiftRide, plan_ride
 from services.controller.navigator import Navigator
 from services.controller.policies.planner import GeodesicPolicy
@@ -249,3 +251,22 @@ def test_goal_is_resumed(floor, resumed):
     status = Status(stamp_ns=0, state="navigating", goal=goal(*FIRST.to_map([4, 1])).pose, goal_seq=7)
     service.on_restored({GOAL: sent, STATUS: status})
     assert service.navigator.goal_state.active == resumed
+
+
+@pytest.mark.parametrize("replaced", [False, True])
+def test_goal_is_resumed_while_mapping(replaced):
+    """At the first map: before, the goal would be refused."""
+    service = ControllerService(ControllerSettings(world=""))
+    policy = service.geodesic = GeodesicPolicy(Robot(), None)
+    service.navigator = Navigator(chosen_policy=policy)
+    status = Status(stamp_ns=0, state="navigating", goal=goal(4, 1).pose, goal_seq=7)
+    service.on_restored({GOAL: goal(4, 1, seq=7), STATUS: status})
+    assert service.navigator.goal_state.goal is None
+    if replaced:
+        service.navigator.on_goal(newer := goal(3, 1, seq=8))
+        service._restored_goal = None
+    grid = OccupancyGrid.of(np.full((80, 120), FREE, np.uint8), 0.05, (0.0, 0.0, 0.0))
+    service._use_map(PlannedMap.of(Map(stamp_ns=0, grid=grid, poses=np.array([START], float)), 0.27))
+    goal_state = service.navigator.goal_state
+    assert goal_state.goal.seq == (newer.seq if replaced else 7)
+    assert replaced or goal_state.active

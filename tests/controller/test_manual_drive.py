@@ -116,6 +116,7 @@ def test_drive_without_beliefs_after_time_went_back():
         ([(0, 0), (400, 0)], [(500, True), (501, False)]),  # repeated: the time counts from the first
         ([(0, 0), (400, 0), (600, 1)], [(1100, True)]),
         ([(0, 0), (501, 0)], [(1001, True), (1002, False)]),  # after a gap the time counts from zero
+        ([(100, 1)], [(33, True), (100, True), (600, True), (601, False)]),  # a belief that lags behind the scans
         ([(100_000, 1)], [(100_000, True), (0, False), (100_000, False)]),  # time went back: a reset
     ],
 )

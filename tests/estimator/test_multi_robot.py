@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import threading
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from common.bus.bus import open_bus, wait_until
 from common.bus.inbox import Inbox
+from common.errors import UserError
 from common.geometry import se2
 from common.messages.definitions import Belief, Health, Pose, Scan
 from common.messages.requests import LocaliseRequest, Reply
@@ -149,6 +151,16 @@ def fleet(bus, link, monkeypatch):
         loop.stop()
         thread.join()
         session.__exit__(None, None, None)
+
+
+def test_a_robot_with_another_protocol_is_left_out(bus, monkeypatch):
+    monkeypatch.setattr(multi_robot, "SharedModels", lambda _: None)
+    loop = multi_robot.FleetLoop(EstimatorSettings(robots=f"{bus.robot}-*"), bus)
+    loop._note_liveliness(f"{bus.robot}-old", "simulator", True)
+    monkeypatch.setattr(multi_robot.ServiceLoop, "open", Mock(side_effect=UserError("another protocol")))
+    loop.models = None
+    loop._add_found_robots()
+    assert loop._robots == {}
 
 
 def test_search_beside_tracking(fleet):

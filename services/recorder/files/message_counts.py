@@ -128,7 +128,7 @@ def from_metadata(record: Mapping[str, str]) -> dict[str, KeyCounts]:
 def is_numbered(key: str) -> bool:
     """Whether messages of this key are numbered by one publisher. Topics such as `goal` have several publishers."""
     topic = topic_of(key)
-    return topic is not None and topic.rate > 0
+    return topic is not None and (topic.per_service or not topic.multiple_publishers)
 
 
 def sequence_of(payload: bytes) -> tuple[int, str] | None:

@@ -39,16 +39,16 @@ def test_ramps(current, wanted, dt):
     assert np.linalg.norm(after - wanted) <= np.linalg.norm(current - wanted) + 1e-9
 
 
-@given(twists, clouds)
-def test_stopping_distance(twist, points):
-    limited, held = safety.limit_velocity(twist, points, ROBOT)
+@given(twists, clouds, st.floats(safety.REACTION_TIME_S, 2))
+def test_stopping_distance(twist, points, hold):
+    limited, held = safety.limit_velocity(twist, points, ROBOT, hold=hold)
     speed = np.hypot(*limited[:2])
     assert speed <= np.hypot(*twist[:2]) + 1e-12
     assert limited[2] == twist[2]
     assert held == (speed < np.hypot(*twist[:2]) - 1e-12)
     if speed < 1e-9:
         return
-    stop = speed * safety.REACTION_TIME_S + speed**2 / (2 * ROBOT.acceleration)
+    stop = speed * hold + speed**2 / (2 * ROBOT.acceleration)
     ahead = limited[:2] / speed
     for travelled in np.linspace(0, stop, 20):
         gaps = np.hypot(*(points - ahead * travelled).T)

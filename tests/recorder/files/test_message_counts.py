@@ -5,11 +5,13 @@ from __future__ import annotations
 import itertools
 
 import msgpack
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.messages.definitions import Goal, Health, Pose, TopicHealth, Truth, Twist
+from common.geometry.occupancy_grid import OccupancyGrid
+from common.messages.definitions import Goal, Health, Map, Pose, TopicHealth, Truth, Twist
 from services.recorder.files.message_counts import (
     MAX_INSTANCES,
     KeyCounts,
@@ -20,7 +22,8 @@ from services.recorder.files.message_counts import (
     sequence_of,
 )
 
-SCAN, GOAL, TRUTH = "presage/r/scan", "presage/r/goal", "presage/r/truth"
+SCAN, GOAL, TRUTH, MAP = "presage/r/scan", "presage/r/goal", "presage/r/truth", "presage/r/map"
+GRID = OccupancyGrid.of(np.zeros((2, 2), np.uint8), 0.05, (0.0, 0.0, 0.0))
 
 
 def counts_of(numbers):
@@ -58,10 +61,13 @@ def test_ledger():
     for number in (0, 1, 5):
         message_counts.add(TRUTH, Truth(stamp_ns=0, seq=number, pose=Pose(x=0.0, y=0.0), twist=Twist()).encode())
     message_counts.add(TRUTH, b"\xc1")
+    for number in (0, 3):  # a topic without a rate
+        message_counts.add(MAP, Map(stamp_ns=0, seq=number, grid=GRID, poses=np.zeros((0, 3))).encode())
     for number in (10**18, 5):  # goals have several publishers, so that their numbers are not counted
         message_counts.add(GOAL, Goal(stamp_ns=0, seq=number, pose=Pose(x=0.0, y=0.0)).encode())
     counts = message_counts.counts({TRUTH: 6, SCAN: 2}, {SCAN: 1}, {SCAN: 1})
     assert counts[TRUTH] == KeyCounts(received=6, written=4, unreadable=1, gaps=1, missing=3)
+    assert counts[MAP] == KeyCounts(written=2, gaps=1, missing=2)
     assert counts[GOAL] == KeyCounts(written=2)
     assert counts[SCAN] == KeyCounts(received=2, dropped=1, oversized=1)
     assert from_metadata(as_metadata(counts) | {"a": "no JSON", "b": '{"unknown": 1}'}) == counts
