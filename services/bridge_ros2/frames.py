@@ -98,6 +98,10 @@ class OdometryBuffer:
         while entry.stamp_ns - self._entries[0].stamp_ns > HISTORY_S * 1e9:
             self._entries.popleft()
 
+    def is_alive(self, stamp_ns: int) -> bool:
+        """Whether there was odometry in the last seconds before a stamp."""
+        return bool(self._entries) and stamp_ns - self._entries[-1].stamp_ns <= HISTORY_S * 1e9
+
     def at(self, stamp_ns: int) -> DeadReckoning | None:
         """Odometry at a stamp, interpolated, or extrapolated by at most `MAX_EXTRAPOLATION_S`. Otherwise None."""
         after = None

@@ -83,9 +83,9 @@ class MountAndOdometry:
         self._by_tf.add(self._last)
 
     def at(self, stamp_ns: int) -> DeadReckoning | None:
-        """Odometry for the estimator: from the topic, or else from tf."""
-        return self._by_topic.at(stamp_ns) or self._by_tf.at(stamp_ns)
+        """Odometry for the estimator: from tf only while none comes on the topic, because the two may drift apart."""
+        return (self._by_topic if self._by_topic.is_alive(stamp_ns) else self._by_tf).at(stamp_ns)
 
     def at_by_tf(self, stamp_ns: int) -> DeadReckoning | None:
-        """Odometry that the transform from map to odom must match: from tf, or else from the topic."""
-        return self._by_tf.at(stamp_ns) or self._by_topic.at(stamp_ns)
+        """Odometry that the transform from map to odom must match: from the topic only while none comes in tf."""
+        return (self._by_tf if self._by_tf.is_alive(stamp_ns) else self._by_topic).at(stamp_ns)

@@ -103,6 +103,18 @@ def test_invalid_transforms():
             motion.mount_for(frame)
 
 
+def test_two_odometries_are_not_mixed():
+    """While the topic pauses, the odometry in tf, which has drifted elsewhere, does not stand in for it at once."""
+    motion, stall = MountAndOdometry("base_link", "odom"), 10**9 // 2
+    for stamp in range(10**9, 14 * 10**9, stall):
+        motion.add_tf(tf(("odom", "base_link", (5, 0, 0), turned(), stamp)))
+    motion.add_odometry(dead(10**9, (1, 0, 0)))
+    assert motion.at(10**9).pose[0] == 1
+    assert motion.at(10**9 + stall) is None
+    assert motion.at_by_tf(13 * 10**9).pose[0] == 5
+    assert motion.at(13 * 10**9).pose[0] == 5  # the topic has been silent for 12 s
+
+
 def dead(stamp, pose, twist=(0.0, 0.0, 0.0)):
     return DeadReckoning(stamp, np.array(pose, float), np.array(twist, float), np.zeros((3, 3)))
 
