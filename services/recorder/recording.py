@@ -52,8 +52,9 @@ class OpenRecording:
         # Log times must not decrease, even if the wall clock is set back.
         self._logged_ns = max(self._logged_ns, sample.received_ns)
         published = sample.published_ns or sample.received_ns
-        self.writer.write(sample.topic, sample.key, sample.payload, published, self._logged_ns)
+        # Counted first, as it is no longer in the queue: writing may end a part of the file, which states the counts.
         self.message_counts.add(sample.key, sample.payload)
+        self.writer.write(sample.topic, sample.key, sample.payload, published, self._logged_ns)
 
     def describe(self, service: str, reply: DescriptionReply) -> None:
         """Writes a service's reply about its configuration, world or model."""
