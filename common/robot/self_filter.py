@@ -1,7 +1,8 @@
 """Masks beams that hit the robot itself.
 
 In published scans such a beam is marked as not measured (0, see `ranges`), so that it is used neither for localisation
-nor for obstacles. For braking and planning within a process it is NaN, as if the scanner did not have this beam.
+nor for obstacles. For braking and planning within a process it is NaN, as if the scanner did not have this beam,
+unless the scan is corrected for the robot's motion.
 """
 
 from __future__ import annotations
@@ -67,6 +68,9 @@ class SelfFilter:
         in_radius = (scan.ranges < np.float32(self.radius)) & (scan.ranges != NOT_MEASURED)
         masked = self._in_sectors(scan) | (in_radius & (self.radius > 0))
         return scan.model_copy(update={"ranges": np.where(masked, np.float32(value), scan.ranges)})
+
+
+NO_FILTER = SelfFilter()
 
 
 def _trim_wide_sectors(scan: Scan, in_sector: Mask) -> Scan:

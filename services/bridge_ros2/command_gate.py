@@ -12,12 +12,11 @@ import numpy as np
 from common.geometry.se2 import Array
 from common.messages.definitions import CmdVel, Scan
 from common.robot.robot import Robot
-from common.robot.self_filter import SelfFilter
+from common.robot.self_filter import NO_FILTER, SelfFilter
 from common.runtime import safety
 
 MIN_SPEED = 1e-3  # m/s and rad/s; smaller components become 0
 STOP_REPEAT_S = 0.5  # how long a stop is repeated; after that other publishers (a joystick, nav2) may use the topic
-NO_FILTER = SelfFilter()
 STOP_REPEAT_PERIOD_S = 0.1  # between repeated stops after commands have ended
 
 

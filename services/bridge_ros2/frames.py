@@ -52,9 +52,9 @@ class LatestTransforms:
                 return of_base[frame].inverse().then(transform)
         return None
 
-    def is_part_of(self, frame: str, ancestor: str) -> bool:
-        """Whether a frame is ``ancestor``, or tf attaches it to that, directly or through others."""
-        return ancestor in self._chain(frame)
+    def find_below(self, ancestor: str, frame: str) -> Transform | None:
+        """The pose of a frame in its ``ancestor``. Returns None if tf does not attach it to that."""
+        return self._chain(frame).get(ancestor)
 
     def names(self) -> list[str]:
         """Names of all known frames."""

@@ -68,10 +68,10 @@ class MountAndOdometry:
     def add_tf(self, message: Any) -> None:
         """Adds a tf message: fixed joints, and odometry if it contains the odom frame."""
         for parent, child, stamp_ns, transform in self.frames.add(message):
-            if parent != self.odom or not self.frames.is_part_of(self.base, child):
-                continue  # other children of the odom frame are not the robot, such as a tracked person
-            base = self.frames.find(self.base, child)
-            if base is not None:
+            if parent != self.odom:
+                continue
+            base = self.frames.find_below(child, self.base)
+            if base is not None:  # else the child is not the robot, but perhaps a tracked person
                 self._add_tf_odometry(stamp_ns, transform.then(base))
 
     def _add_tf_odometry(self, stamp_ns: int, base_in_odom: Transform) -> None:

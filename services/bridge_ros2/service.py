@@ -240,7 +240,7 @@ class BridgeRos2Service(Service):
         self._with_odometry = odometry is not None
         if odometry is not None:
             self.publish(ODOM, odom_of(odometry))
-            self.gate.add_velocity(odometry.twist, now)  # tf has no velocities of its own
+            self.gate.add_velocity(odometry.twist, now)  # also if the odometry comes in tf
         else:
             self.counters["scans_without_odometry"] += 1
         self.gate.add_scan(scan, now)

@@ -211,8 +211,8 @@ class Explorer:
         if viewpoint is not None:
             yaw_tolerance = None if half_field_of_view >= np.pi else half_field_of_view / 2
             goal = goal.model_copy(update={"tolerance": VIEWPOINT_TOLERANCE_M, "yaw_tolerance": yaw_tolerance})
-        # A goal within its tolerance of the present one does not replace it.
         self._map_jumped = False
+        # A goal within its tolerance of the present one does not replace it.
         same = self.goal is not None and np.hypot(*(self.goal.pose.array() - pose)[:2]) <= goal.tolerance
         if same and phase == self.phase and under_way:
             return None

@@ -12,7 +12,7 @@ from common.errors import UserError
 from common.geometry import se2
 from common.messages.definitions import Belief, CmdVel, Drive, Exploration, Goal, PolicyEnergy, Scan, Status
 from common.robot.robot import Robot
-from common.robot.self_filter import SelfFilter
+from common.robot.self_filter import NO_FILTER, SelfFilter
 from common.runtime import safety
 from services.controller.docking import STANDING_TIME_S, Docking
 from services.controller.explorer import Explorer
@@ -54,7 +54,7 @@ class Navigator:
     parameters: ActionParameters = field(default_factory=ActionParameters)  # of preset `paper`
     world: World | None = None  # the map; None while the mapper builds it, or if preset `paper` drives without a map
     chosen_policy: Policy | None = None  # defaults to the straight-line policy, preset `paper`
-    self_filter: SelfFilter = field(default_factory=SelfFilter)
+    self_filter: SelfFilter = NO_FILTER
 
     def __post_init__(self) -> None:
         self.policy: Policy = self.chosen_policy or StraightLinePolicy(self.robot, self.parameters, self.world)

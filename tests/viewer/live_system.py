@@ -4,6 +4,16 @@ from __future__ import annotations
 
 from tests.viewer.client import page_of
 
+SEEN = """(() => {
+    window.seen = [];
+    const take = store.takeFrame.bind(store);
+    store.takeFrame = (frame, now) => {
+        const { belief, truth } = frame;
+        window.seen.push([frame.t, now, belief && truth ? Math.hypot(belief.x - truth.x, belief.y - truth.y) : -1]);
+        take(frame, now);
+    };
+})()"""  # from now on: stamp in s, arrival in ms, distance in m between drawn belief and truth
+
 
 class System:
     """Everything that `presage up` starts."""

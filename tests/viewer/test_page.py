@@ -10,19 +10,9 @@ import pytest
 
 from tests.conftest import ROOT, WAIT_TIMEOUT_S
 from tests.viewer.client import Page
-from tests.viewer.live_system import System
+from tests.viewer.live_system import SEEN, System
 
 STATIC = ROOT / "services" / "viewer" / "static"
-AWAY = "Math.hypot({0}.x - arg[0], {0}.y - arg[1])"  # m from a given place
-SEEN = """(() => {
-    window.seen = [];
-    const take = store.takeFrame.bind(store);
-    store.takeFrame = (frame, now) => {
-        const { belief, truth } = frame;
-        window.seen.push([frame.t, now, belief && truth ? Math.hypot(belief.x - truth.x, belief.y - truth.y) : -1]);
-        take(frame, now);
-    };
-})()"""  # from now on: stamp in s, arrival in ms, distance in m between drawn belief and truth
 COLOURS = """(() => {
     const canvas = document.getElementById("c-scan");
     return new Set(canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data).size;

@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 
 from tests.conftest import WAIT_TIMEOUT_S
-from tests.viewer.live_system import System
-from tests.viewer.test_page import AWAY, SEEN
+from tests.viewer.live_system import SEEN, System
+
+AWAY = "Math.hypot({0}.x - arg[0], {0}.y - arg[1])"  # m from a given place
 
 
 @pytest.fixture(scope="module")

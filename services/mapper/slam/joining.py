@@ -136,7 +136,7 @@ def _agreed_closures(
 
 
 def _which_agree(frames: Array, references: Array) -> npt.NDArray[np.bool_]:
-    """Which candidates agree (M, M): with both of their ``frames`` (M, 3), the ``references`` (M, 3) are close."""
+    """Which candidates (M, M) agree: the ``frames`` (M, 3) of both put the ``references`` (M, 3) close together."""
     agree = []
     for frame in frames:
         off = se2.between(se2.compose(frame, references), se2.compose(frames, references))

@@ -65,7 +65,7 @@ class MessageCounts:
     sequences: dict[str, dict[str, SequenceNumbers]] = field(default_factory=dict)
 
     def add(self, key: str, payload: bytes) -> None:
-        """Counts a payload that was written."""
+        """Counts a payload that is written."""
         self.written[key] = self.written.get(key, 0) + 1
         numbered = sequence_of(payload)
         if numbered is None:

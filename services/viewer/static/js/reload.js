@@ -8,7 +8,7 @@ addEventListener("error", ({ target }) => {
   if (!target.matches?.("script, link")) return;
   const banner = document.getElementById("banner");
   if (banner) {
-    document.getElementById("banner-text").textContent = "A part of this page could not be loaded. Loading it again…";
+    banner.textContent = "A part of this page could not be loaded. Loading it again…"; // without its button, whose code is missing
     banner.hidden = false;
   }
   setTimeout(() => location.reload(), RELOAD_DELAY);
