@@ -43,7 +43,7 @@ OBSTACLE_GAP_M = 0.06
 REPLAN_PERIOD_NS = 400_000_000  # minimum time between two plans when obstacles near the path change
 REPLAN_PERIOD_FAR_NS = 1_500_000_000  # the same when obstacles change elsewhere
 BLIND_AHEAD = "the scanner does not see ahead, where a differential base drives: mount it facing ahead"
-MIN_PROGRESS_M = 0.004  # near the goal, the robot counts as stuck if it gets nearer by less than this
+MIN_PROGRESS_M = 0.02  # near the goal, the robot counts as stuck if it moves by less than this
 MAX_COST_TO_GOAL_M = 100.0  # larger costs are clipped, also that of a goal to which no path leads
 OBSTACLE_RANGE_M = 3.0  # obstacles farther from the robot do not matter to its next second
 
@@ -82,8 +82,8 @@ class GeodesicPolicy:
         self._field_outdated = False  # whether the field was computed before these obstacles were given
         self._reachable_from: int | None = None  # a component of the graph; the goal can be reached from there
         self._field_of_view = ALL_ROUND
-        # Least distance from the goal in m, and the stamp at which the robot got there; None until it is near the goal.
-        self._closest_approach: tuple[float, int] | None = None
+        # Where near the goal it was last seen to move, (2,) m in map, and the stamp; None until it is near the goal.
+        self._last_progress: tuple[Array, int] | None = None
         self._decided_ns = 0  # stamp of the last belief for which it decided
         self._obstacle_near_ns = -STUCK_AFTER_NS  # when an obstacle was last near the robot or the goal
 
@@ -141,7 +141,7 @@ class GeodesicPolicy:
 
     def interrupt(self) -> None:
         """Stops watching for progress: a robot that does not drive to its goal is not stuck."""
-        self._closest_approach = None
+        self._last_progress = None
         self._recovery.reset()
 
     def resume(self) -> None:
@@ -243,7 +243,7 @@ class GeodesicPolicy:
         """
         if self._scan is None:
             return Decision(reason=f"standing until localised: the belief is {belief.state}")
-        self._closest_approach = None  # near the goal, the robot is not stuck while its pose is not known
+        self._last_progress = None  # near the goal, the robot is not stuck while its pose is not known
         if self.epistemic or belief.state != "ambiguous":
             points = safety.scan_points(self._scan)
             points = points[np.hypot(*points.T) < OBSTACLE_RANGE_M]
@@ -324,12 +324,13 @@ class GeodesicPolicy:
         to_goal = self._goal - pose[:2]
         distance, shift = float(np.hypot(*to_goal)), float(np.hypot(*(place - self._goal)))
         if distance > shift + 2 * self.robot.radius:
-            self._closest_approach = None
-        elif self._closest_approach is None or distance < self._closest_approach[0] - MIN_PROGRESS_M:
-            self._closest_approach = (distance, stamp_ns)
+            self._last_progress = None
+        elif self._last_progress is None or np.hypot(*(pose[:2] - self._last_progress[0])) > MIN_PROGRESS_M:
+            # A robot that drives past the goal because its commands come late also moves: no wall stops it.
+            self._last_progress = (pose[:2], stamp_ns)
         # Other free places may be as near to the goal as this one, so the robot need not stand exactly here.
         arrived = shift > 0 and distance < shift + self.free.grid.resolution
-        stuck = self._closest_approach is not None and stamp_ns - self._closest_approach[1] > STUCK_AFTER_NS
+        stuck = self._last_progress is not None and stamp_ns - self._last_progress[1] > STUCK_AFTER_NS
         of_robot, of_goal = (
             np.hypot(*(surroundings.points - centre).T).min(initial=np.inf)
             for centre in (np.zeros(2), se2.rotate(-pose[2], to_goal))

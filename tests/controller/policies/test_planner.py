@@ -79,6 +79,15 @@ def test_time_without_beliefs_is_not_time_without_progress(pause_s, refused):
     assert any(decision.refused for decision in decisions) == refused
 
 
+def test_driving_past_the_goal_is_not_being_stuck():
+    """A robot that swings around its goal because its commands come late is not stopped by a wall."""
+    policy, stamps_s, command = GeodesicPolicy(Robot(), HALL), np.arange(100) * 0.066, np.array([0.3, 0.0, 0.0])
+    policy.set_goal(np.array([7.5, 2.5]))
+    poses = [np.array([7.5 + 0.15 * np.cos(2 * stamp), 2.5 + 0.03, 1.5]) for stamp in stamps_s]
+    beliefs = [belief(int(1e9 * stamp), pose) for stamp, pose in zip(stamps_s, poses, strict=True)]
+    assert not any(policy.decide(each, command, np.zeros(3)).refused for each in beliefs)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_goal_beside_a_wall(kind):
     """The scanner's noise does not stop the robot before a goal 4 cm farther from a wall than its radius."""
