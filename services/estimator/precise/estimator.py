@@ -32,6 +32,7 @@ from services.estimator.precise.motion_model import (
     limit_covariance,
     predict_motion,
     reachable_poses,
+    surprise,
     widen_unobserved,
 )
 from services.estimator.precise.precision import Precision
@@ -71,7 +72,7 @@ SIGNIFICANT_MAP_ERROR = 0.25
 # explained less than 5 to 9 % of the scan at nine of ten wrong poses in the buildings used for development.
 EXPLAINED_BY_CHANCE = 0.1
 UNKNOWN_SIGMA_M = 100.0  # published where the map is unknown
-# A less probable number of changes (a guess) may be due to a kidnapping, so a search is due soon.
+# A less probable number of changes or motion (a guess) may be due to a kidnapping, so a search is due soon.
 SUDDEN_CHANGE_PROBABILITY = 0.01
 MIN_GAIN = 1.0  # nats, by which a scan must be more probable at a place of the map than at an unknown one (a guess)
 TARGET_BEAMS = 2000  # a scan with at least twice as many is thinned, because the time of a search grows with the beams
@@ -184,14 +185,14 @@ class PreciseEstimator:
             match = self._match_local_map(
                 match, self._predict_local_motion(period, odom, observation.command), predicted.covariance
             )
-        if observation.time_increment and any(each.excess(match.poses[0]) == 0 for each in motions[0][:-1]):
+        if observation.time_increment and any(each.is_near(match.poses[0]) for each in motions[0][:-1]):
             # Only if the match is one of the predicted motions: otherwise the robot may have been carried to another
             # place, and may have stood still during the scan.
             match = self._correct_motion_again(match, observation, period)
         # Fusion of match and motion prior
         view = match.view
-        hypotheses = [self._fuse(k, match, motions[k][-1], observation) for k in range(len(match.poses))]
-        hypotheses += self._find_alternatives(view, hypotheses[0], match.motions[0], motions[0][-1])
+        hypotheses = [self._fuse(k, match, motions[k], observation) for k in range(len(match.poses))]
+        hypotheses += self._find_alternatives(view, hypotheses[0], match.motions[0], motions[0])
         # Weights, also of the unknown place
         self._weigh_hypotheses(view, hypotheses, match.local_pose, period)
         self._scan = view, observation
@@ -349,12 +350,14 @@ class PreciseEstimator:
         poses, evidence = view.descend(match.poses, _prior_of([each[-1] for each in match.motions]))
         return replace(match, view=view, poses=poses, evidence=evidence)
 
-    def _fuse(self, k: int, match: ScanMatch, widest: MotionCandidate, observation: Observation) -> TrackedHypothesis:
+    def _fuse(
+        self, k: int, match: ScanMatch, predicted: list[MotionCandidate], observation: Observation
+    ) -> TrackedHypothesis:
         """Fuses the k-th hypothesis with the scan.
 
-        A motion of which the robot is hardly capable, according to the ``widest`` candidate, is evidence against the
-        hypothesis: the robot may have been carried there instead. Where the stamp is earlier than that of the last
-        scan, as when a replay starts again, the duration of the motion is unknown, and this evidence is left out.
+        A motion that is surprising, given those that were ``predicted``, is evidence against the hypothesis: the robot
+        may have been carried instead. Where the stamp is earlier than that of the last scan, as when a replay starts
+        again, the duration of the motion is unknown, and this evidence is left out.
         """
         hypothesis, period = self.hypotheses[k], self._period(observation.stamp)
         candidates, pose, evidence = match.motions[k], match.poses[k], match.evidence
@@ -369,7 +372,7 @@ class PreciseEstimator:
                 widen_unobserved(self.settings.motion, each, unobserved, hypothesis.unobserved_scans, period)
                 for each in candidates
             ]
-            widest = candidates[-1]
+            predicted = candidates
         fused = [
             fuse(
                 limit_covariance(decouple(each, unobserved), self.seeds.spread),
@@ -383,16 +386,17 @@ class PreciseEstimator:
         updated = update_hypothesis(hypothesis, best, evidence, k, period, unobserved=unknown_motion)
         if observation.stamp is not None and self._stamp is not None and observation.stamp < self._stamp:
             return updated
-        return replace(updated, log_evidence=updated.log_evidence - widest.excess(best.mean))
+        return replace(updated, surprise=self._surprise_of_motion(predicted, updated))
 
     def _find_alternatives(
-        self, view: View, best: TrackedHypothesis, candidates: list[MotionCandidate], widest: MotionCandidate
+        self, view: View, best: TrackedHypothesis, candidates: list[MotionCandidate], predicted: list[MotionCandidate]
     ) -> list[TrackedHypothesis]:
         """Other hypotheses within the motion prior that fit the scan, if it made the ``best`` one far more certain.
 
         The pose was uncertain before this scan, and a descent from one pose finds only the nearest match. An
         alternative loses evidence if its motion is less probable than that of the best match, and gains none if it is
-        more probable. As in `_fuse`, a motion of which the robot is hardly capable costs evidence as well.
+        more probable. As in `_fuse`, a motion that is surprising, given those that were ``predicted``, costs evidence
+        as well.
         """
         before = self.hypotheses[0]
         doubt = 1 - self._probability_of_being_near(before)
@@ -405,11 +409,16 @@ class PreciseEstimator:
         return [
             replace(
                 each,
-                log_evidence=min(before.log_evidence, at_best + each.log_evidence) - widest.excess(each.pose),
+                log_evidence=min(before.log_evidence, at_best + each.log_evidence),
+                surprise=self._surprise_of_motion(predicted, each),
                 surroundings=before.surroundings,
             )
             for each in found
         ]
+
+    def _surprise_of_motion(self, predicted: list[MotionCandidate], hypothesis: TrackedHypothesis) -> float:
+        """How improbable the motion to the pose of a hypothesis is, in nats, given the motions that were predicted."""
+        return surprise(self.settings.motion, predicted, hypothesis.pose, hypothesis.noise_covariance)
 
     def _weigh_hypotheses(
         self, view: View, hypotheses: list[TrackedHypothesis], local: Array | None, period: float
@@ -426,6 +435,9 @@ class PreciseEstimator:
         small = view.surfaces.small
         ignored = seen | appeared | small
 
+        # A motion that surprises at all hypotheses would surprise as much if the robot had been carried earlier, but
+        # not if it was carried just now.
+        least_surprise = min(each.surprise for each in hypotheses)
         # Changes are equally probable at all hypotheses. If there are suddenly more of them, a search is due soon.
         log_probability = 0.0  # of the number of changes
         if self._last:
@@ -433,7 +445,7 @@ class PreciseEstimator:
             log_probability = self._change_rate.log_probability(changes, period)
             self._change_rate.learn(changes, period)
         log_change = log_probability + _log_unmapped_surfaces(view, ~appeared | small)
-        if log_probability < np.log(SUDDEN_CHANGE_PROBABILITY):
+        if min(log_probability, -least_surprise) < np.log(SUDDEN_CHANGE_PROBABILITY):
             self._search_interval = 1
 
         log_likelihood, surroundings = _log_at_poses(
@@ -442,6 +454,7 @@ class PreciseEstimator:
         hypotheses = [
             replace(
                 hypothesis,
+                log_evidence=hypothesis.log_evidence - (hypothesis.surprise - least_surprise),
                 explained=evidence.explained[k],
                 scan_log_likelihood=log_likelihood[k] + log_change,
                 scan_surroundings=surroundings[k],
@@ -450,17 +463,16 @@ class PreciseEstimator:
         ]
         self._local_pose, self._ignored_beams, self._log_change = local, ignored, log_change
 
-        log_kidnapping = max(each.log_evidence for each in self.hypotheses) + float(
-            np.log(self.settings.unknown_probability)
-        )
-        self._unknown_place.allow_kidnapping(log_kidnapping, self.settings.off_map_probability)
+        log_kidnapping = max(each.log_evidence for each in self.hypotheses) + least_surprise
+        log_kidnapping += float(np.log(self.settings.unknown_probability))
         # Alternatives found for this scan come last in `hypotheses`, and have no counterpart in `self.hypotheses`.
         pairs = zip(self.hypotheses, hypotheses, strict=False)
-        self._unknown_place.allow_mismatch(max(self._log_mismatch(before, after) for before, after in pairs))
+        unknown_place = self._unknown_place
+        unknown_place.allow_mismatch(max(self._log_mismatch(before, after) for before, after in pairs))
         # Either the surroundings have changed, or the robot was carried to another place and all surfaces are new.
-        self._unknown_place.scan_log_likelihood = max(
-            _log_unmapped_surfaces(view, ignored) + log_change, _log_unmapped_surfaces(view, small)
-        )
+        log_new = _log_unmapped_surfaces(view, small)
+        unknown_place.scan_log_likelihood = max(_log_unmapped_surfaces(view, ignored) + log_change, log_new)
+        unknown_place.allow_kidnapping(log_kidnapping, self.settings.off_map_probability, log_new)
         self._set_hypotheses(hypotheses)
         if not np.array_equal(self.hypotheses[0].pose, hypotheses[0].pose):  # another hypothesis is best now
             self._local_map.place(local, self.hypotheses[0].pose)
@@ -616,6 +628,7 @@ class PreciseEstimator:
             self._search_interval = 1
             if carried[best] > stayed[best]:
                 self._change_rate.forget_latest()
+                self._unknown_place.restart_after_kidnapping(self.settings.off_map_probability)
                 self._restart_local_map(view)
         self._unknown_place.exclude_mapped_places()
         self._set_hypotheses([*self.hypotheses, *added])

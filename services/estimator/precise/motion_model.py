@@ -5,7 +5,8 @@ The prior is a mixture of motions, here called candidates:
 - With odometry: dead reckoning with its noise.
 - Without odometry, and with a small probability also with it, as wheels spin or are blocked: the robot stands still, or
   it keeps its velocity (or follows the velocity command), but for its acceleration.
-- Always, with a small probability: any motion, with that at full speed as its standard deviation.
+- Always, with a small probability: any motion, with that at full speed as its standard deviation. If nothing tells
+  whether the robot moves, standing and moving are equally probable.
 
 The evidence of the scan selects the candidate. So the scans of a standing robot are averaged, and the belief of a
 moving robot does not lag.
@@ -68,9 +69,9 @@ class MotionCandidate:
         off = se2.difference(pose, self.mean)
         return float(off @ np.linalg.solve(self.covariance, off))
 
-    def excess(self, pose: Array) -> float:
-        """Returns max(0, (d² - 9) / 2) nats, where d is the Mahalanobis distance of ``pose`` (3,) from the mean."""
-        return 0.5 * max(0.0, self.squared_distance(pose) - MAX_MOTION_SIGMAS**2)
+    def is_near(self, pose: Array) -> bool:
+        """Whether ``pose`` (3,) is within `MAX_MOTION_SIGMAS` of the mean."""
+        return self.squared_distance(pose) <= MAX_MOTION_SIGMAS**2
 
 
 def predict_motion(
@@ -93,8 +94,11 @@ def predict_motion(
     before = MotionCandidate(pose, covariance, 1.0, np.zeros((3, 3)) if drift_covariance is None else drift_covariance)
     likely = 1 - noise.surprise
     probability = likely if odom is None else likely * noise.surprise  # of the motions that odometry does not give
+    any_motion = noise.surprise
     if command is not None or velocity is not None:
         probability /= 2
+    elif odom is None:
+        probability = any_motion = 0.5  # nothing tells whether the robot stands
     found = [_propagate(before, np.zeros(3), np.full(3, noise.standing), probability)]  # standing still
     acceleration = np.array([noise.acceleration, noise.acceleration, noise.turn_acceleration])
     change = acceleration * period * max(period, SMOOTHING_TIME_S)
@@ -112,7 +116,7 @@ def predict_motion(
         by_odometry = _propagate(before, odom, np.array([position, position, heading]), likely**2)
         found.append(_add_drift(by_odometry, noise.slip * odom, float(pose[2])))
     centre = np.zeros(3) if odom is None else odom
-    found.append(_propagate(before, centre, full_speed + np.abs(centre), noise.surprise))  # any motion
+    found.append(_propagate(before, centre, full_speed + np.abs(centre), any_motion))  # any motion
     return found
 
 
@@ -122,6 +126,22 @@ def expected_motion(candidates: list[MotionCandidate]) -> MotionCandidate:
     It comes last but one, before any possible motion. A match with the local map is the only candidate.
     """
     return candidates[-2] if len(candidates) > 1 else candidates[0]
+
+
+def surprise(noise: MotionNoise, candidates: list[MotionCandidate], pose: Array, covariance: Array) -> float:
+    """How much less probable a motion to ``pose`` (3,), known with ``covariance`` (3, 3), is than expected, in nats.
+
+    It is 0 within `MAX_MOTION_SIGMAS` of an expected motion. Any other motion is as improbable as its candidate, the
+    widest, is at its peak relative to the expected one.
+    """
+    spread = np.array([each.covariance + covariance for each in candidates])
+    off = np.array([se2.difference(pose, each.mean) for each in candidates])
+    squares = np.einsum("ci,ci->c", off, np.linalg.solve(spread, off[:, :, None])[:, :, 0])
+    probability = np.array([each.probability for each in candidates])
+    peaks = np.log(probability) - 0.5 * np.linalg.slogdet(spread)[1]
+    expected = peaks[probability > noise.surprise].min()
+    costs = np.maximum(0.0, expected - peaks) + 0.5 * np.maximum(0.0, squares - MAX_MOTION_SIGMAS**2)
+    return float(costs.min())
 
 
 def smooth_velocity(previous: Array | None, current: Array, period: float) -> Array:

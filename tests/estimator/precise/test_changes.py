@@ -169,7 +169,7 @@ def test_alternatives_are_in_the_same_surroundings():
     unmapped = np.array([0.0, 0.0, 1.0])
     made.hypotheses = [replace(before, noise_covariance=0.1 * np.eye(3), surroundings=unmapped)]
     motion = MotionCandidate(before.pose, 0.1 * np.eye(3), 1.0)
-    found = made._find_alternatives(view, before, [motion], motion)
+    found = made._find_alternatives(view, before, [motion], [motion])
     assert found
     assert all(np.array_equal(each.surroundings, unmapped) for each in found)
 
@@ -194,6 +194,27 @@ def test_unlearned_room(driven, kidnapped):
     assert np.hypot(*(found[-1].pose - then[-1])[:2]) < 0.02
     # In a plain hall, one place seen after a kidnapping is not quite enough for the state tracking.
     assert found[-1].probability > (0.998 if kidnapped else 0.999)
+
+
+ROOM = [(1.0, 3.4, 0.9, 0.4), (4.2, 0.9, 0.5, 0.9), (2.6, 2.4, 0.3, 0.3)]  # x, y, width, depth of boxes
+EXTRA = (4.0, 2.7, 0.35, 0.3)  # a box that only the eastern room has
+
+
+def test_kidnapping_between_similar_rooms():
+    """A robot carried to a room that differs by one box is not taken to be where it was, among new furniture."""
+    boxes = [(x + shift, y, w, d) for shift in (0.0, 6.0) for x, y, w, d in ROOM]
+    boxes += [(EXTRA[0] + 6.0, *EXTRA[1:]), (5.5, 2.0, 0.2, 4.0)]
+    obstacles = [{"box": {"center": (x, y), "size": (w, d)}} for x, y, w, d in boxes]
+    rooms = World(name="rooms", boundary=[(0, 0), (11.5, 0), (11.5, 4), (0, 4)], obstacles=obstacles)
+    made, scene = estimator(rooms)
+    west = np.linspace([1.5, 1.4, 0.0], [2.4, 1.4, 0.0], 30)
+    made.restart(west[0], CLOSE)
+    assert drive(made, scene, west)[-1].state == "tracking"
+    east = np.linspace([8.52, 1.44, 0.05], [9.2, 1.44, 0.5], 30)
+    found = drive(made, scene, east, len(west))
+    off = [np.hypot(*(posterior.pose - pose)[:2]) for posterior, pose in zip(found, east, strict=True)]
+    assert all(o < 0.05 for o, posterior in zip(off, found, strict=True) if posterior.state == "tracking")
+    assert found[-1].state == "tracking"
 
 
 def test_crowd_and_kidnapping():
