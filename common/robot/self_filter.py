@@ -1,8 +1,8 @@
 """Masks beams that hit the robot itself.
 
 In published scans such a beam is marked as not measured (0, see `ranges`), so that it is used neither for localisation
-nor for obstacles. For braking and planning within a process it is NaN, as if the scanner did not have this beam,
-unless the scan is corrected for the robot's motion.
+nor for obstacles. For braking and planning within a process it is NaN, as if the scanner did not have this beam, or 0
+if the scan was corrected for the robot's motion.
 """
 
 from __future__ import annotations

@@ -70,8 +70,9 @@ class MountAndOdometry:
         for parent, child, stamp_ns, transform in self.frames.add(message):
             if parent != self.odom:
                 continue
+            # None for a child that is not part of the robot, such as a tracked person.
             base = self.frames.find_below(child, self.base)
-            if base is not None:  # else the child is not the robot, but perhaps a tracked person
+            if base is not None:
                 self._add_tf_odometry(stamp_ns, transform.then(base))
 
     def _add_tf_odometry(self, stamp_ns: int, base_in_odom: Transform) -> None:

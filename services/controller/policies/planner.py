@@ -82,7 +82,8 @@ class GeodesicPolicy:
         self._field_outdated = False  # whether the field was computed before these obstacles were given
         self._reachable_from: int | None = None  # a component of the graph; the goal can be reached from there
         self._field_of_view = ALL_ROUND
-        # Where near the goal it was last seen to move, (2,) m in map, and the stamp; None until it is near the goal.
+        # A place near the goal, (2,) m in map, and the stamp since which the robot has stayed within `MIN_PROGRESS_M`
+        # of it; None until it is near the goal.
         self._last_progress: tuple[Array, int] | None = None
         self._decided_ns = 0  # stamp of the last belief for which it decided
         self._obstacle_near_ns = -STUCK_AFTER_NS  # when an obstacle was last near the robot or the goal

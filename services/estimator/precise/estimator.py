@@ -30,9 +30,9 @@ from services.estimator.precise.motion_model import (
     expected_motion,
     fuse,
     limit_covariance,
+    motion_cost,
     predict_motion,
     reachable_poses,
-    surprise,
     widen_unobserved,
 )
 from services.estimator.precise.precision import Precision
@@ -72,7 +72,7 @@ SIGNIFICANT_MAP_ERROR = 0.25
 # explained less than 5 to 9 % of the scan at nine of ten wrong poses in the buildings used for development.
 EXPLAINED_BY_CHANCE = 0.1
 UNKNOWN_SIGMA_M = 100.0  # published where the map is unknown
-# A less probable number of changes or motion (a guess) may be due to a kidnapping, so a search is due soon.
+# A number of changes, or a motion, that is less probable (a guess) may be due to a kidnapping: a search is due soon.
 SUDDEN_CHANGE_PROBABILITY = 0.01
 MIN_GAIN = 1.0  # nats, by which a scan must be more probable at a place of the map than at an unknown one (a guess)
 TARGET_BEAMS = 2000  # a scan with at least twice as many is thinned, because the time of a search grows with the beams
@@ -355,8 +355,8 @@ class PreciseEstimator:
     ) -> TrackedHypothesis:
         """Fuses the k-th hypothesis with the scan.
 
-        A motion that is surprising, given those that were ``predicted``, is evidence against the hypothesis: the robot
-        may have been carried instead. Where the stamp is earlier than that of the last scan, as when a replay starts
+        An improbable motion, given those that were ``predicted``, is evidence against the hypothesis: the robot may
+        have been carried instead. Where the stamp is earlier than that of the last scan, as when a replay starts
         again, the duration of the motion is unknown, and this evidence is left out.
         """
         hypothesis, period = self.hypotheses[k], self._period(observation.stamp)
@@ -386,7 +386,7 @@ class PreciseEstimator:
         updated = update_hypothesis(hypothesis, best, evidence, k, period, unobserved=unknown_motion)
         if observation.stamp is not None and self._stamp is not None and observation.stamp < self._stamp:
             return updated
-        return replace(updated, surprise=self._surprise_of_motion(predicted, updated))
+        return replace(updated, motion_cost=self._motion_cost(predicted, updated))
 
     def _find_alternatives(
         self, view: View, best: TrackedHypothesis, candidates: list[MotionCandidate], predicted: list[MotionCandidate]
@@ -395,8 +395,7 @@ class PreciseEstimator:
 
         The pose was uncertain before this scan, and a descent from one pose finds only the nearest match. An
         alternative loses evidence if its motion is less probable than that of the best match, and gains none if it is
-        more probable. As in `_fuse`, a motion that is surprising, given those that were ``predicted``, costs evidence
-        as well.
+        more probable. As in `_fuse`, an improbable motion, given those that were ``predicted``, costs evidence as well.
         """
         before = self.hypotheses[0]
         doubt = 1 - self._probability_of_being_near(before)
@@ -410,15 +409,14 @@ class PreciseEstimator:
             replace(
                 each,
                 log_evidence=min(before.log_evidence, at_best + each.log_evidence),
-                surprise=self._surprise_of_motion(predicted, each),
+                motion_cost=self._motion_cost(predicted, each),
                 surroundings=before.surroundings,
             )
             for each in found
         ]
 
-    def _surprise_of_motion(self, predicted: list[MotionCandidate], hypothesis: TrackedHypothesis) -> float:
-        """How improbable the motion to the pose of a hypothesis is, in nats, given the motions that were predicted."""
-        return surprise(self.settings.motion, predicted, hypothesis.pose, hypothesis.noise_covariance)
+    def _motion_cost(self, predicted: list[MotionCandidate], hypothesis: TrackedHypothesis) -> float:
+        return motion_cost(self.settings.motion, predicted, hypothesis.pose, hypothesis.noise_covariance)
 
     def _weigh_hypotheses(
         self, view: View, hypotheses: list[TrackedHypothesis], local: Array | None, period: float
@@ -435,9 +433,9 @@ class PreciseEstimator:
         small = view.surfaces.small
         ignored = seen | appeared | small
 
-        # A motion that surprises at all hypotheses would surprise as much if the robot had been carried earlier, but
-        # not if it was carried just now.
-        least_surprise = min(each.surprise for each in hypotheses)
+        # What the motion costs at all hypotheses, it would also cost if the robot had been carried away earlier, but
+        # not if it was carried away just now.
+        common_cost = min(each.motion_cost for each in hypotheses)
         # Changes are equally probable at all hypotheses. If there are suddenly more of them, a search is due soon.
         log_probability = 0.0  # of the number of changes
         if self._last:
@@ -445,7 +443,7 @@ class PreciseEstimator:
             log_probability = self._change_rate.log_probability(changes, period)
             self._change_rate.learn(changes, period)
         log_change = log_probability + _log_unmapped_surfaces(view, ~appeared | small)
-        if min(log_probability, -least_surprise) < np.log(SUDDEN_CHANGE_PROBABILITY):
+        if min(log_probability, -common_cost) < np.log(SUDDEN_CHANGE_PROBABILITY):
             self._search_interval = 1
 
         log_likelihood, surroundings = _log_at_poses(
@@ -454,7 +452,7 @@ class PreciseEstimator:
         hypotheses = [
             replace(
                 hypothesis,
-                log_evidence=hypothesis.log_evidence - (hypothesis.surprise - least_surprise),
+                log_evidence=hypothesis.log_evidence - (hypothesis.motion_cost - common_cost),
                 explained=evidence.explained[k],
                 scan_log_likelihood=log_likelihood[k] + log_change,
                 scan_surroundings=surroundings[k],
@@ -463,7 +461,7 @@ class PreciseEstimator:
         ]
         self._local_pose, self._ignored_beams, self._log_change = local, ignored, log_change
 
-        log_kidnapping = max(each.log_evidence for each in self.hypotheses) + least_surprise
+        log_kidnapping = max(each.log_evidence for each in self.hypotheses) + common_cost
         log_kidnapping += float(np.log(self.settings.unknown_probability))
         # Alternatives found for this scan come last in `hypotheses`, and have no counterpart in `self.hypotheses`.
         pairs = zip(self.hypotheses, hypotheses, strict=False)
@@ -628,8 +626,9 @@ class PreciseEstimator:
             self._search_interval = 1
             if carried[best] > stayed[best]:
                 self._change_rate.forget_latest()
-                self._unknown_place.restart_after_kidnapping(self.settings.off_map_probability)
                 self._restart_local_map(view)
+                unknown, off_map = self._unknown_place, self.settings.off_map_probability
+                unknown.allow_kidnapping(unknown.log_evidence, off_map, unknown.scan_log_likelihood)
         self._unknown_place.exclude_mapped_places()
         self._set_hypotheses([*self.hypotheses, *added])
 

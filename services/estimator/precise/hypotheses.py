@@ -50,7 +50,7 @@ class TrackedHypothesis:
     scan_log_likelihood: float = 0.0
     surroundings: Array = field(default_factory=lambda: FIRST_SURROUNDINGS)  # (3,) probabilities at the last key scan
     scan_surroundings: Array = field(default_factory=lambda: FIRST_SURROUNDINGS)  # (3,) at the present scan
-    surprise: float = 0.0  # nats, of the motion since the last scan (see `motion_model.surprise`)
+    motion_cost: float = 0.0  # nats, of the motion since the last scan, see `motion_model.motion_cost`
     velocity: Array | None = None  # (3,) in base_link; None while unknown
     drift_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))  # covariance of the pose with the drift
     weight: float = 1.0
@@ -99,13 +99,6 @@ class UnknownPlace:
         self.log_evidence += self.scan_log_likelihood
         self.log_off_map += self.scan_log_likelihood
         self.scan_log_likelihood = 0.0
-
-    def restart_after_kidnapping(self, off_map: float) -> None:
-        """Begins again after a kidnapping, with probability ``off_map`` to a place that is not on the map.
-
-        The present scan then counts as a whole, in `scan_log_likelihood`.
-        """
-        self.log_off_map = max(self.log_off_map, self.log_evidence + float(np.log(off_map)))
 
     def exclude_mapped_places(self) -> None:
         """Removes the places on the map, after a search of the whole map has made hypotheses of them."""

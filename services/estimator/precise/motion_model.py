@@ -128,18 +128,16 @@ def expected_motion(candidates: list[MotionCandidate]) -> MotionCandidate:
     return candidates[-2] if len(candidates) > 1 else candidates[0]
 
 
-def surprise(noise: MotionNoise, candidates: list[MotionCandidate], pose: Array, covariance: Array) -> float:
+def motion_cost(noise: MotionNoise, candidates: list[MotionCandidate], pose: Array, covariance: Array) -> float:
     """How much less probable a motion to ``pose`` (3,), known with ``covariance`` (3, 3), is than expected, in nats.
 
-    It is 0 within `MAX_MOTION_SIGMAS` of an expected motion. Any other motion is as improbable as its candidate, the
-    widest, is at its peak relative to the expected one.
+    It is 0 within `MAX_MOTION_SIGMAS` of an expected motion. Any other motion costs what the largest density of its
+    candidate, the widest, is below that of the expected one.
     """
-    spread = np.array([each.covariance + covariance for each in candidates])
-    off = np.array([se2.difference(pose, each.mean) for each in candidates])
-    squares = np.einsum("ci,ci->c", off, np.linalg.solve(spread, off[:, :, None])[:, :, 0])
-    probability = np.array([each.probability for each in candidates])
-    peaks = np.log(probability) - 0.5 * np.linalg.slogdet(spread)[1]
-    expected = peaks[probability > noise.surprise].min()
+    widened = [replace(each, covariance=each.covariance + covariance) for each in candidates]
+    peaks = np.array([np.log(each.probability) - 0.5 * np.linalg.slogdet(each.covariance)[1] for each in widened])
+    expected = min(peak for peak, each in zip(peaks, widened, strict=True) if each.probability > noise.surprise)
+    squares = np.array([each.squared_distance(pose) for each in widened])
     costs = np.maximum(0.0, expected - peaks) + 0.5 * np.maximum(0.0, squares - MAX_MOTION_SIGMAS**2)
     return float(costs.min())
 

@@ -22,8 +22,8 @@ from services.estimator.precise.motion_model import (
     MotionNoise,
     expected_motion,
     fuse,
+    motion_cost,
     predict_motion,
-    surprise,
     widen_unobserved,
 )
 from services.estimator.precise.search import NEAR_SCHEDULE_M
@@ -232,25 +232,25 @@ def test_motion_priors():
     assert sum(c.probability for c in (standing, going, wide)) == pytest.approx(1)
 
 
-def test_surprise():
-    """A motion near an expected one is no surprise; any other costs what the prior says, and one too fast more."""
+def test_motion_cost():
+    """A motion near an expected one costs nothing; any other what the prior says, and one too fast more."""
     noise, P, known = MotionNoise(), 1e-6 * np.eye(3), np.zeros((3, 3))
     motions = predict_motion(noise, TRUTH, P, 0.1, velocity=np.array([0.5, 0, 0]))
     standing, going, anywhere = motions
     for each in (standing, going):
-        assert surprise(noise, motions, each.mean, known) == 0
+        assert motion_cost(noise, motions, each.mean, known) == 0
         root = np.linalg.cholesky(each.covariance)
-        assert surprise(noise, motions, each.mean + root @ [0.0, 2.99, 0.0], known) == 0
+        assert motion_cost(noise, motions, each.mean + root @ [0.0, 2.99, 0.0], known) == 0
     aside = se2.compose(going.mean, [0.0, 0.08, 0.1])
     ratio = np.sqrt(np.linalg.det(anywhere.covariance) / np.linalg.det(going.covariance))
     cost = np.log(going.probability / anywhere.probability * ratio)
-    assert surprise(noise, motions, aside, known) == pytest.approx(cost)
+    assert motion_cost(noise, motions, aside, known) == pytest.approx(cost)
     too_fast = se2.compose(TRUTH, [0.5, 0.0, 0.0])
-    assert surprise(noise, motions, too_fast, known) == pytest.approx(
+    assert motion_cost(noise, motions, too_fast, known) == pytest.approx(
         cost + 0.5 * (anywhere.squared_distance(too_fast) - 9)
     )
-    # If nothing tells whether the robot moves, no motion of which it is capable is a surprise.
-    assert surprise(noise, predict_motion(noise, TRUTH, P, 0.1), aside, known) == 0
+    # If nothing tells whether the robot moves, no motion of which it is capable costs anything.
+    assert motion_cost(noise, predict_motion(noise, TRUTH, P, 0.1), aside, known) == 0
 
 
 def test_drift():
