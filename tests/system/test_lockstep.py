@@ -58,8 +58,12 @@ class Session:
                 self.start("recorder", "--directory", str(self.folder), "--file", f"{name}.mcap"),
                 self.start("controller", "--belief-timeout", "60"),
                 self.start("estimator", "--initial-pose", "3.2,1.4", "--models", str(self.models)),
-                self.start("simulator", "--pace", "lockstep", "--seed", "3", "--beams", "622", "--wait-for", wait_for),
-            ]
+                # A busy machine must not make it send a scan again.
+                self.start(
+                    "simulator", "--pace", "lockstep", "--lockstep-deadline", str(WAIT_TIMEOUT_S), "--seed", "3",
+                    "--beams", "622", "--wait-for", wait_for,
+                ),
+            ]  # fmt: skip
             assert wait_until(lambda: bus.alive() >= SERVICES, WAIT_TIMEOUT_S), [each.output for each in started]
             key = GOAL.key(bus.robot)
             bus.put(GOAL, Goal(stamp_ns=0, pose=Pose(x=15.5, y=1.5)).encode())

@@ -131,8 +131,9 @@ def expected_motion(candidates: list[MotionCandidate]) -> MotionCandidate:
 def motion_cost(noise: MotionNoise, candidates: list[MotionCandidate], pose: Array, covariance: Array) -> float:
     """How much less probable a motion to ``pose`` (3,), known with ``covariance`` (3, 3), is than expected, in nats.
 
-    It is 0 within `MAX_MOTION_SIGMAS` of an expected motion. Any other motion costs what the largest density of its
-    candidate, the widest, is below that of the expected one.
+    It is 0 within `MAX_MOTION_SIGMAS` of an expected motion, and rises with the distance from that. At most, it is the
+    cost of any possible motion (the widest candidate): the difference of the largest log densities of an expected
+    motion and of this candidate, and more if the robot is hardly capable of the motion.
     """
     widened = [replace(each, covariance=each.covariance + covariance) for each in candidates]
     peaks = np.array([np.log(each.probability) - 0.5 * np.linalg.slogdet(each.covariance)[1] for each in widened])
