@@ -16,9 +16,10 @@ from rich.console import Console
 from rich.table import Table
 
 from common.bus.bus import open_bus
+from common.errors import UserError
 from common.messages.definitions import Belief, Goal, Pose, Status
 from common.messages.topics import BELIEF, GOAL, STATUS
-from lab.benchmarks.viewer import ROBOT, FrameCounter
+from lab.benchmarks.viewer import ROBOT, TIMEOUT_S, FrameCounter
 from presage.live.latest_messages import LatestMessages
 from presage.session.ports import free_port
 from presage.session.stack import Stack
@@ -56,11 +57,13 @@ def measure(seconds: float, beams: int) -> dict[str, Any]:
 
 
 def _drive(stack: Stack, messages: LatestMessages, goals: Iterator[Pose], seconds: float) -> int:
-    """Sends the next goal whenever the robot has none; returns the number of beliefs."""
-    beliefs, end = 0, time.monotonic() + seconds
-    while (left := end - time.monotonic()) > 0:
+    """Sends the next goal whenever the robot has none; returns the number of beliefs, at least one."""
+    beliefs, began = 0, time.monotonic()
+    while (spent := time.monotonic() - began) < seconds or not beliefs:
+        if spent > seconds + TIMEOUT_S:
+            raise UserError(f"the estimator sent no belief within {spent:.0f} s")
         stack.check()
-        message = messages.next(min(0.5, left))
+        message = messages.next(0.05)
         beliefs += isinstance(message, Belief)
         if isinstance(message, Status) and message.state in {"idle", "reached"}:
             goal = Goal(stamp_ns=message.stamp_ns, seq=message.goal_seq + 1, pose=next(goals))
