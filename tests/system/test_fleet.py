@@ -15,7 +15,7 @@ from tests.conftest import WAIT_TIMEOUT_S
 
 NUMBERS = (1, 2, 3)
 STARTS = {1: "3,1.5,90", 2: "9,1.5,0", 3: "14,1.5,90"}
-MAX_ERROR = 0.15  # m, with 64 beams
+MAX_ERROR = 0.15  # m, with 181 beams
 
 
 class RobotListener:
@@ -60,7 +60,7 @@ def names(link):
 def simulate(process, names):
     def start(k, where=None):
         return process(
-            "simulator", "--beams", "64", "--start", where or STARTS[k], "--seed", str(k),
+            "simulator", "--beams", "181", "--start", where or STARTS[k], "--seed", str(k),
             env={"PRESAGE_ROBOT": names[k]},
         )  # fmt: skip
 

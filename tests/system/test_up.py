@@ -139,7 +139,7 @@ def test_up_with_page_and_dead_service(up):
 
 
 def test_up_with_two_robots(up):
-    running, children, port = up("--robots", "2", "--no-viewer", PRESAGE_ROBOT="r", PRESAGE_BEAMS="64")
+    running, children, port = up("--robots", "2", "--no-viewer", PRESAGE_ROBOT="r", PRESAGE_BEAMS="181")
     assert "page:" not in running.output
     assert len(children) == 6  # a simulator and a controller for each robot, one router and one estimator
     for robot in ("r-1", "r-2"):
