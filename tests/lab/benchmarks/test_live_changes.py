@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from lab.benchmarks import visits
 from lab.benchmarks.live_changes import AFTER, BEFORE, PRESENT, follow_changes, table
 
 
-def test_short_drive():
+def test_short_drive(monkeypatch):
+    monkeypatch.setattr(visits, "PRESENT_SCANS", 60)  # that each model is learned from: enough to find single scans
     row = follow_changes("office", seed=1, seconds=4.0, scans=3)
     assert [len(row[model]) for model in (BEFORE, AFTER, PRESENT)] == [3, 3, 3]
     assert row[BEFORE] == row[AFTER]  # too short to learn anything
