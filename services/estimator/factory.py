@@ -175,7 +175,8 @@ def _prepare_precise(options: EstimatorOptions, world: World) -> EstimatorFactor
     model, seeds, card = load_model(options, world)
     calibration = card.calibration if card else None
     settings = calibration.settings() if calibration else PreciseSettings(inflation=card.inflation if card else 1.0)
-    cell = 0.0 if calibration or world.grid is None else world.grid.resolution
+    measured = card is not None and (card.measured or card.calibration is not None)
+    cell = 0.0 if measured or world.grid is None else world.grid.resolution
     bounds = (card.world if card else world).bounds
     _compile(model, seeds)
 

@@ -103,6 +103,7 @@ def save_learned(
         learning_s=0.0,
         source=f"{len(version.key_poses)} key scans while driving; elsewhere {original.file or 'the map'}",
         calibration=None if card_before is None else card_before.calibration,
+        measured=True,
         commit=commit(),
         command=f"presage save-model {name}",
         versions=versions(),

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from services.estimator.shared.interface import Observation, PoseEstimator, Posterior
 
 DISCOVERY_PERIOD_S = 0.5  # between two checks for new and absent robots
+RETRY_PERIOD_S = 10.0  # after which a robot that could not be served is tried again
 HEALTH_CHECK_PERIOD_S = 0.05  # between two checks for due health messages
 MAX_MESSAGES_PER_TURN = 20  # handled for one robot before the next one
 INBOX_MESSAGES, INBOX_BYTES = 1000, 1 << 24  # of one robot
@@ -67,6 +68,10 @@ class FleetRobot(EstimatorService):
         else:
             self.search, self._searched_scan = self._start_search(estimator.search), scan
 
+    def try_start(self) -> None:
+        """Becomes active, unless another process serves this robot."""
+        self.active = self.loop.try_start()
+
     def publish_search(self) -> None:
         """Waits for the search, if there is one, and publishes its result. Raises the exception of a failed search."""
         search, self.search = self.search, None
@@ -98,6 +103,8 @@ class FleetService(Service):
             raise UserError("--learn is for one robot: leave it out, or leave out --robots")
         if settings.initial_pose:
             raise UserError("--initial-pose is for one robot: with --robots, set each pose with `presage relocalise`")
+        if settings.metrics:
+            self.log.warning("the estimator of several robots serves no metrics: its robots report health instead")
 
     def make_loop(self, bus: Bus) -> Runnable:
         """Creates the loop that serves all robots; see Service."""
@@ -129,14 +136,14 @@ class FleetLoop:
         self._searches = ThreadPoolExecutor(1, "search")
         self._may_log = LogRateLimiter()
         self._next_health_check = self._next_discovery = 0.0
+        self._retry_at: dict[str, float] = {}  # by name of a robot in the settings
         self._stopping = False
 
     def run(self) -> None:
         """Runs until `stop` is called."""
         sys.setswitchinterval(THREAD_SWITCH_INTERVAL_S)
         self.models = SharedModels(self.settings)
-        for name in self.names:
-            self._add(name, named=True)
+        self._add_named_robots()
         self.bus.watch_robots(self._note_liveliness)
         for pattern in self.patterns:
             self.bus.subscribe(SCAN, self._unserved_scans, robot=key_expression(pattern))
@@ -163,6 +170,7 @@ class FleetLoop:
                     self._guard(robot, robot.loop.publish_health_if_due)
         if now >= self._next_discovery:
             self._next_discovery = now + DISCOVERY_PERIOD_S
+            self._add_named_robots()
             self._add_found_robots()
             self._update_robots(now)
         with self._changed:
@@ -186,8 +194,6 @@ class FleetLoop:
         except UserError as error:
             self.log.warning(str(error), robot=robot.robot)
             self._remove(robot)
-            if robot.named:
-                self._add(robot.robot, named=True)
 
     def _start_search(self, search: Callable[[], Posterior]) -> Future[Posterior]:
         future = self._searches.submit(search)
@@ -204,6 +210,13 @@ class FleetLoop:
         else:
             self._alive.pop((robot, service), None)
 
+    def _add_named_robots(self) -> None:
+        """Serves the robots of the settings that are not served, also those for which this failed before."""
+        for name in self.names:
+            if name not in self._robots and time.monotonic() >= self._retry_at.get(name, 0.0):
+                self._retry_at[name] = time.monotonic() + RETRY_PERIOD_S
+                self._try_to_add(name, named=True)
+
     def _add_found_robots(self) -> None:
         """Serves robots that a pattern found, unless they have an estimator of their own or there are too many."""
         found = [robot for robot, service in list(self._alive) if service == "simulator"]
@@ -213,11 +226,7 @@ class FleetLoop:
             if name in self._robots or not self._matches(name) or (name, "estimator") in self._alive:
                 continue
             if len(self._robots) < self.settings.max_robots:
-                try:
-                    self._add(name, named=False)
-                except UserError as error:
-                    if self._may_log(name):
-                        self.log.warning(str(error), robot=name)
+                self._try_to_add(name, named=False)
             elif self._may_log("many"):
                 self.log.warning("too many robots", not_served=name, max_robots=self.settings.max_robots)
 
@@ -228,7 +237,9 @@ class FleetLoop:
         """Starts robots that can become active, and forgets those without scans and simulator."""
         for name, robot in list(self._robots.items()):
             if not robot.active:
-                robot.active = robot.loop.try_start()
+                self._guard(robot, robot.try_start)
+                if name not in self._robots:
+                    continue
             scans = robot.loop.inbox.received[SCAN.key(name)]
             if scans != robot.scans_at_last_check or (name, "simulator") in self._alive:
                 robot.scans_at_last_check, robot.last_seen = scans, now
@@ -240,15 +251,18 @@ class FleetLoop:
                 if not robot.named:
                     self._remove(robot)
 
-    def _add(self, name: str, *, named: bool) -> None:
+    def _try_to_add(self, name: str, *, named: bool) -> None:
+        """Serves a robot, or logs why that cannot be."""
         robot = FleetRobot(self.settings, name, self.models, self._start_search, named=named)
         loop = ServiceLoop(robot, self.bus.for_robot(name), Inbox(INBOX_MESSAGES, INBOX_BYTES, self._changed))
         try:
             loop.open()
-            robot.active = loop.try_start()
-        except UserError:
+            robot.try_start()
+        except UserError as error:
             loop.bus.undeclare_all()
-            raise
+            if self._may_log(name):
+                self.log.warning(str(error), robot=name)
+            return
         self._robots[name] = robot
         self._count()
 

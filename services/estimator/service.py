@@ -48,6 +48,7 @@ from common.messages.topics import (
     Topic,
 )
 from common.robot.ranges import ranges_for_localisation
+from common.robot.robot import Robot
 from common.runtime.odometry_sync import OdometrySync, ScanWithOdometry
 from common.runtime.service import Service
 from services.estimator.factory import (
@@ -72,6 +73,7 @@ from services.estimator.shared.interface import Observation, PoseEstimator, Post
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
 
+MAX_COMMAND_AGE_NS = int(Robot().command_age * 1e9)  # a robot does not follow older commands
 # The learned field is published again after this time, for recordings that begin later.
 FIELD_PERIOD_NS = 30_000_000_000
 
@@ -345,6 +347,8 @@ class EstimatorService(Service):
         if prior == "odometry" and odom is None:
             self.counters["scans_without_odometry"] += 1
         command = self.command if prior == "command" else None
+        if command is not None and not 0 <= scan.stamp_ns - command.stamp_ns <= MAX_COMMAND_AGE_NS:
+            command = None
         return Observation(
             ranges_for_localisation(scan.ranges),
             scan.angles(),

@@ -163,6 +163,36 @@ def test_a_robot_with_another_protocol_is_left_out(bus, monkeypatch):
     assert loop._robots == {}
 
 
+def test_a_named_robot_with_another_protocol_is_tried_again(bus, monkeypatch):
+    """Nor does it end the process, in which the other robots are served."""
+    monkeypatch.setattr(multi_robot, "SharedModels", lambda _: None)
+    other, good = f"{bus.robot}-old", f"{bus.robot}-new"
+    loop = multi_robot.FleetLoop(EstimatorSettings(robots=f"{other},{good}"), bus)
+    loop.models = None
+    monkeypatch.setattr(multi_robot.ServiceLoop, "open", lambda loop: check(loop.bus.robot))
+    monkeypatch.setattr(multi_robot.ServiceLoop, "try_start", lambda _: True)
+    monkeypatch.setattr(multi_robot.ServiceLoop, "publish_health_if_due", lambda loop: check(loop.bus.robot))
+    outdated = set()
+
+    def check(robot):
+        if robot in outdated:
+            raise UserError("another protocol")
+
+    def turn():
+        loop._next_health_check = loop._next_discovery = 0.0
+        loop._turn()
+        return set(loop._robots)
+
+    loop._stopping = True  # no turn waits
+    assert turn() == {other, good}
+    outdated.add(other)
+    assert turn() == {good}
+    outdated.clear()
+    assert turn() == {good}  # not at once
+    loop._retry_at[other] = 0.0
+    assert turn() == {other, good}
+
+
 def test_search_beside_tracking(fleet):
     _, _, a, b = fleet("a", "b")
     a.send(1, 2)

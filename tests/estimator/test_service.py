@@ -185,6 +185,8 @@ def test_command_as_prior(precise):
     assert precise._observation(a_scan(2), None).command is None
     precise.settings = EstimatorSettings(prior="command")
     assert precise._observation(a_scan(2), None).command.tolist() == [0.5, 0, 0]
+    assert precise._observation(a_scan(501_000_000), None).command is None  # the robot has stopped by then
+    assert precise._observation(a_scan(0), None).command is None  # stamps have begun again
 
 
 @pytest.mark.parametrize("estimator", ["precise", "paper"])

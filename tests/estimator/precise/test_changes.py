@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,8 @@ from lab.accuracy import tasks
 from lab.accuracy.scenes import Scene
 from lab.integrity.cases import CASES, make_trial
 from lab.integrity.maps import noisy_grid, scaled_map
-from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
+from services.estimator import factory
+from services.estimator.factory import EstimatorOptions, ScannerGeometry, load_model, prepare_factory
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.global_seeds import Seeds, thin_places
 from services.estimator.precise.hypotheses import NEAR_HEADING_RAD, NEAR_POSITION_M, probability_of_being_near
@@ -338,6 +340,18 @@ def test_surfaces_in_the_cells_of_a_grid():
         normalised.append(errors[-1] @ np.linalg.solve(found.covariance[:2, :2], errors[-1]))
     assert np.sqrt((np.array(errors) ** 2).sum(axis=1).mean()) < 0.02
     assert np.mean(normalised) < 4.5
+
+
+@pytest.mark.parametrize("measured", [False, True])
+def test_field_learned_on_a_grid(monkeypatch, measured):
+    """A field that was learned from the robot's scans has no cells, though its map is a grid."""
+    grid = noisy_grid(Scene.of(HALL, BEAMS, 3))
+    model, seeds, _ = load_model(EstimatorOptions(grid, model="exact"), grid)
+    scanner = Scene.of(HALL, BEAMS, 3).scanner
+    card = SimpleNamespace(measured=measured, calibration=None, inflation=1.0, world=grid, scanner=scanner)
+    monkeypatch.setattr(factory, "load_model", lambda *_: (model, seeds, card))
+    made = prepare_factory(EstimatorOptions(grid))(ScannerGeometry.of(scanner))
+    assert (Precision.before_first_scan(0.0) == made._precision) is measured
 
 
 def test_heading_of_a_kidnapping():

@@ -40,7 +40,7 @@ MAX_SPEED, MAX_TURN = 2.0, 3.0  # m/s, rad/s
 class KeyScan:
     """A scan as if all its beams had been measured at its stamp."""
 
-    stamp: float  # s
+    stamp: float  # s, of the collector's clock
     pose: Array  # (3,) base_link in map
     ranges: npt.NDArray[np.float32]  # (B,) m
     path: float  # m that the robot had driven
@@ -52,7 +52,10 @@ class KeyScan:
 
 
 class KeyScanCollector:
-    """Collects the key scans of one scanner, and keeps the newest one of each place and heading."""
+    """Collects the key scans of one scanner, and keeps the newest one of each place and heading.
+
+    Its clock is that of the scans, but where their stamps begin again, as after a reset of the simulator, it goes on.
+    """
 
     def __init__(self, angles: Array, mount: Array, range_max: float) -> None:
         """``angles`` (B,) rad are those of the scanner's beams, ``mount`` (3,) is the laser in base_link."""
@@ -65,6 +68,7 @@ class KeyScanCollector:
         self._taken_total = 0
         self._size = PLACE_M
         self._path = 0.0  # m
+        self._clock, self._clock_ahead = -np.inf, 0.0  # s; by which it is ahead of the scans' stamps
         self._last: tuple[float, Array] | None = None  # stamp and pose of the last scan in `tracking`
         self._last_key: Array | None = None  # (3,) pose
 
@@ -73,9 +77,11 @@ class KeyScanCollector:
 
     def add(self, posterior: Posterior, observation: Observation) -> None:
         """Processes a scan and the posterior after it; keeps the scan if it is due as a key scan."""
-        stamp = observation.stamp
-        if stamp is None:
+        if observation.stamp is None:
             return
+        if observation.stamp + self._clock_ahead < self._clock:
+            self._clock_ahead = self._clock + 2 * MAX_GAP_S - observation.stamp  # the robot may be elsewhere
+        self._clock = stamp = observation.stamp + self._clock_ahead
         if self._last is not None and not 0 < stamp - self._last[0] <= MAX_GAP_S:
             self.forget_unverified()
         if posterior.state != "tracking":

@@ -51,6 +51,8 @@ class FieldCard(BaseModel):
     learning_s: float
     source: str = "simulated scans"
     calibration: Calibration | None = None  # on real scans; None if the estimator's defaults hold
+    # whether the field shows surfaces where the robot's scans did, not where the cells of a grid have them
+    measured: bool = False
     commit: str
     command: str
     versions: dict[str, str]

@@ -110,6 +110,22 @@ def test_restart_of_time():
     assert drive.keys.dropped_total > 10
 
 
+def test_stamps_that_begin_again():
+    """Scans after a reset of the simulator are newer than those before, and are not mixed up with them."""
+    drive = Drive().go(12)
+    stamps, poses = (
+        np.array(each) for each in zip(*((k.stamp, k.pose) for k in drive.keys.verified.values()), strict=True)
+    )
+    drive.keys.set_learned(stamps, poses)
+    drive.stamp = 0.0
+    drive.go(12)
+    added = [key for key in drive.keys.verified.values() if key.pose[0] > 12]
+    assert len(added) > 10
+    assert min(key.stamp for key in added) > drive.keys.learned_until
+    drive.keys.set_learned(stamps, poses + np.array([5.0, 0.0, 0.0]))
+    assert all(drive.keys.verified[key.cell(key_scans.PLACE_M)] == key for key in added)
+
+
 def test_newest_of_each_place():
     drive = Drive().go(12)
     first = len(drive.keys)
