@@ -87,7 +87,8 @@ def _obstacles(context: typer.Context) -> list[Obstacle]:
     with session_bus(chosen_link(context, OBSERVER)) as bus:
         reply = bus.query(WORLD, Request(), WorldReply)
     if reply.world is None:
-        raise UserError(f"refused: {reply.reason}")
+        hidden = "the simulator hides its world while mapping: obstacles can be added and removed, not listed or moved"
+        raise UserError(f"refused: {reply.reason}" if reply.reason else hidden)
     return list(reply.world.obstacles)
 
 

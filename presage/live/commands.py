@@ -65,12 +65,13 @@ def send_goal(link: Link, goal: Goal, console: Console, *, wait: bool) -> int:
         messages = LatestMessages(bus, STATUS)
         if not bus.wait_matching(GOAL, 3.0):
             raise UserError("no controller receives goals: is it running?")
-        status = messages.wait_for(Status, lambda _: True, 3.0)
-        if status is None:
+        status = messages.wait_for(Status, lambda _: True, STATUS_WARNING_S)
+        # Without beliefs, a robot that stands has no status, but it would drive on later if its goal stayed.
+        if status is None and not goal.cancel:
             raise UserError(
                 "the controller publishes no status: does it receive beliefs? `presage doctor` finds the cause"
             )
-        bus.put(GOAL, goal.model_copy(update={"stamp_ns": status.stamp_ns}).encode())
+        bus.put(GOAL, goal.model_copy(update={"stamp_ns": status.stamp_ns if status else 0}).encode())
         if goal.cancel:
             done = messages.wait_for(Status, lambda s: s.state == "idle", 3.0)
             console.print("cancelled; the robot stops" if done else "sent, but not confirmed by the controller")

@@ -28,8 +28,10 @@ def explore(link: Link, console: Console) -> int:
             bus.put(GOAL, request.encode())
             return _follow(messages, request.seq, console)
         except KeyboardInterrupt:
-            _stop(messages, request)
-            console.print("stopped; `presage save-map NAME` saves the map so far")
+            if _stop(messages, request):
+                console.print("stopped; `presage save-map NAME` saves the map so far")
+            else:
+                console.print("the stop was sent, but not confirmed by the controller: the robot may still drive")
             raise
 
 
@@ -45,6 +47,7 @@ def _follow(messages: LatestMessages, seq: int, console: Console) -> int:
                 raise UserError(
                     status.reason if status.refused else "the exploration was cancelled, or another one began"
                 )
+            began_ns = began_ns or status.stamp_ns  # before the first belief, stamps are 0
             so_far = f"{progress.area:.0f} m² mapped, {progress.path:.1f} m driven"
             state = f"{status.state} {status.reason}"
             show(f"{progress.phase}: {so_far}; {state}", f"{progress.phase} {state}")
@@ -65,7 +68,8 @@ def _progress(status: Status, seq: int) -> Exploration | None:
     return status.exploration if status.exploration is not None and status.exploration.seq == seq else None
 
 
-def _stop(messages: LatestMessages, request: Goal) -> None:
-    """Ends the exploration, and waits until the controller confirms it."""
+def _stop(messages: LatestMessages, request: Goal) -> bool:
+    """Ends the exploration; returns whether the controller confirms it."""
     messages.bus.put(GOAL, request.model_copy(update={"cancel": True}).encode())
-    messages.wait_for(Status, lambda status: status.exploration is None and status.state == "idle", ANSWER_TIMEOUT_S)
+    ended = lambda status: status.exploration is None and status.state == "idle"  # noqa: E731
+    return messages.wait_for(Status, ended, ANSWER_TIMEOUT_S) is not None

@@ -47,6 +47,7 @@ from services.simulator.settings import SimulatorSettings
 from services.simulator.simulation import Simulation, SimulationSetup
 
 MAX_SAMPLE_RANGES = 4_000_000  # in one reply, 16 MB
+REPEAT_S = 0.2  # in slow motion, after which a scan is sent again: less than the controller's belief timeout
 MAX_LAG_S = 1.0  # a simulation that is farther behind real time goes on from there, without catching up
 
 
@@ -72,6 +73,7 @@ class SimulatorService(Service):
         # The measurements at the present simulated time; None before the first ones, and after a reset.
         self._published: tuple[Stamped, Stamped, Stamped] | None = None
         self._next_step_s = 0.0  # time.monotonic() of the next step; in lockstep, of publishing the same scan again
+        self._repeat_s = 0.0  # time.monotonic() at which, in slow motion, the present scan is sent again
         self._alive: set[str] = set()  # services, updated from zenoh's thread
         self._required_services = settings.required_services()  # emptied when time begins
 
@@ -107,7 +109,7 @@ class SimulatorService(Service):
             people_speed=settings.people_speed,
             engine=engine,
         )
-        self._create_simulation()
+        self._use(self.setup, Simulation(self.setup))
         if not settings.obstacle_stop:
             self.log.warning("the obstacle stop is off, for fault injection: the robot will not brake before obstacles")
         self._next_step_s = time.monotonic()
@@ -116,8 +118,8 @@ class SimulatorService(Service):
             self.log.info(self.note)
             self.loop.bus.watch_alive(self._on_liveliness)
 
-    def _create_simulation(self) -> None:
-        self.simulation = Simulation(self.setup)
+    def _use(self, setup: SimulationSetup, simulation: Simulation) -> None:
+        self.setup, self.simulation = setup, simulation
         self._update_clock_factor()
 
     def _update_clock_factor(self) -> None:
@@ -145,10 +147,18 @@ class SimulatorService(Service):
             return None
         if self._required_services:
             return 0.0 if self._required_services <= self._alive else 0.05
-        return 0.0 if self.settings.pace == "fast" else self._next_step_s - time.monotonic()
+        if self.settings.pace == "fast":
+            return 0.0
+        next_s = min(self._next_step_s, self._repeat_s) if self._is_slow else self._next_step_s
+        return next_s - time.monotonic()
+
+    @property
+    def _is_slow(self) -> bool:
+        """Whether a scan is sent again until the next one, so that slow motion does not look like a failure."""
+        return self.speed < 1 and self._published is not None
 
     def on_timer(self) -> None:
-        """Publishes the first scan, or the next one; in lockstep the same scan again."""
+        """Publishes the first scan, or the next one; in lockstep, and in slow motion, the same scan again."""
         if self._required_services:
             self._required_services = set()
             self._update_note()
@@ -163,6 +173,8 @@ class SimulatorService(Service):
             )
             self.counters["scans_sent_again"] += 1
             self._publish()
+        elif self._is_slow and time.monotonic() < self._next_step_s:
+            self._send()
         else:
             self.simulation.advance()
             self._observe()
@@ -190,10 +202,8 @@ class SimulatorService(Service):
         self._publish()
 
     def _publish(self) -> None:
-        """Publishes odometry and truth before the scan, so that services have them when the scan arrives."""
-        assert self._published is not None  # noqa: S101 - set by all callers
-        for topic, message in zip((ODOM, TRUTH, SCAN), self._published, strict=True):
-            self.publish(topic, message)
+        """Publishes the present scan, and sets the time of the next step."""
+        self._send()
         now = time.monotonic()
         if self.lockstep:
             self._next_step_s = now + self.settings.lockstep_deadline
@@ -202,6 +212,13 @@ class SimulatorService(Service):
             if now - self._next_step_s > MAX_LAG_S:
                 self.counters["late"] += 1
                 self._next_step_s = now
+
+    def _send(self) -> None:
+        """Sends odometry and truth before the scan, so that services have them when the scan arrives."""
+        assert self._published is not None  # noqa: S101 - set by all callers
+        for topic, message in zip((ODOM, TRUTH, SCAN), self._published, strict=True):
+            self.publish(topic, message)
+        self._repeat_s = time.monotonic() + REPEAT_S
 
     def on_request(self, query: Query, request: Request) -> Reply:
         """Carries out a request. Raises UserError if that is not possible."""
@@ -271,9 +288,10 @@ class SimulatorService(Service):
         return Reply()
 
     def _reset(self, seed: int | None) -> None:
-        self.setup = replace(self.setup, seed=self.setup.seed if seed is None else seed)
+        setup = replace(self.setup, seed=self.setup.seed if seed is None else seed)
+        simulation = Simulation(setup)  # fails if there is no room for the people: then the present one goes on
         self.simulation.close()
-        self._create_simulation()
+        self._use(setup, simulation)
         self._published, self._next_step_s = None, time.monotonic()
 
     def _sample(self, request: SampleRequest) -> SampleReply:

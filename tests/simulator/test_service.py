@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
 from common.bus.inbox import Inbox, IncomingRequest
+from common.errors import UserError
 from common.messages.definitions import CmdVel, Pose, Twist
 from common.messages.requests import PoseRequest, Request, ResetRequest, SpeedRequest
 from common.messages.topics import PAUSE, RESET, RESUME, SCAN, SPEED, STEP, TELEPORT, TRUTH, WORLD
@@ -176,13 +178,43 @@ def test_speed_factor(simulator, factor):
         assert len(running.scans()) in {15, 16}
         assert running.request(SPEED, SpeedRequest(factor=factor)).ok
         running.run(1.0)
-        assert len(running.scans()) == pytest.approx(15 * factor, abs=1)
+        assert len(set(running.scans())) == pytest.approx(15 * factor, abs=1)
         note = "" if factor == 1 else f"runs at {factor:g} x real time"
         assert running.service.note == note
         running.request(PAUSE)
         assert running.service.note == "paused"
         running.request(RESUME)
         assert running.service.note == note
+
+
+def test_slow_motion(simulator):
+    """The controller hears of the present scan often enough not to stop the robot for want of beliefs."""
+    with simulator() as running:
+        running.service.on_timer()
+        running.request(SPEED, SpeedRequest(factor=0.1))
+        running.scans()
+        stamps = []
+        for _ in range(20):
+            running.run(shell.REPEAT_S)
+            sent = running.scans()
+            assert sent
+            stamps += sent
+        assert set(stamps) == set(range(stamps[0], stamps[0] + 6))
+        assert stamps == sorted(stamps)
+        running.request(PAUSE)
+        running.run(1.0)
+        assert running.scans() == []
+
+
+def test_refused_reset(simulator, monkeypatch):
+    """The simulation goes on if another one cannot be made."""
+    with simulator() as running:
+        running.run(1.0)
+        running.scans()
+        monkeypatch.setattr(shell, "Simulation", Mock(side_effect=UserError("no room for 22 people")))
+        assert running.request(RESET, ResetRequest(seed=1)).reason == "no room for 22 people"
+        running.run(1.0)
+        assert min(running.scans()) > 10
 
 
 def test_higher_speed_takes_effect_at_once(simulator):
