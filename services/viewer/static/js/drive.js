@@ -1,8 +1,8 @@
-// Manual driving by keys or joystick. Sends a command ten times per second, as the controller requires.
+// Manual driving by keys or joystick. Sends a command ten times per second of the robot's time: they expire after half of one.
 
 import { $ } from "./dom.js";
 
-const SEND_PERIOD = 100; // ms
+const SEND_PERIOD = 100; // ms at real time; a simulation may be faster
 const KEYS = {
   w: [1, 0, 0], arrowup: [1, 0, 0], s: [-1, 0, 0], arrowdown: [-1, 0, 0],
   a: [0, 0, 1], arrowleft: [0, 0, 1], d: [0, 0, -1], arrowright: [0, 0, -1],
@@ -38,7 +38,7 @@ export class Drive {
 
   run() {
     if (this.timer || !this.allowed()) return;
-    this.timer = setInterval(() => this.send(), SEND_PERIOD);
+    this.timer = setInterval(() => this.send(), SEND_PERIOD / Math.max(1, Number($("speed").value)));
     this.send();
   }
 
