@@ -137,9 +137,9 @@ def test_time_that_jumps_back(process, bus, link, tmp_path):
                 failed[message.service] = message.counters["failed"]
             else:
                 (beliefs if isinstance(message, Belief) else commands).append(message)
-        back = sum(b.stamp_ns < a.stamp_ns for a, b in itertools.pairwise(beliefs))
-        answered = len(commands) >= len(beliefs) - 1  # the last command may be on its way
-        return back >= 3 and answered and {"estimator", "controller"} <= failed.keys()
+        # Not every belief is answered: a busy controller leaves some out.
+        back = [sum(b.stamp_ns < a.stamp_ns for a, b in itertools.pairwise(each)) for each in (beliefs, commands)]
+        return min(back) >= 3 and {"estimator", "controller"} <= failed.keys()
 
     try:
         assert wait_until(three_jumps, WAIT_TIMEOUT_S), [s.output for s in services]
