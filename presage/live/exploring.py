@@ -71,5 +71,5 @@ def _progress(status: Status, seq: int) -> Exploration | None:
 def _stop(messages: LatestMessages, request: Goal) -> bool:
     """Ends the exploration; returns whether the controller confirms it."""
     messages.bus.put(GOAL, request.model_copy(update={"cancel": True}).encode())
-    ended = lambda status: status.exploration is None and status.state == "idle"  # noqa: E731
-    return messages.wait_for(Status, ended, ANSWER_TIMEOUT_S) is not None
+    ended = messages.wait_for(Status, lambda s: s.exploration is None and s.state == "idle", ANSWER_TIMEOUT_S)
+    return ended is not None

@@ -96,7 +96,7 @@ class SimulatorService(Service):
         engine = choose_engine(settings.physics)
         if settings.physics == "auto" and engine == "kinematic":
             self.log.warning("pybullet is not installed: the simulation is kinematic, contacts just stop the robot")
-        self.setup = SimulationSetup(
+        setup = SimulationSetup(
             world=load_world(settings.world),
             scanner=scanner,
             robot=robot,
@@ -109,7 +109,7 @@ class SimulatorService(Service):
             people_speed=settings.people_speed,
             engine=engine,
         )
-        self._use(self.setup, Simulation(self.setup))
+        self._use(setup, Simulation(setup))
         if not settings.obstacle_stop:
             self.log.warning("the obstacle stop is off, for fault injection: the robot will not brake before obstacles")
         self._next_step_s = time.monotonic()

@@ -25,8 +25,11 @@ def goals(bus):
     return inbox
 
 
-@pytest.mark.parametrize("answers", [True, False])
-def test_goal_cancelled_without_statuses(bus, link, goals, monkeypatch, answers):
+@pytest.mark.parametrize(
+    ("answers", "exit_status", "output"),
+    [(True, 0, "cancelled; the robot stops\n"), (False, 1, "sent, but not confirmed by the controller\n")],
+)
+def test_goal_cancelled_without_statuses(bus, link, goals, monkeypatch, answers, exit_status, output):
     """A controller without beliefs publishes no status before the goal comes."""
     monkeypatch.setattr(commands, "STATUS_WARNING_S", 0.1)
     console, received = Console(file=io.StringIO(), width=150), []
@@ -38,11 +41,10 @@ def test_goal_cancelled_without_statuses(bus, link, goals, monkeypatch, answers)
 
     controller = threading.Thread(target=answer)
     controller.start()
-    assert commands.send_goal(link, CANCEL, console, wait=False) == (0 if answers else 1)
+    assert commands.send_goal(link, CANCEL, console, wait=False) == exit_status
     controller.join()
     assert received == [CANCEL]
-    said = "cancelled; the robot stops" if answers else "sent, but not confirmed by the controller"
-    assert console.file.getvalue() == f"{said}\n"
+    assert console.file.getvalue() == output
 
 
 def test_exploration_that_may_go_on(bus, link, goals, monkeypatch):
