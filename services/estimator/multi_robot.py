@@ -136,7 +136,7 @@ class FleetLoop:
         self._searches = ThreadPoolExecutor(1, "search")
         self._may_log = LogRateLimiter()
         self._next_health_check = self._next_discovery = 0.0
-        self._retry_at: dict[str, float] = {}  # by name of a robot in the settings
+        self._retry_at: dict[str, float] = {}  # time.monotonic(), by name of a robot in the settings
         self._stopping = False
 
     def run(self) -> None:
@@ -211,7 +211,7 @@ class FleetLoop:
             self._alive.pop((robot, service), None)
 
     def _add_named_robots(self) -> None:
-        """Serves the robots of the settings that are not served, also those for which this failed before."""
+        """Begins to serve the robots named in the settings; one that failed is tried again after `RETRY_PERIOD_S`."""
         for name in self.names:
             if name not in self._robots and time.monotonic() >= self._retry_at.get(name, 0.0):
                 self._retry_at[name] = time.monotonic() + RETRY_PERIOD_S

@@ -54,7 +54,7 @@ class KeyScan:
 class KeyScanCollector:
     """Collects the key scans of one scanner, and keeps the newest one of each place and heading.
 
-    Its clock is that of the scans, but where their stamps begin again, as after a reset of the simulator, it goes on.
+    Its clock follows the stamps of the scans. Where these begin again, as after a reset of the simulator, it goes on.
     """
 
     def __init__(self, angles: Array, mount: Array, range_max: float) -> None:
@@ -68,7 +68,7 @@ class KeyScanCollector:
         self._taken_total = 0
         self._size = PLACE_M
         self._path = 0.0  # m
-        self._clock, self._clock_ahead = -np.inf, 0.0  # s; by which it is ahead of the scans' stamps
+        self._clock, self._clock_ahead = -np.inf, 0.0  # s; how far it is ahead of the stamps
         self._last: tuple[float, Array] | None = None  # stamp and pose of the last scan in `tracking`
         self._last_key: Array | None = None  # (3,) pose
 
