@@ -72,7 +72,7 @@ SIGNIFICANT_MAP_ERROR = 0.25
 # explained less than 5 to 9 % of the scan at nine of ten wrong poses in the buildings used for development.
 EXPLAINED_BY_CHANCE = 0.1
 UNKNOWN_SIGMA_M = 100.0  # published where the map is unknown
-# A number of changes, or a motion, that is less probable (a guess) may be due to a kidnapping: a search is due soon.
+# A number of changes, or a motion, that is less probable (a guess) may be due to a kidnapping: a search is due.
 SUDDEN_CHANGE_PROBABILITY = 0.01
 MIN_GAIN = 1.0  # nats, by which a scan must be more probable at a place of the map than at an unknown one (a guess)
 TARGET_BEAMS = 2000  # a scan with at least twice as many is thinned, because the time of a search grows with the beams
@@ -157,6 +157,8 @@ class PreciseEstimator:
         self._local_pose = np.zeros(3)  # in the frame of the local map
         self._ignored_beams = np.zeros(0, np.bool_)  # (B,) no evidence, see `LocalMapScan.ignored`
         self._log_change = 0.0  # nats, log probability of the changes since the last scan
+        self._log_carried = -np.inf  # nats, evidence that the robot was carried away just before; unnormalised
+        self._is_motion_sudden = False  # less probable than `SUDDEN_CHANGE_PROBABILITY`
 
     def use_model(self, model: GenerativeModel, seeds: Seeds) -> None:
         """Replaces the model by one learned from real scans in the same frame; the belief stays."""
@@ -198,6 +200,8 @@ class PreciseEstimator:
         self._scan = view, observation
         # Global search
         self._scans_since_search += 1
+        if self._is_motion_sudden:
+            return None
         if not self._may_be_elsewhere():
             self._search_interval = 1
         elif self._is_search_due():
@@ -355,9 +359,9 @@ class PreciseEstimator:
     ) -> TrackedHypothesis:
         """Fuses the k-th hypothesis with the scan.
 
-        An improbable motion, given those that were ``predicted``, is evidence against the hypothesis: the robot may
-        have been carried instead. Where the stamp is earlier than that of the last scan, as when a replay starts
-        again, the duration of the motion is unknown, and this evidence is left out.
+        An improbable motion, given those that were ``predicted``, is evidence for a kidnapping. Where the stamp is
+        earlier than that of the last scan, as when a replay starts again, the duration of the motion is unknown, and
+        this evidence is left out.
         """
         hypothesis, period = self.hypotheses[k], self._period(observation.stamp)
         candidates, pose, evidence = match.motions[k], match.poses[k], match.evidence
@@ -433,9 +437,8 @@ class PreciseEstimator:
         small = view.surfaces.small
         ignored = seen | appeared | small
 
-        # What the motion costs at all hypotheses, it would also cost if the robot had been carried away earlier, but
-        # not if it was carried away just now.
-        common_cost = min(each.motion_cost for each in hypotheses)
+        motion_cost = hypotheses[0].motion_cost
+        self._is_motion_sudden = -motion_cost < np.log(SUDDEN_CHANGE_PROBABILITY)
         # Changes are equally probable at all hypotheses. If there are suddenly more of them, a search is due soon.
         log_probability = 0.0  # of the number of changes
         if self._last:
@@ -443,7 +446,7 @@ class PreciseEstimator:
             log_probability = self._change_rate.log_probability(changes, period)
             self._change_rate.learn(changes, period)
         log_change = log_probability + _log_unmapped_surfaces(view, ~appeared | small)
-        if min(log_probability, -common_cost) < np.log(SUDDEN_CHANGE_PROBABILITY):
+        if self._is_motion_sudden or log_probability < np.log(SUDDEN_CHANGE_PROBABILITY):
             self._search_interval = 1
 
         log_likelihood, surroundings = _log_at_poses(
@@ -452,7 +455,8 @@ class PreciseEstimator:
         hypotheses = [
             replace(
                 hypothesis,
-                log_evidence=hypothesis.log_evidence - (hypothesis.motion_cost - common_cost),
+                # A motion costs less where the pose is less certain; that does not speak for this hypothesis.
+                log_evidence=hypothesis.log_evidence - max(0.0, hypothesis.motion_cost - motion_cost),
                 explained=evidence.explained[k],
                 scan_log_likelihood=log_likelihood[k] + log_change,
                 scan_surroundings=surroundings[k],
@@ -461,8 +465,11 @@ class PreciseEstimator:
         ]
         self._local_pose, self._ignored_beams, self._log_change = local, ignored, log_change
 
-        log_kidnapping = max(each.log_evidence for each in self.hypotheses) + common_cost
+        log_kidnapping = max(each.log_evidence for each in self.hypotheses)
         log_kidnapping += float(np.log(self.settings.unknown_probability))
+        # The motion would cost as much if the robot had been carried away earlier, but not if it was carried away just
+        # now. In that case, the whole scan is new evidence, so only a search at this scan uses this.
+        self._log_carried = log_kidnapping + motion_cost
         # Alternatives found for this scan come last in `hypotheses`, and have no counterpart in `self.hypotheses`.
         pairs = zip(self.hypotheses, hypotheses, strict=False)
         unknown_place = self._unknown_place
@@ -470,7 +477,8 @@ class PreciseEstimator:
         # Either the surroundings have changed, or the robot was carried to another place and all surfaces are new.
         log_new = _log_unmapped_surfaces(view, small)
         unknown_place.scan_log_likelihood = max(_log_unmapped_surfaces(view, ignored) + log_change, log_new)
-        unknown_place.allow_kidnapping(log_kidnapping, self.settings.off_map_probability, log_new)
+        log_off_map = self._log_carried + float(np.log(self.settings.off_map_probability))
+        unknown_place.allow_kidnapping(log_kidnapping, log_off_map + log_new - unknown_place.scan_log_likelihood)
         self._set_hypotheses(hypotheses)
         if not np.array_equal(self.hypotheses[0].pose, hypotheses[0].pose):  # another hypothesis is best now
             self._local_map.place(local, self.hypotheses[0].pose)
@@ -614,7 +622,8 @@ class PreciseEstimator:
         """Adds hypotheses: the robot may have been there since one of the key scans, or was carried there just now."""
         stayed, surroundings = self._log_stayed(found, view)
         log_likelihood = np.array([each.scan_log_likelihood for each in found])
-        carried = self._unknown_place.log_evidence + log_likelihood - _log_reference(view, view.surfaces.small)
+        log_carried = max(self._unknown_place.log_evidence, self._log_carried)
+        carried = log_carried + log_likelihood - _log_reference(view, view.surfaces.small)
         evidence = np.array([each.log_evidence for each in found]) + np.maximum(stayed, carried)
         surroundings[carried >= stayed] = FIRST_SURROUNDINGS
         added = [
@@ -627,8 +636,8 @@ class PreciseEstimator:
             if carried[best] > stayed[best]:
                 self._change_rate.forget_latest()
                 self._restart_local_map(view)
-                unknown, off_map = self._unknown_place, self.settings.off_map_probability
-                unknown.allow_kidnapping(unknown.log_evidence, off_map, unknown.scan_log_likelihood)
+                log_off_map = log_carried + float(np.log(self.settings.off_map_probability))
+                self._unknown_place.allow_kidnapping(log_carried, log_off_map)
         self._unknown_place.exclude_mapped_places()
         self._set_hypotheses([*self.hypotheses, *added])
 

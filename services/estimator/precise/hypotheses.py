@@ -80,15 +80,10 @@ class UnknownPlace:
         """Starts with the ``probability`` that the robot is at no hypothesis, ``off_map`` that it is off the map."""
         self.log_evidence, self.log_off_map = float(np.log(probability)), float(np.log(off_map))
 
-    def allow_kidnapping(self, log_probability: float, off_map: float, log_new: float) -> None:
-        """Allows for a kidnapping just before the present scan, with ``log_probability`` in nats.
-
-        With probability ``off_map`` it was to a place that is not on the map. There all surfaces of the scan are new:
-        it has the log likelihood ``log_new``, in nats.
-        """
-        log_off_map = log_probability + float(np.log(off_map)) + log_new - self.scan_log_likelihood
+    def allow_kidnapping(self, log_evidence: float, log_off_map: float) -> None:
+        """Allows for a kidnapping, with this evidence in nats, and with ``log_off_map`` to a place not on the map."""
+        self.log_evidence = max(self.log_evidence, log_evidence)
         self.log_off_map = max(self.log_off_map, log_off_map)
-        self.log_evidence = max(self.log_evidence, log_probability)
 
     def allow_mismatch(self, log_probability: float) -> None:
         """Allows for a match at a wrong place, with the right one on the map, where a search can find it."""

@@ -176,6 +176,26 @@ def test_alternatives_are_in_the_same_surroundings():
     assert all(np.array_equal(each.surroundings, unmapped) for each in found)
 
 
+def test_a_less_certain_hypothesis_gains_nothing_by_a_sudden_motion():
+    """It allows for more motion, but a jump of odometry is the same at all hypotheses."""
+    made, scene = estimator(OFFICE)
+    made.restart(np.array([3.0, CORRIDOR_Y, 0.0]), CLOSE)
+    drive(made, scene, [[3.0, CORRIDOR_Y, 0.0]])
+    view = made._scan[0]
+    (best,) = made.hypotheses
+
+    def evidence(cost, cost_of_other):
+        """By how much more the evidence of another hypothesis 0.2 m away decreases than that of the best, in nats."""
+        other = replace(best, pose=best.pose + np.array([0.2, 0.0, 0.0]), motion_cost=cost_of_other)
+        after = copy.deepcopy(made)
+        after._weigh_hypotheses(view, [replace(best, motion_cost=cost), other], None, 0.1)
+        by_x = sorted(after.hypotheses, key=lambda each: each.pose[0])
+        return by_x[0].log_evidence - by_x[1].log_evidence
+
+    assert evidence(8.0, 0.0) == 0
+    assert evidence(0.0, 8.0) == 8
+
+
 @pytest.fixture(scope="module")
 def driven():
     """An estimator after a drive from the learned half to the other one, its scene, and the path."""
