@@ -449,9 +449,12 @@ class PreciseEstimator:
         if self._is_motion_sudden or log_probability < np.log(SUDDEN_CHANGE_PROBABILITY):
             self._search_interval = 1
 
-        log_likelihood, surroundings = _log_at_poses(
-            view, poses, ignored, np.array([each.surroundings for each in hypotheses])
-        )
+        before = np.array([each.surroundings for each in hypotheses])
+        log_likelihood, surroundings = _log_at_poses(view, poses, ignored, before)
+        # Alternatives found for this scan come last in `hypotheses`, and have no counterpart in `self.hypotheses`. They
+        # differ by the motion, and surfaces that were seen before may speak against this as well.
+        of_seen = _log_at_poses(view, poses, small, before)[0] - log_likelihood
+        log_likelihood[len(self.hypotheses) :] += np.minimum(0.0, of_seen - of_seen[0])[len(self.hypotheses) :]
         hypotheses = [
             replace(
                 hypothesis,
@@ -470,7 +473,6 @@ class PreciseEstimator:
         # The motion would cost as much if the robot had been carried away earlier, but not if it was carried away just
         # now. In that case, the whole scan is new evidence, so only a search at this scan uses this.
         self._log_carried = log_kidnapping + motion_cost
-        # Alternatives found for this scan come last in `hypotheses`, and have no counterpart in `self.hypotheses`.
         pairs = zip(self.hypotheses, hypotheses, strict=False)
         unknown_place = self._unknown_place
         unknown_place.allow_mismatch(max(self._log_mismatch(before, after) for before, after in pairs))

@@ -176,6 +176,19 @@ def test_alternatives_are_in_the_same_surroundings():
     assert all(np.array_equal(each.surroundings, unmapped) for each in found)
 
 
+def test_alternatives_explain_the_surfaces_seen_before():
+    """These are no new evidence about the place, but about the motion by which the alternatives differ."""
+    world = load_world("corridor")
+    made, scene = estimator(world)
+    path = np.column_stack([np.linspace(3.0, 3.7, 30), np.full(30, 1.45), np.linspace(0.0, -2.2, 30)])
+    made.restart(path[0], CLOSE)
+    assert drive(made, scene, path)[-1].state == "tracking"
+    off = se2.compose(path[-1], np.array([0.3, 0.1, 0.2]))
+    made.hypotheses = [replace(made.hypotheses[0], pose=off, noise_covariance=np.diag([0.1, 0.1, 0.03]), velocity=None)]
+    found = drive(made, scene, np.tile(path[-1], (6, 1)), len(path) + 25)
+    assert found[-1].state == "tracking"
+
+
 def test_a_less_certain_hypothesis_gains_nothing_by_a_sudden_motion():
     """It allows for more motion, but a jump of odometry is the same at all hypotheses."""
     made, scene = estimator(OFFICE)
@@ -188,6 +201,7 @@ def test_a_less_certain_hypothesis_gains_nothing_by_a_sudden_motion():
         """By how much more the evidence of another hypothesis 0.2 m away decreases than that of the best, in nats."""
         other = replace(best, pose=best.pose + np.array([0.2, 0.0, 0.0]), motion_cost=cost_of_other)
         after = copy.deepcopy(made)
+        after.hypotheses = [best, other]
         after._weigh_hypotheses(view, [replace(best, motion_cost=cost), other], None, 0.1)
         by_x = sorted(after.hypotheses, key=lambda each: each.pose[0])
         return by_x[0].log_evidence - by_x[1].log_evidence
