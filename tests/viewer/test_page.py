@@ -75,6 +75,12 @@ def test_obstacles_and_keys(page):
     page.wait("Math.abs(Math.sin((store.frame.truth.yaw - arg) / 2)) > 0.1", argument=yaw)
     page.page.keyboard.up("a")
     page.wait("store.frame.status.state !== 'manual'")
+    page.page.keyboard.down("a")
+    page.wait("store.frame.status.state === 'manual'")
+    page.page.keyboard.down("Meta")  # while it is held, macOS does not report that "a" is released
+    page.wait("store.frame.status.state !== 'manual'")
+    page.page.keyboard.up("a")
+    page.page.keyboard.up("Meta")
     page.page.keyboard.press(" ")
     page.wait("store.paused")
     page.wait("performance.now() - store.arrivals.at(-1) > 500")

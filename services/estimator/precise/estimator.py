@@ -72,7 +72,8 @@ SIGNIFICANT_MAP_ERROR = 0.25
 # explained less than 5 to 9 % of the scan at nine of ten wrong poses in the buildings used for development.
 EXPLAINED_BY_CHANCE = 0.1
 UNKNOWN_SIGMA_M = 100.0  # published where the map is unknown
-# A number of changes, or a motion, that is less probable (a guess) may be due to a kidnapping: a search is due.
+# A number of changes, or a motion, that is less probable (a guess) may be due to a kidnapping: such a motion causes a
+# search, and such a number of changes does so if another place could fit much better.
 SUDDEN_CHANGE_PROBABILITY = 0.01
 MIN_GAIN = 1.0  # nats, by which a scan must be more probable at a place of the map than at an unknown one (a guess)
 TARGET_BEAMS = 2000  # a scan with at least twice as many is thinned, because the time of a search grows with the beams
@@ -399,7 +400,8 @@ class PreciseEstimator:
 
         The pose was uncertain before this scan, and a descent from one pose finds only the nearest match. An
         alternative loses evidence if its motion is less probable than that of the best match, and gains none if it is
-        more probable. As in `_fuse`, an improbable motion, given those that were ``predicted``, costs evidence as well.
+        more probable. What its motion, given those that were ``predicted``, costs more than that of the best match is
+        subtracted in `_weigh_hypotheses`.
         """
         before = self.hypotheses[0]
         doubt = 1 - self._probability_of_being_near(before)
@@ -437,8 +439,8 @@ class PreciseEstimator:
         small = view.surfaces.small
         ignored = seen | appeared | small
 
-        motion_cost = hypotheses[0].motion_cost
-        self._is_motion_sudden = -motion_cost < np.log(SUDDEN_CHANGE_PROBABILITY)
+        cost_at_best = hypotheses[0].motion_cost
+        self._is_motion_sudden = -cost_at_best < np.log(SUDDEN_CHANGE_PROBABILITY)
         # Changes are equally probable at all hypotheses. If there are suddenly more of them, a search is due soon.
         log_probability = 0.0  # of the number of changes
         if self._last:
@@ -452,14 +454,18 @@ class PreciseEstimator:
         before = np.array([each.surroundings for each in hypotheses])
         log_likelihood, surroundings = _log_at_poses(view, poses, ignored, before)
         # Alternatives found for this scan come last in `hypotheses`, and have no counterpart in `self.hypotheses`. They
-        # differ by the motion, and surfaces that were seen before may speak against this as well.
-        of_seen = _log_at_poses(view, poses, small, before)[0] - log_likelihood
-        log_likelihood[len(self.hypotheses) :] += np.minimum(0.0, of_seen - of_seen[0])[len(self.hypotheses) :]
+        # differ by the motion, against which surfaces that were seen before may speak. They do not speak for it: among
+        # similar surfaces, the search may have missed the right match.
+        of_seen = _log_at_poses(view, poses, appeared | small, before)[0] - log_likelihood
+        seen_against = np.maximum(0.0, of_seen[0] - of_seen)
+        seen_against[: len(self.hypotheses)] = 0.0
         hypotheses = [
             replace(
                 hypothesis,
                 # A motion costs less where the pose is less certain; that does not speak for this hypothesis.
-                log_evidence=hypothesis.log_evidence - max(0.0, hypothesis.motion_cost - motion_cost),
+                log_evidence=hypothesis.log_evidence
+                - max(0.0, hypothesis.motion_cost - cost_at_best)
+                - seen_against[k],
                 explained=evidence.explained[k],
                 scan_log_likelihood=log_likelihood[k] + log_change,
                 scan_surroundings=surroundings[k],
@@ -470,9 +476,9 @@ class PreciseEstimator:
 
         log_kidnapping = max(each.log_evidence for each in self.hypotheses)
         log_kidnapping += float(np.log(self.settings.unknown_probability))
-        # The motion would cost as much if the robot had been carried away earlier, but not if it was carried away just
-        # now. In that case, the whole scan is new evidence, so only a search at this scan uses this.
-        self._log_carried = log_kidnapping + motion_cost
+        # If the robot was carried away just now, the motion costs nothing, but all surfaces of the scan are new. So it
+        # counts only together with the whole scan: in a search at this scan, and for places off the map.
+        self._log_carried = log_kidnapping + cost_at_best
         pairs = zip(self.hypotheses, hypotheses, strict=False)
         unknown_place = self._unknown_place
         unknown_place.allow_mismatch(max(self._log_mismatch(before, after) for before, after in pairs))

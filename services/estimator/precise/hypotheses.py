@@ -81,7 +81,7 @@ class UnknownPlace:
         self.log_evidence, self.log_off_map = float(np.log(probability)), float(np.log(off_map))
 
     def allow_kidnapping(self, log_evidence: float, log_off_map: float) -> None:
-        """Allows for a kidnapping, with this evidence in nats, and with ``log_off_map`` to a place not on the map."""
+        """Allows for a kidnapping: ``log_evidence`` in nats to any place, ``log_off_map`` to one not on the map."""
         self.log_evidence = max(self.log_evidence, log_evidence)
         self.log_off_map = max(self.log_off_map, log_off_map)
 

@@ -34,6 +34,7 @@ class PartsWriter:
         self._channels: dict[str, Topic] = {}  # by key
         self._began_ns: int | None = None  # when the part's first message was received
         self._saved_before = 0  # messages in completed parts
+        self._repeated = 0  # bytes of this part that each part repeats; they do not count for its size
         self.finished: list[Path] = []
         self.part = open_part(1)
 
@@ -56,6 +57,7 @@ class PartsWriter:
         """Attaches a file to this part and to all later ones."""
         self._attachments[name] = data, media_type, time_ns
         self.part.attachment(name, data, media_type, time_ns)
+        self._repeated += len(data)
 
     def declare(self, topic: Topic, key: str) -> None:
         """Declares the channel of a key in this part and in all later ones."""
@@ -86,7 +88,7 @@ class PartsWriter:
         limits, began = self._limits, self._began_ns
         if began is None:
             return False  # each part has at least one message
-        large = limits.size and self.part.size >= limits.size
+        large = limits.size and self.part.size - self._repeated >= limits.size
         return bool(large or (limits.seconds and now_ns - began >= limits.seconds * 1e9))
 
     def _next(self) -> None:
@@ -105,6 +107,7 @@ class PartsWriter:
         for key, topic in self._channels.items():
             self.part.declare(topic, key)
         self.part.flush()
+        self._repeated = self.part.size
 
     def _write_ending(self) -> None:
         for name, values in self._ending().items():

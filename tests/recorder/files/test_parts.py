@@ -63,6 +63,16 @@ def test_parts_by_size(tmp_path):
     assert all(20_000 <= file.stat().st_size < 30_000 for file in files[:-1])
 
 
+def test_what_each_part_repeats_does_not_count_for_its_size(tmp_path):
+    writer = writer_in(tmp_path, PartLimits(size=20_000), compression="none", chunk_size=1024)
+    writer.attachment("model", bytes(30_000), "application/octet-stream", 1)
+    for number in range(500):
+        writer.write(TRUTH, KEY, truth(number), number, number)
+    files = writer.finish()
+    assert len(files) > 2
+    assert all(50_000 <= file.stat().st_size < 60_000 for file in files[:-1])
+
+
 def test_next_name_is_taken(tmp_path):
     writer = writer_in(tmp_path, PartLimits(seconds=1))
     (tmp_path / "run-002.mcap").write_bytes(b"another file")

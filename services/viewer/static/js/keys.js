@@ -33,6 +33,7 @@ export function startKeys({ store, view, modes, actions, drive, player, toolbar 
     escape: () => { modes.cancel(); modes.select(""); }, "?": help,
   };
   addEventListener("keydown", (event) => {
+    if (event.metaKey) drive.stop(); // on macOS, no key that is released while the command key is held is reported
     if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]") || typing(event)) return;
     const command = commands[event.key.toLowerCase()];
     if (command && !event.repeat) command();
