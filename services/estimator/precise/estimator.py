@@ -159,7 +159,6 @@ class PreciseEstimator:
         self._ignored_beams = np.zeros(0, np.bool_)  # (B,) no evidence, see `LocalMapScan.ignored`
         self._log_change = 0.0  # nats, log probability of the changes since the last scan
         self._log_carried = -np.inf  # nats, evidence that the robot was carried away just before; unnormalised
-        self._is_motion_sudden = False  # less probable than `SUDDEN_CHANGE_PROBABILITY`
 
     def use_model(self, model: GenerativeModel, seeds: Seeds) -> None:
         """Replaces the model by one learned from real scans in the same frame; the belief stays."""
@@ -196,12 +195,14 @@ class PreciseEstimator:
         view = match.view
         hypotheses = [self._fuse(k, match, motions[k], observation) for k in range(len(match.poses))]
         hypotheses += self._find_alternatives(view, hypotheses[0], match.motions[0], motions[0])
+        is_motion_sudden = -hypotheses[0].motion_cost < np.log(SUDDEN_CHANGE_PROBABILITY)
         # Weights, also of the unknown place
         self._weigh_hypotheses(view, hypotheses, match.local_pose, period)
         self._scan = view, observation
         # Global search
         self._scans_since_search += 1
-        if self._is_motion_sudden:
+        if is_motion_sudden:
+            self._search_interval = 1
             return None
         if not self._may_be_elsewhere():
             self._search_interval = 1
@@ -439,8 +440,6 @@ class PreciseEstimator:
         small = view.surfaces.small
         ignored = seen | appeared | small
 
-        cost_at_best = hypotheses[0].motion_cost
-        self._is_motion_sudden = -cost_at_best < np.log(SUDDEN_CHANGE_PROBABILITY)
         # Changes are equally probable at all hypotheses. If there are suddenly more of them, a search is due soon.
         log_probability = 0.0  # of the number of changes
         if self._last:
@@ -448,7 +447,7 @@ class PreciseEstimator:
             log_probability = self._change_rate.log_probability(changes, period)
             self._change_rate.learn(changes, period)
         log_change = log_probability + _log_unmapped_surfaces(view, ~appeared | small)
-        if self._is_motion_sudden or log_probability < np.log(SUDDEN_CHANGE_PROBABILITY):
+        if log_probability < np.log(SUDDEN_CHANGE_PROBABILITY):
             self._search_interval = 1
 
         before = np.array([each.surroundings for each in hypotheses])
@@ -456,9 +455,10 @@ class PreciseEstimator:
         # Alternatives found for this scan come last in `hypotheses`, and have no counterpart in `self.hypotheses`. They
         # differ by the motion, against which surfaces that were seen before may speak. They do not speak for it: among
         # similar surfaces, the search may have missed the right match.
-        of_seen = _log_at_poses(view, poses, appeared | small, before)[0] - log_likelihood
-        seen_against = np.maximum(0.0, of_seen[0] - of_seen)
-        seen_against[: len(self.hypotheses)] = 0.0
+        cost_at_best, seen_against = hypotheses[0].motion_cost, np.zeros(len(hypotheses))
+        if len(hypotheses) > len(self.hypotheses):
+            of_seen = _log_at_poses(view, poses, appeared | small, before)[0] - log_likelihood
+            seen_against[len(self.hypotheses) :] = np.maximum(0.0, of_seen[0] - of_seen)[len(self.hypotheses) :]
         hypotheses = [
             replace(
                 hypothesis,
@@ -481,12 +481,12 @@ class PreciseEstimator:
         self._log_carried = log_kidnapping + cost_at_best
         pairs = zip(self.hypotheses, hypotheses, strict=False)
         unknown_place = self._unknown_place
-        unknown_place.allow_mismatch(max(self._log_mismatch(before, after) for before, after in pairs))
+        unknown_place.allow(max(self._log_mismatch(before, after) for before, after in pairs))
         # Either the surroundings have changed, or the robot was carried to another place and all surfaces are new.
         log_new = _log_unmapped_surfaces(view, small)
         unknown_place.scan_log_likelihood = max(_log_unmapped_surfaces(view, ignored) + log_change, log_new)
-        log_off_map = self._log_carried + float(np.log(self.settings.off_map_probability))
-        unknown_place.allow_kidnapping(log_kidnapping, log_off_map + log_new - unknown_place.scan_log_likelihood)
+        unknown_place.allow(log_kidnapping)
+        unknown_place.allow_off_map(self._log_carried, self.settings.off_map_probability, log_new)
         self._set_hypotheses(hypotheses)
         if not np.array_equal(self.hypotheses[0].pose, hypotheses[0].pose):  # another hypothesis is best now
             self._local_map.place(local, self.hypotheses[0].pose)
@@ -644,8 +644,8 @@ class PreciseEstimator:
             if carried[best] > stayed[best]:
                 self._change_rate.forget_latest()
                 self._restart_local_map(view)
-                log_off_map = log_carried + float(np.log(self.settings.off_map_probability))
-                self._unknown_place.allow_kidnapping(log_carried, log_off_map)
+                unknown, off_map = self._unknown_place, self.settings.off_map_probability
+                unknown.allow_off_map(log_carried, off_map, unknown.scan_log_likelihood)
         self._unknown_place.exclude_mapped_places()
         self._set_hypotheses([*self.hypotheses, *added])
 

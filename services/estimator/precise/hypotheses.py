@@ -80,14 +80,18 @@ class UnknownPlace:
         """Starts with the ``probability`` that the robot is at no hypothesis, ``off_map`` that it is off the map."""
         self.log_evidence, self.log_off_map = float(np.log(probability)), float(np.log(off_map))
 
-    def allow_kidnapping(self, log_evidence: float, log_off_map: float) -> None:
-        """Allows for a kidnapping: ``log_evidence`` in nats to any place, ``log_off_map`` to one not on the map."""
+    def allow(self, log_evidence: float) -> None:
+        """Allows for another place with this evidence, after a kidnapping or a match at a wrong place."""
         self.log_evidence = max(self.log_evidence, log_evidence)
-        self.log_off_map = max(self.log_off_map, log_off_map)
 
-    def allow_mismatch(self, log_probability: float) -> None:
-        """Allows for a match at a wrong place, with the right one on the map, where a search can find it."""
-        self.log_evidence = max(self.log_evidence, log_probability)
+    def allow_off_map(self, log_carried: float, off_map: float, log_new: float) -> None:
+        """Allows for a kidnapping just before the present scan, which has the evidence ``log_carried`` in nats.
+
+        With probability ``off_map`` it was to a place that is not on the map. There all surfaces of the scan are new:
+        it has the log likelihood ``log_new``, in nats.
+        """
+        log_off_map = log_carried + float(np.log(off_map)) + log_new - self.scan_log_likelihood
+        self.log_off_map = max(self.log_off_map, log_off_map)
 
     def add_key_scan(self) -> None:
         """Adds the evidence of the present scan, which becomes a key scan."""

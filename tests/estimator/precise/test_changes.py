@@ -161,13 +161,18 @@ def test_a_later_search_keeps_the_evidence():
     assert len(made._local_map.scans) >= before
 
 
-def test_alternatives_are_in_the_same_surroundings():
-    """An alternative to the best match is no more probable because the hypothesis was in a room that the map lacks."""
+def after_one_scan():
+    """An estimator in the office after its first scan, this scan, and the only hypothesis."""
     made, scene = estimator(OFFICE)
     made.restart(np.array([3.0, CORRIDOR_Y, 0.0]), CLOSE)
     drive(made, scene, [[3.0, CORRIDOR_Y, 0.0]])
-    view = made._scan[0]
-    (before,) = made.hypotheses
+    (hypothesis,) = made.hypotheses
+    return made, made._scan[0], hypothesis
+
+
+def test_alternatives_are_in_the_same_surroundings():
+    """An alternative to the best match is no more probable because the hypothesis was in a room that the map lacks."""
+    made, view, before = after_one_scan()
     unmapped = np.array([0.0, 0.0, 1.0])
     made.hypotheses = [replace(before, noise_covariance=0.1 * np.eye(3), surroundings=unmapped)]
     motion = MotionCandidate(before.pose, 0.1 * np.eye(3), 1.0)
@@ -191,11 +196,7 @@ def test_alternatives_explain_the_surfaces_seen_before():
 
 def test_a_motion_that_costs_less_is_no_gain():
     """It costs less where the pose is less certain, but a jump of odometry is the same at all hypotheses."""
-    made, scene = estimator(OFFICE)
-    made.restart(np.array([3.0, CORRIDOR_Y, 0.0]), CLOSE)
-    drive(made, scene, [[3.0, CORRIDOR_Y, 0.0]])
-    view = made._scan[0]
-    (best,) = made.hypotheses
+    made, view, best = after_one_scan()
 
     def evidence(cost, cost_of_other):
         """By how much more the evidence of another hypothesis 0.2 m away decreases than that of the best, in nats."""
