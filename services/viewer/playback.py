@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import tempfile
@@ -32,9 +33,12 @@ class ReplayProcess:
 class Playback:
     """Replays at most one recording in a child process. Its methods block, so call them from a worker thread."""
 
-    def __init__(self, folder: Path, robot: str, connect: str) -> None:
-        """Replays files of ``folder`` under the robot name ``robot``-replay, over the endpoints ``connect``."""
-        self.folder, self._connect = folder, connect
+    def __init__(self, folder: Path, robot: str, connect: str, security: Path | None = None) -> None:
+        """Replays files of ``folder`` under the robot name ``robot``-replay, over the endpoints ``connect``.
+
+        ``security`` is the folder of credentials, if the bus needs them.
+        """
+        self.folder, self._connect, self._security = folder, connect, security
         self.robot = f"{robot[:57]}-replay"  # a robot's name has at most 64 characters
         self._child: ReplayProcess | None = None
         self._lock = threading.Lock()
@@ -96,12 +100,17 @@ class Playback:
     def _start(self, name: str) -> ReplayProcess:
         command = [sys.executable, "-m", "presage", "--connect", self._connect, "replay", str(self.folder / name)]
         command += ["--robot", self.robot, "--force", "--paused"]
+        # The role is chosen by `presage replay`: the viewer's own may not publish a recording.
+        environment = {name: value for name, value in os.environ.items() if name != "PRESAGE_ROLE"}
+        if self._security is not None:
+            environment["PRESAGE_SECURITY"] = str(self._security)
         stderr = tempfile.TemporaryFile()  # noqa: SIM115 - closed in _end
         process = subprocess.Popen(  # noqa: S603 - runs this package; `open` checked the name against the folder
             command,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=stderr,
+            env=environment,
             start_new_session=True,
             preexec_fn=end_with_this_process(),  # noqa: PLW1509 - one call, before any thread of the child
         )

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from typing import Any, ParamSpec, TypeVar
 
 from common.errors import UserError
-from common.messages.requests import PlayerReply, PlayerRequest, Request, WorldReply
-from common.messages.topics import PLAYER, WORLD
+from common.messages.requests import ModelReply, ModelRequest, PlayerReply, PlayerRequest, Request, WorldReply
+from common.messages.topics import MODEL, PLAYER, WORLD
 from services.viewer import visitor_requests as requests
 from services.viewer.control import ActionResult, RobotControl
 from services.viewer.playback import Playback
@@ -201,20 +201,29 @@ class RequestHandler:
 
     async def _query_world(self, robot: str) -> None:
         """Queries the robot's world and sends it to visitors if it has changed."""
-        services = self.context.roster.services(robot)
-        if not services & {"simulator", "replay"}:
-            return
         try:
-            reply = await self._in_thread(self.context.control.query, robot, WORLD, Request(), WorldReply)
+            reply = await self._in_thread(self._world_of, robot)
         except UserError:
             return  # the next query may succeed
-        if reply == self.worlds.get(robot):
+        if reply is None or reply == self.worlds.get(robot):
             return
         self.worlds[robot] = reply
         parts = {"world": reply.world, "scanner": reply.scanner, "robot": reply.robot}
         plain = {name: part.model_dump(mode="json") if part is not None else None for name, part in parts.items()}
         self._world_texts[robot] = json.dumps({"type": "world", **plain})
         self.context.hub.queue_text(robot, "world", self._world_texts[robot])
+
+    def _world_of(self, robot: str) -> WorldReply | None:
+        """The world of the simulator or of the recording, else the estimator's map; None if there is none yet."""
+        query, services = self.context.control.query, self.context.roster.services(robot)
+        if services & {"simulator", "replay"}:
+            reply = query(robot, WORLD, Request(), WorldReply)
+            if reply.ok or "estimator" not in services:
+                return reply
+        if "estimator" not in services:
+            return None
+        world = query(robot, MODEL, ModelRequest(), ModelReply).world
+        return None if world is None else WorldReply(world=world)
 
     async def _follow_player(self) -> None:
         playback, hub = self.context.playback, self.context.hub

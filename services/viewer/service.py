@@ -60,7 +60,7 @@ class ViewerService(Service):
         self.options = settings
         self.hub = Hub(self._wake)
         self.roster = Roster(settings.robot)
-        self.playback = Playback(settings.recordings, settings.robot, settings.connect)
+        self.playback = Playback(settings.recordings, settings.robot, settings.connect, settings.security)
         self.pool = ThreadPoolExecutor(16, "action")
         self.robots: dict[str, FollowedRobot] = {}
         self._reopened: set[str] = set()  # robots of replays that now show another recording

@@ -22,6 +22,8 @@ from common.messages.requests import PoseRequest, Request, WorldReply
 from common.messages.topics import CMD_VEL, GOAL, HEALTH, SCAN, TELEPORT, TRUTH, WORLD
 from presage.session import credentials as secure
 from tests.conftest import WAIT_TIMEOUT_S, Processes, accepts, free_tcp_port, wait_for_message
+from tests.recorder import sessions as recorded
+from tests.viewer.client import Page, page_of
 
 INTRUDER_SCRIPT = Path(__file__).with_name("intruder.py")
 KEY_PREFIX = "presage/robot"
@@ -234,6 +236,22 @@ def test_stop_while_waiting_for_the_router(secure_router):
     )
     waiting.wait_for("waiting")
     assert waiting.stop() == 0, waiting.output
+
+
+def test_recording_opened_on_the_page(secure_router, tmp_path):
+    secure.add(secure_router.keys, "replay", "replay")
+    secure_router.restart_router()
+    recorded.write(tmp_path / "hall.mcap")
+    options = ("--port", "0", "--recordings", str(tmp_path), "--connect", f"tcp/127.0.0.1:{secure_router.port}")
+    environment = {"PRESAGE_ROLE": "viewer-control"}  # must not become that of the replay
+    viewer = secure_router.processes.start("viewer", *options, "--security", str(secure_router.keys), env=environment)
+    with Page(page_of(viewer)) as page:
+        page.wait_for("services", lambda m: m["linked"])
+        page.done("open", name="hall.mcap")
+        assert page.by_now("world", lambda m: m["world"])["world"]["name"] == "hall"
+        page.frame(lambda header: header["robot"] == "robot-replay")
+        page.done("close")
+    assert viewer.stop() == 0, viewer.output
 
 
 def test_whole_loop_and_replayed_command(secure_router):

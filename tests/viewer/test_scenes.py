@@ -299,6 +299,38 @@ def test_server_that_comes_back(browser, processes):
     seen.page.context.close()
 
 
+def test_tools_of_a_real_robot(look):
+    seen = look("tracking")
+    seen.page.locator("[data-mode=carry]").click()
+    rows = [{"name": "estimator", "state": "alive", "alive": True, "note": "", "rates": [], "uptime_s": 1.0}]
+    message = {"type": "services", "services": rows, "missing": [], "linked": True}
+    take = "((take) => (presage.connection.on.message = () => {}, take(arg)))(presage.connection.on.message)"
+    seen.see(take, message)  # no other messages come after it
+    names = ["goal", "carry", "obstacle", "look"]
+    visible = seen.see("arg.filter((name) => document.querySelector(`[data-mode=${name}]`).checkVisibility())", names)
+    assert (visible, seen.see("modes.name")) == (["goal", "look"], "goal")
+    assert not seen.page.locator("#pause").is_visible()
+
+
+def test_robot_that_was_watched_before_the_viewer_restarted(look):
+    seen = look("tracking")
+    seen.see("(window.watched = [], presage.actions.watch = (robot) => window.watched.push(robot), 0)")
+
+    def hello(robot, *robots):
+        message = {"type": "hello", "control": True, "version": "stub", "robots": robots, "robot": robot}
+        seen.see("presage.connection.on.message(arg)", message)
+        return seen.see("window.watched.splice(0)")
+
+    hello("robot", "robot", "truck")
+    seen.page.locator("#robot").select_option("truck")
+    assert hello("truck", "robot", "truck") == ["truck"]
+    seen.see("store.connected = false")
+    assert hello("robot", "robot") == []  # the viewer does not know the truck yet
+    assert hello("robot", "robot", "truck") == ["truck"]
+    assert hello("truck", "robot", "truck") == []
+    assert hello("robot", "robot", "truck") == []  # the server shows another robot: a recording was closed
+
+
 @pytest.mark.parametrize("part", ["js/map.js", "css/base.css"])
 def test_page_that_was_loaded_in_part(browser, stub, part):
     context = browser.new_context()

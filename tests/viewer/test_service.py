@@ -17,8 +17,8 @@ from common.bus.bus import Link, open_bus, wait_until
 from common.bus.inbox import Inbox, IncomingRequest, Sample
 from common.geometry.world import load_world
 from common.messages.definitions import Health
-from common.messages.requests import Reply, WorldReply
-from common.messages.topics import HEALTH, PAUSE, PREFERENCE, SCAN, TOPICS, TRUTH, WORLD
+from common.messages.requests import ModelReply, Reply, WorldReply
+from common.messages.topics import HEALTH, MODEL, PAUSE, PREFERENCE, SCAN, TOPICS, TRUTH, WORLD
 from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS
 from services.viewer.state.robot_view import SHOWN_TOPICS
@@ -219,6 +219,8 @@ class Servant:
             reply = Reply()
             if call.query is WORLD:
                 reply = WorldReply(world=self.world, scanner=SCANNERS["tim571"], robot=Robot(radius=0.3))
+            if call.query is MODEL:
+                reply = ModelReply(estimator="precise", world=self.world)
             call.reply(reply.encode())
             if call.query.name == name:
                 return
@@ -238,6 +240,16 @@ def test_world_that_changes(viewer, bus):
         servant.world = load_world("office")
         servant.answer("world", 20)
         assert page.wait_for("world")["world"]["name"] == "office"
+
+
+def test_map_of_a_real_robot(viewer, bus):
+    _, where = viewer()
+    servant = Servant(bus, MODEL)
+    bus.declare_alive("estimator")
+    with Page(where) as page:
+        servant.answer("model")
+        message = page.wait_for("world")
+        assert (message["world"]["name"], message["robot"]) == ("maze", None)
 
 
 HOSTILE = [

@@ -75,6 +75,7 @@ function takeHello(hello) {
   const first = !store.connected;
   const moved = store.hello && store.hello.robot !== hello.robot;
   if (moved) store.clear();
+  if (moved && !first) wanted = hello.robot; // chosen here, or by a recording that was opened or closed
   if (first) Object.assign(store, { player: null, servicesKnown: false });
   store.hello = hello;
   store.connected = true;
@@ -83,17 +84,18 @@ function takeHello(hello) {
   $("robot").value = hello.robot ?? "";
   $("robot").parentElement.hidden = names.length < 1;
   $("robot").disabled = names.length < 2;
-  if (first && wanted && wanted !== hello.robot && names.includes(wanted)) actions.watch(wanted);
-  else wanted = hello.robot;
+  wanted ??= hello.robot;
+  if (wanted !== hello.robot && names.includes(wanted)) actions.watch(wanted); // a viewer that just started learns it late
   if (first && hello.control) actions.recordStatus();
   $("joystick").hidden = !hello.control || !matchMedia("(pointer: coarse)").matches;
   view.rearrange();
   redraw();
 }
 
-function takeWorld({ world: simulatorWorld, scanner, robot }) {
-  const before = store.world, world = store.map?.world ?? simulatorWorld; // the map has another frame than the simulator's world
-  Object.assign(store, { world, simulatorWorld, scanner, robot });
+/** The world of the simulator or of the recording, or the estimator's map. */
+function takeWorld({ world: knownWorld, scanner, robot }) {
+  const before = store.world, world = store.map?.world ?? knownWorld; // the mapper's map may have another frame
+  Object.assign(store, { world, knownWorld, scanner, robot });
   floors.update();
   if (view.gesture.selected && !modes.selected) modes.select("");
   redraw(); // first, because the fit depends on the size of the tools
@@ -103,11 +105,11 @@ function takeWorld({ world: simulatorWorld, scanner, robot }) {
   }
 }
 
-/** The mapper's map, which replaces the simulator's world; a message without a world removes it. */
+/** The mapper's map, which replaces the known world; a message without a world removes it. */
 function takeMap(message) {
   const map = message.world ? message : null, changed = !map !== !store.map;
   if (!map && !changed) return;
-  Object.assign(store, { map, world: map?.world ?? store.simulatorWorld });
+  Object.assign(store, { map, world: map?.world ?? store.knownWorld });
   floors.update();
   if (changed || view.camera.fitted) view.fit();
   if (changed) redraw();
@@ -116,6 +118,7 @@ function takeMap(message) {
 
 function takeServices({ services: rows, missing }) {
   Object.assign(store, { services: rows, missing: missing ?? [], servicesKnown: true });
+  toolbar.draw();
   services.draw();
   draw();
 }

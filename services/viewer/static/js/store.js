@@ -15,7 +15,7 @@ export class Store {
 
   /** Forgets everything about the current robot. */
   clear() {
-    this.world = this.simulatorWorld = this.scanner = this.robot = this.frame = this.field = null;
+    this.world = this.knownWorld = this.scanner = this.robot = this.frame = this.field = null;
     this.map = null; // the mapper's: its world, the path of the key scans, loop closures
     this.journal = []; // {t, state, reason} of the controller, the oldest first
     this.stoppedAt = 0; // ms, when the present obstacle stop began
@@ -43,6 +43,11 @@ export class Store {
   /** Services that are connected but send no health messages. */
   get stuck() {
     return this.services.filter((one) => one.state === "late");
+  }
+
+  /** Whether the scans come from a simulator, or would if it were running, and not from a real robot. */
+  get simulated() {
+    return !this.servicesKnown || [...this.services, ...this.missing].some((one) => one.name === "simulator");
   }
 
   /** The distance field of the current goal; null if there is none. */

@@ -53,6 +53,8 @@ export class Toolbar {
     const allowed = modes.canControl;
     $("watch-only").hidden = !store.hello || store.control;
     document.body.toggleAttribute("data-playing", Boolean(store.player));
+    document.body.toggleAttribute("data-real-robot", !store.simulated);
+    if (!store.simulated && ["carry", "obstacle"].includes(modes.name)) modes.set("goal");
     for (const id of ["pause", "step", "reset", "speed", "localise", "record"]) $(id).disabled = !allowed;
     for (const button of document.querySelectorAll("[data-mode]")) button.disabled = !allowed && button.dataset.mode !== "look";
     $("open").disabled = !store.connected || !store.control;
