@@ -93,9 +93,9 @@ class Bus(Liveliness):
         newest = topic.queue == "newest" and not keep_all
 
         def on_sample(sample: zenoh.Sample) -> None:
-            published = published_ns(sample)
+            received, published = time.monotonic_ns(), published_ns(sample)
             source = _source(sample)
-            entry = Sample(topic, str(sample.key_expr), sample.payload.to_bytes(), published, time.time_ns(), source)
+            entry = Sample(topic, str(sample.key_expr), sample.payload.to_bytes(), published, received, source)
             inbox.put(entry, newest_only=newest)
 
         subscriber = self._session.declare_subscriber(topic.key(robot or self.robot), on_sample)

@@ -23,7 +23,7 @@ class Sample:
     key: str
     payload: bytes
     published_ns: int  # wall time at the publisher, 0 if unknown
-    received_ns: int  # wall time here
+    received_ns: int  # monotonic time here
     source: str = ""  # zenoh session that published it; empty if unknown
 
 

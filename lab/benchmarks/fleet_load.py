@@ -121,7 +121,7 @@ class FleetLoad:
         for (due, robot, k), payload in zip(schedule, payloads, strict=True):
             time.sleep(max(0.0, began + due - time.monotonic()))
             if robot is not searching_robot:
-                sent[BELIEF.key(robot.name), self._stamp(k)] = time.time_ns()
+                sent[BELIEF.key(robot.name), self._stamp(k)] = time.monotonic_ns()
             elif k % round(rate) == 0:
                 self._buses[robot.name].send_request(LOCALISE, LocaliseRequest(), k, Inbox())
             self._buses[robot.name].put(SCAN, payload)

@@ -82,7 +82,7 @@ def _round(stack: Stack, seconds: float, cost: ScrapeCost, ports: dict[str, int]
 def observation_us() -> float:
     """Processor time in µs to record one message in the histograms."""
     metrics = ServiceMetrics("bench", "bench", Inbox(), dict)
-    sample = Sample(SCAN, SCAN.key("bench"), b"", time.time_ns(), time.time_ns())
+    sample = Sample(SCAN, SCAN.key("bench"), b"", time.time_ns(), time.monotonic_ns())
     began = time.process_time()
     for _ in range(MESSAGES):
         with metrics.step(sample):

@@ -111,7 +111,8 @@ def _add_sample(sample: Sample, observation: BusObservation, now: float) -> None
     if isinstance(message, Health):
         # Health messages on the key of another service are ignored.
         if sample.key == sample.topic.key(observation.robot, message.service):
-            observation.health.setdefault(message.service, []).append((sample.received_ns, message))
+            received_ns = sample.received_ns + time.time_ns() - time.monotonic_ns()
+            observation.health.setdefault(message.service, []).append((received_ns, message))
             observation.monitor.add_health(message, now)
     elif sample.topic.rate:
         if isinstance(message, Scan) and sample.key == sample.topic.key(observation.robot):

@@ -111,7 +111,7 @@ class BoardFeed:
                 message = topic.message.decode(sample.payload)
                 if isinstance(message, Health) and sample.key != topic.key(board.robot, message.service):
                     return  # published on the key of another service
-                board.add_message(topic, message, sample.published_ns or sample.received_ns, now)
+                board.add_message(topic, message, sample.published_ns or time.time_ns(), now)
 
 
 def tables(boards: dict[str, HealthBoard], now: float) -> Group:

@@ -167,7 +167,7 @@ def list_topics(robot: str, console: Console) -> None:
 
 
 def measure_rates(link: Link, topics: tuple[Topic, ...], seconds: float) -> dict[str, list[int]]:
-    """Receives ``topics`` for ``seconds`` s; returns the arrival times (ns of wall time) by key.
+    """Receives ``topics`` for ``seconds`` s; returns the arrival times (ns of monotonic time) by key.
 
     Raises UserError if no message comes.
     """

@@ -109,10 +109,10 @@ class RosSession:
         """
 
         def on_sample(sample: zenoh.Sample) -> None:
-            data = sample.attachment
+            received_ns, data = time.monotonic_ns(), sample.attachment
             fields = read_attachment(data.to_bytes()) if data is not None else None
             published_ns = fields[1] if fields is not None else 0
-            entry = Sample(inbox_topic, str(sample.key_expr), sample.payload.to_bytes(), published_ns, time.time_ns())
+            entry = Sample(inbox_topic, str(sample.key_expr), sample.payload.to_bytes(), published_ns, received_ns)
             inbox.put(entry, newest_only=inbox_topic.queue == "newest")
 
         key = self._keys.subscribe(topic, kind)
@@ -137,7 +137,7 @@ class RosSession:
 
         def on_reply(reply: zenoh.Reply) -> None:
             if (sample := reply.ok) is not None:
-                inbox.put(Sample(inbox_topic, topic.strip("/"), sample.payload.to_bytes(), 0, time.time_ns()))
+                inbox.put(Sample(inbox_topic, topic.strip("/"), sample.payload.to_bytes(), 0, time.monotonic_ns()))
 
         for key in self._keys.caches(topic):
             self._session.get(

@@ -122,8 +122,11 @@ class Recording:
         return {key: topic for key in sorted(self.message_counts) if (topic := topic_of(key)) is not None}
 
     def world(self) -> World | None:
-        """The world of the session. Returns None if it was not recorded or is invalid."""
-        text = self.attachments.get("world.yaml")
+        """The simulator's world, or without a simulator the estimator's map.
+
+        Returns None if neither was recorded, or if it is invalid.
+        """
+        text = self.attachments.get("world.yaml", self.attachments.get("model/world.yaml"))
         try:
             return World.model_validate(parse_yaml(text)) if text is not None else None
         except NOT_YAML:  # a ValidationError is a ValueError too

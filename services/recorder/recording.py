@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 import shlex
 import sys
 import time
@@ -14,6 +15,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from common.bus.inbox import OTHERS, Inbox, Sample
+from common.errors import UserError
 from common.log import Logger
 from common.messages.requests import RecordReply
 from common.messages.topics import Topic
@@ -37,21 +39,26 @@ class OpenRecording:
         """
         self.message_counts = MessageCounts()
         self._inbox, self._before, self._began = inbox, inbox.handled_counts(), time.monotonic()
+        # Log times are wall time at the opening and monotonic time from there: a clock that is set does not bend them.
+        self._clock_ns = time.time_ns() - time.monotonic_ns()
         self._logged_ns = 0  # log time of the last message
         limits = PartLimits(int(options.split_size * 1e6), options.split_minutes * 60)
         writer = self.writer = PartsWriter(parts_of(options, numbered=numbered), limits, self._counters)
-        writer.metadata("presage", {"robot": options.robot, "command": shlex.join(sys.argv), **versions()})
-        writer.metadata("config:recorder", {"config": json.dumps(options.effective())})
-        for topic in topics:
-            if not topic.per_service:
-                writer.declare(topic, topic.key(options.robot))
-        writer.flush()
+        try:
+            writer.metadata("presage", {"robot": options.robot, "command": shlex.join(sys.argv), **versions()})
+            writer.metadata("config:recorder", {"config": json.dumps(options.effective())})
+            for topic in topics:
+                if not topic.per_service:
+                    writer.declare(topic, topic.key(options.robot))
+            writer.flush()
+        except UserError:
+            writer.part.discard()
+            raise
 
     def write(self, sample: Sample) -> None:
         """Writes the payload as received, whether or not it can be decoded."""
-        # Log times must not decrease, even if the wall clock is set back.
-        self._logged_ns = max(self._logged_ns, sample.received_ns)
-        published = sample.published_ns or sample.received_ns
+        self._logged_ns = max(self._logged_ns, sample.received_ns + self._clock_ns)  # log times must not decrease
+        published = sample.published_ns or self._logged_ns
         # Counted first, as it is no longer in the queue: writing may end a part of the file, which states the counts.
         self.message_counts.add(sample.key, sample.payload)
         self.writer.write(sample.topic, sample.key, sample.payload, published, self._logged_ns)
@@ -107,12 +114,22 @@ def parts_of(options: RecorderSettings, *, numbered: bool = False) -> Callable[[
             file = path.with_stem(f"{path.stem}-{part:03d}") if several else path
             try_next_number = (numbered or not options.file) and not chosen
             with suppress(NameTakenError) if try_next_number else nullcontext():
+                if several and not chosen:
+                    check_no_parts(path)
                 writer = RecordingWriter(file, options.compression, options.chunk_size)
                 chosen.append(path)
                 return writer
         raise AssertionError
 
     return open_part
+
+
+def check_no_parts(path: Path) -> None:
+    """Raises NameTakenError if another recording has parts of this name, on which this one would end."""
+    pattern = re.compile(rf"{re.escape(path.stem)}-\d{{3,}}\.mcap({re.escape(UNFINISHED_SUFFIX)})?")
+    for existing in sorted(path.parent.glob("*.mcap*")):
+        if pattern.fullmatch(existing.name):
+            raise NameTakenError(existing)
 
 
 def warn_about_unfinished(folder: Path, log: Logger) -> None:

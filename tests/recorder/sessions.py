@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 
 import numpy as np
@@ -117,3 +118,24 @@ def write(path: Path, *leave_out: Topic, world: bool = True) -> Path:
         if topic not in leave_out:
             writer.write(topic, topic.key("robot", service), message.encode(), at, at)
     return writer.finish()
+
+
+class FullDisk:
+    """A file that raises an error after a number of bytes, like a full disk."""
+
+    def __init__(self, stream, room):
+        self.stream, self.room = stream, room
+
+    def write(self, data):
+        if self.stream.tell() + len(data) > self.room:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return self.stream.write(data)
+
+    def __getattr__(self, name):
+        return getattr(self.stream, name)
+
+
+def on_full_disk(writer: RecordingWriter, room: int) -> RecordingWriter:
+    """The same writer, whose file raises an error after ``room`` bytes."""
+    writer._stream = writer._writer._Writer__stream = FullDisk(writer._stream, room)
+    return writer

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import errno
+import time
 import tracemalloc
 
 import lz4.frame
+import numpy as np
 import pytest
 import zstandard
 from hypothesis import given
@@ -18,12 +19,14 @@ from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
 from presage.recordings.info import collect_facts
 from presage.recordings.printing import info
+from services.recorder import recording
 from services.recorder.files.chunks import MAGIC, MAX_CHUNK_BYTES
-from services.recorder.files.writer import PROFILE
+from services.recorder.files.writer import PROFILE, RecordingWriter
 from services.recorder.reader import read_recording
 from services.recorder.recording import OpenRecording
 from services.recorder.recover import recover
 from services.recorder.settings import RecorderSettings
+from tests.recorder.sessions import on_full_disk
 from tests.recorder.test_recover import COMPRESSIONS, SENT, damaged, message, messages_in, write_chunks
 
 
@@ -86,26 +89,10 @@ def test_huge_chunk(tmp_path, compression, stated):
         tracemalloc.stop()
 
 
-class FullDisk:
-    """A file that raises an error after a number of bytes, like a full disk."""
-
-    def __init__(self, stream, room):
-        self.stream, self.room = stream, room
-
-    def write(self, data):
-        if self.stream.tell() + len(data) > self.room:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        return self.stream.write(data)
-
-    def __getattr__(self, name):
-        return getattr(self.stream, name)
-
-
 def test_losses_on_a_full_disk(tmp_path):
     inbox = Inbox()
     session = OpenRecording(RecorderSettings(directory=tmp_path, compression="none", chunk_size=1024), (), inbox)
-    part = session.writer.part
-    part._stream = part._writer._Writer__stream = FullDisk(part._stream, 40_000)
+    part = on_full_disk(session.writer.part, 40_000)
     for number in range(200):
         topic, payload = message(number)
         inbox.put(Sample(topic, topic.key("robot"), payload, number, number))
@@ -120,3 +107,24 @@ def test_losses_on_a_full_disk(tmp_path):
     recovered = recover(part.active).messages.total()
     assert recovered > 0
     assert (session.writer.saved, session.lost()) == (recovered, 200 - recovered)
+
+
+def test_full_disk_from_the_beginning(tmp_path, monkeypatch):
+    monkeypatch.setattr(recording, "RecordingWriter", lambda *args: on_full_disk(RecordingWriter(*args), 0))
+    with pytest.raises(UserError, match=r"No space left.* it holds no message: free some space"):
+        OpenRecording(RecorderSettings(directory=tmp_path), (), Inbox())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_clock_that_is_set(tmp_path, monkeypatch):
+    inbox, began_ns = Inbox(), time.time_ns()
+    session = OpenRecording(RecorderSettings(directory=tmp_path), (), inbox)
+    monkeypatch.setattr(time, "time_ns", lambda: began_ns - 10**12)
+    received = [time.monotonic_ns() + number * 10**8 for number in range(20)]
+    for number, received_ns in enumerate(received):
+        topic, payload = message(number)
+        session.write(Sample(topic, topic.key("robot"), payload, 0, received_ns))
+    (path,) = session.writer.finish()
+    logged = [raw.logged_ns for raw in read_recording(path).payloads()]
+    assert began_ns <= logged[0] < began_ns + 60 * 10**9
+    assert np.diff(logged).tolist() == np.diff(received).tolist()

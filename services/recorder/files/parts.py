@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from common.errors import UserError
 from common.messages.topics import Topic
 from services.recorder.files.writer import RecordingWriter
 
@@ -94,8 +95,12 @@ class PartsWriter:
     def _next(self) -> None:
         number = len(self.finished) + 2
         following = self._open(number)  # opened first: if that fails, the current part can still be completed
-        self._write_ending()
-        before = self.part.finish()
+        try:
+            self._write_ending()
+            before = self.part.finish()
+        except UserError:
+            following.discard()
+            raise
         self.finished.append(before)
         self._saved_before += self.part.saved
         self.part, self._began_ns = following, None

@@ -26,6 +26,10 @@ UNFINISHED_SUFFIX = ".active"  # appended to the name until the file is complete
 class NameTakenError(UserError):
     """A recording of that name exists or is being written."""
 
+    def __init__(self, path: Path, remedy: str = "--file") -> None:
+        """``path`` is the file that is there, ``remedy`` the option that chooses another name."""
+        super().__init__(f"{path}: is there already; choose another name with {remedy}, or another folder")
+
 
 class RecordingWriter:
     """Writes NAME.mcap.active, which `finish` renames to NAME.mcap. Every method raises UserError if writing fails."""
@@ -105,7 +109,10 @@ class RecordingWriter:
             )
 
     def finish(self) -> Path:
-        """Completes and renames the file, and returns its path. After a failure, only closes the unfinished file."""
+        """Completes and renames the file, and returns its path.
+
+        After a failure, only closes the unfinished file, or removes it if no message is in it.
+        """
 
         def end() -> None:
             self._writer.finish()  # type: ignore[no-untyped-call]
@@ -117,7 +124,10 @@ class RecordingWriter:
             self._stream.close()
 
         if self.failed:
-            self._abandon()
+            if self._saved:
+                self._close()
+            else:
+                self.discard()
             return self.active
         self._guarded(self._writer.flush)
         self._saved = self.written.total()
@@ -129,13 +139,23 @@ class RecordingWriter:
             step()
         except OSError as error:
             self.failed = True
-            reason = error.strerror or str(error)
-            raise UserError(
-                f"{self.active}: recording failed ({reason}); the messages flushed before are in the file, and "
-                f"`presage recover {self.active}` completes it: free some space, or choose another folder"
-            ) from None
+            reason, advice = error.strerror or str(error), "free some space, or choose another folder"
+            saved = (
+                f"the messages flushed before are in the file, and `presage recover {self.active}` completes it"
+                if self._saved
+                else "it holds no message"
+            )
+            raise UserError(f"{self.active}: recording failed ({reason}); {saved}: {advice}") from None
 
-    def _abandon(self) -> None:
+    def discard(self) -> None:
+        """Closes and removes the unfinished file."""
+        self.failed = True
+        there = is_there(self.active, self._stream)
+        self._close()
+        if there:
+            self.active.unlink()
+
+    def _close(self) -> None:
         try:
             self._stream.close()
         except OSError:
@@ -173,16 +193,15 @@ def claim(path: Path, active: Path, remedy: str = "--file") -> BufferedWriter:
     Creation is exclusive, so two recorders never write to one recording. Raises NameTakenError if ``active`` or
     ``path`` exists; the message names the option ``remedy``.
     """
-    taken = f"is there already; choose another name with {remedy}, or another folder"
     try:
         stream = active.open("xb")
         if sys.platform != "win32":
             with suppress(OSError):  # some network file systems have no locks
                 fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except FileExistsError:
-        raise NameTakenError(f"{active}: {taken}") from None
+        raise NameTakenError(active, remedy) from None
     if path.exists():
         stream.close()
         active.unlink()
-        raise NameTakenError(f"{path}: {taken}")
+        raise NameTakenError(path, remedy)
     return stream

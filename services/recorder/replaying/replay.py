@@ -199,10 +199,10 @@ class Replay:
         call.reply(self.player.handle(request, time.monotonic()).encode())
 
     def _world(self) -> WorldReply:
-        """The recorded world, or a refusal if there is none."""
+        """The recorded world or map, or a refusal if there is none."""
         recording, world = self.recording, self.recording.world()
         if world is None:
-            return WorldReply(ok=False, reason=f"{recording.path.name} does not hold its world")
+            return WorldReply(ok=False, reason=f"{recording.path.name} holds neither a world nor a map")
         return WorldReply(world=world, scanner=recording.scanner(), robot=recording.robot())
 
     def _published(self) -> dict[str, Topic]:

@@ -10,9 +10,11 @@ from common.errors import UserError
 from common.messages.definitions import Pose, Truth, Twist
 from common.messages.topics import SCAN, TRUTH
 from services.recorder.files.parts import PartLimits, PartsWriter
+from services.recorder.files.writer import NameTakenError, RecordingWriter
 from services.recorder.reader import read_recording
 from services.recorder.recording import parts_of
 from services.recorder.settings import RecorderSettings
+from tests.recorder.sessions import on_full_disk
 
 KEY = "presage/r/truth"
 SECOND_NS = 1_000_000_000
@@ -81,3 +83,42 @@ def test_next_name_is_taken(tmp_path):
         writer.write(TRUTH, KEY, truth(1), 0, 5 * SECOND_NS)
     assert writer.finish() == [tmp_path / "run-001.mcap"]
     assert [raw.payload for raw in read_recording(tmp_path / "run-001.mcap").payloads()] == [truth(0)]
+
+
+@pytest.mark.parametrize("name", ["run-002.mcap", "run-017.mcap.active"])
+def test_parts_of_another_recording(tmp_path, name):
+    (tmp_path / name).write_bytes(b"")
+    (tmp_path / "runway-002.mcap").write_bytes(b"")
+    with pytest.raises(NameTakenError, match=rf"{name}: is there already"):
+        writer_in(tmp_path, PartLimits(seconds=1))
+    options = RecorderSettings(directory=tmp_path, file="run", split_minutes=1)
+    assert parts_of(options, numbered=True)(1).finish() == tmp_path / "run-2-001.mcap"
+
+
+def test_part_that_cannot_begin(tmp_path):
+    rooms = iter([1 << 20, 0])
+
+    def open_part(number):
+        return on_full_disk(RecordingWriter(tmp_path / f"run-{number}.mcap"), next(rooms))
+
+    writer = PartsWriter(open_part, PartLimits(seconds=1))
+    writer.write(TRUTH, KEY, truth(0), 0, 0)
+    with pytest.raises(UserError, match=r"run-2\.mcap\.active: recording failed .* it holds no message"):
+        writer.write(TRUTH, KEY, truth(1), 0, 5 * SECOND_NS)
+    writer.finish()
+    assert list(tmp_path.iterdir()) == [tmp_path / "run-1.mcap"]
+
+
+def test_part_that_cannot_end(tmp_path):
+    rooms = iter([20_000, 1 << 20])
+
+    def open_part(number):
+        return on_full_disk(RecordingWriter(tmp_path / f"run-{number}.mcap", "none", 100), next(rooms))
+
+    writer = PartsWriter(open_part, PartLimits(seconds=1), lambda: {"counters": {"long": "x" * 50_000}})
+    writer.write(TRUTH, KEY, truth(0), 0, 0)
+    writer.flush()
+    with pytest.raises(UserError, match=r"run-1\.mcap\.active: recording failed .* `presage recover"):
+        writer.write(TRUTH, KEY, truth(1), 0, 5 * SECOND_NS)
+    writer.finish()
+    assert list(tmp_path.iterdir()) == [tmp_path / "run-1.mcap.active"]

@@ -15,9 +15,10 @@ from hypothesis import strategies as st
 from common.bus.bus import open_bus, wait_until
 from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
-from common.messages.requests import ConfigReply, PlayerReply, PlayerRequest, Request, WorldReply
+from common.messages.requests import ConfigReply, ModelReply, PlayerReply, PlayerRequest, Request, WorldReply
 from common.messages.topics import BELIEF, CONFIG, GOAL, HEALTH, ODOM, PLAYER, SCAN, TOPICS, WORLD
 from services.recorder.files.writer import RecordingWriter
+from services.recorder.recording import write_description
 from services.recorder.replaying import player as core
 from services.recorder.replaying import replay as shell
 from services.recorder.replaying.replay import ReplayOptions, replay
@@ -254,7 +255,16 @@ def test_descriptions(start, bus, session):
 def test_recording_without_world(start, bus):
     start(ON_REQUEST)
     reply = bus.query(WORLD, Request(), WorldReply, timeout=WAIT_TIMEOUT_S)
-    assert (reply.ok, reply.reason) == (False, "run.mcap does not hold its world")
+    assert (reply.ok, reply.reason) == (False, "run.mcap holds neither a world nor a map")
+
+
+def test_recording_of_a_real_robot(start, bus, link, tmp_path):
+    writer = RecordingWriter(tmp_path / "robot.mcap")
+    write_description(writer, "estimator", ModelReply(estimator="precise", world=sessions.WORLD))
+    writer.write(SCAN, SCAN.key(link.robot), b"", 1, 1)
+    start(replace(ON_REQUEST, paused=True), writer.finish())
+    reply = bus.query(WORLD, Request(), WorldReply, timeout=WAIT_TIMEOUT_S)
+    assert (reply.world, reply.scanner) == (sessions.WORLD, None)
 
 
 def test_world_beside_a_simulator(start, session, bus):
