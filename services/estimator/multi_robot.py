@@ -136,7 +136,7 @@ class FleetLoop:
         self._searches = ThreadPoolExecutor(1, "search")
         self._may_log = LogRateLimiter()
         self._next_health_check = self._next_discovery = 0.0
-        self._retry_at: dict[str, float] = {}  # time.monotonic(), by name of a robot in the settings
+        self._retry_at: dict[str, float] = {}  # time.monotonic(), by name of a robot that could not be served
         self._stopping = False
 
     def run(self) -> None:
@@ -194,6 +194,13 @@ class FleetLoop:
         except UserError as error:
             self.log.warning(str(error), robot=robot.robot)
             self._remove(robot)
+            self._pause(robot.robot)
+
+    def _pause(self, name: str) -> None:
+        """Leaves a robot that cannot be served alone for `RETRY_PERIOD_S`."""
+        now = time.monotonic()
+        waiting = {other: at for other, at in self._retry_at.items() if at > now}
+        self._retry_at = {**waiting, name: now + RETRY_PERIOD_S}
 
     def _start_search(self, search: Callable[[], Posterior]) -> Future[Posterior]:
         future = self._searches.submit(search)
@@ -211,10 +218,9 @@ class FleetLoop:
             self._alive.pop((robot, service), None)
 
     def _add_named_robots(self) -> None:
-        """Begins to serve the robots named in the settings; one that failed is tried again after `RETRY_PERIOD_S`."""
+        """Begins to serve the robots named in the settings."""
         for name in self.names:
-            if name not in self._robots and time.monotonic() >= self._retry_at.get(name, 0.0):
-                self._retry_at[name] = time.monotonic() + RETRY_PERIOD_S
+            if name not in self._robots:
                 self._try_to_add(name, named=True)
 
     def _add_found_robots(self) -> None:
@@ -252,7 +258,9 @@ class FleetLoop:
                     self._remove(robot)
 
     def _try_to_add(self, name: str, *, named: bool) -> None:
-        """Serves a robot, or logs why that cannot be."""
+        """Serves a robot, or logs why that cannot be. Does nothing while the robot is left alone."""
+        if time.monotonic() < self._retry_at.get(name, 0.0):
+            return
         robot = FleetRobot(self.settings, name, self.models, self._start_search, named=named)
         loop = ServiceLoop(robot, self.bus.for_robot(name), Inbox(INBOX_MESSAGES, INBOX_BYTES, self._changed))
         try:
@@ -262,6 +270,7 @@ class FleetLoop:
             loop.bus.undeclare_all()
             if self._may_log(name):
                 self.log.warning(str(error), robot=name)
+            self._pause(name)
             return
         self._robots[name] = robot
         self._count()

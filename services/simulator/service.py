@@ -248,9 +248,9 @@ class SimulatorService(Service):
     def _pause(self, *, paused: bool) -> None:
         self.paused = paused
         self._update_note()
-        # In lockstep, a command that came during the pause did not advance time. Publish the scan again at once, so
-        # that it is answered again.
         self._next_step_s = time.monotonic()
+        if self.lockstep and self._published is not None and not paused:
+            self._publish()  # again, because a command that came during the pause did not advance time
 
     def _update_note(self) -> None:
         """Sets the note shown in health: whether and how fast time runs."""

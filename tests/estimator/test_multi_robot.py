@@ -157,10 +157,12 @@ def test_a_robot_with_another_protocol_is_left_out(bus, monkeypatch):
     monkeypatch.setattr(multi_robot, "SharedModels", lambda _: None)
     loop = multi_robot.FleetLoop(EstimatorSettings(robots=f"{bus.robot}-*"), bus)
     loop._note_liveliness(f"{bus.robot}-old", "simulator", True)
-    monkeypatch.setattr(multi_robot.ServiceLoop, "open", Mock(side_effect=UserError("another protocol")))
+    opening = Mock(side_effect=UserError("another protocol"))
+    monkeypatch.setattr(multi_robot.ServiceLoop, "open", opening)
     loop.models = None
     loop._add_found_robots()
-    assert loop._robots == {}
+    loop._add_found_robots()
+    assert (loop._robots, opening.call_count) == ({}, 1)  # not tried again at once
 
 
 def test_a_named_robot_with_another_protocol_is_tried_again(bus, monkeypatch):
