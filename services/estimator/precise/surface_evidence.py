@@ -43,6 +43,7 @@ BORDER_M = 0.1
 PLAUSIBLE_SIGMAS = 2.0  # a larger error makes it less probable that a beam ends at a surface of the map
 MEAN_PENALTY = 0.04  # nats, of Gaussian errors due to that; it is added back, so that the penalty is 0 on average
 
+STATES = 4  # a constant, so that the compiler unrolls loops over them; they also avoid temporary arrays
 jit = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
@@ -152,8 +153,7 @@ def _emit(
     ``unmapped_log_density`` on a surface that the map lacks, and ``known_log_density`` on one that it shows exactly.
     ``starts_surface`` is true at the first beam on a surface of the scan.
     """
-    outlier = math.log(OUTLIER / FAR_M)
-    log_densities[:] = outlier
+    log_densities[:] = math.log(OUTLIER / FAR_M)
     if scale == np.inf:  # the map is unknown beyond this range
         if r > surface:
             log_densities[:] = unmapped_log_density
@@ -207,7 +207,7 @@ def _forward_backward(
 ) -> None:
     """Fills the fields of `SurfaceEvidence` by the forward and the backward algorithm."""
     used = np.flatnonzero(~np.isnan(ranges) & (ranges > -np.inf))
-    size, states = len(used), len(prior)
+    size, states = len(used), STATES
     forward, emitted, keep = np.empty((size, states)), np.empty((size, states)), np.empty((size, states))
     for k in range(expected.shape[0]):
         explained[k] = 0.0
@@ -240,7 +240,9 @@ def _forward_backward(
             if n < size - 1:
                 _step_backward(backward, emitted[n + 1], prior, keep[n + 1])
             if scale[k, b] < np.inf:
-                norm = (forward[n] * backward).sum()
+                norm = 0.0
+                for i in range(STATES):
+                    norm += forward[n, i] * backward[i]
                 weights[k, b] = forward[n, 0] * backward[0] / norm
                 explained[k] += (weights[k, b] + forward[n, 3] * backward[3] / norm) / size
 
@@ -272,17 +274,20 @@ def _step_forward(forward: Array, emitted: Array, prior: Array, keep: Array, n: 
     that a beam is in the same state as the one before, instead of one drawn from ``prior``. Returns the log density of
     the n-th beam given those before it.
     """
-    top, norm, drawn = emitted[n].max(), 0.0, 1.0
-    for i in range(len(prior)):
+    top, norm, drawn = emitted[n, 0], 0.0, 1.0
+    for i in range(1, STATES):
+        top = max(top, emitted[n, i])
+    for i in range(STATES):
         if n > 0:
             drawn -= keep[i] * forward[n - 1, i]
-    for i in range(len(prior)):
+    for i in range(STATES):
         emitted[n, i] = math.exp(emitted[n, i] - top)
         forward[n, i] = drawn * prior[i] * emitted[n, i]
         if n > 0:
             forward[n, i] += keep[i] * forward[n - 1, i] * emitted[n, i]
         norm += forward[n, i]
-    forward[n] /= norm
+    for i in range(STATES):
+        forward[n, i] /= norm
     return float(math.log(norm) + top)
 
 
@@ -290,13 +295,14 @@ def _step_forward(forward: Array, emitted: Array, prior: Array, keep: Array, n: 
 def _step_backward(backward: Array, emitted: Array, prior: Array, keep: Array) -> None:
     """Updates ``backward`` (4,), the likelihood of the beams that follow for each state, by one more beam."""
     drawn, norm = 0.0, 0.0
-    for i in range(len(prior)):
+    for i in range(STATES):
         backward[i] *= emitted[i]
         drawn += prior[i] * backward[i]
-    for i in range(len(prior)):
+    for i in range(STATES):
         backward[i] = keep[i] * backward[i] + (1 - keep[i]) * drawn
         norm += backward[i]
-    backward /= norm
+    for i in range(STATES):
+        backward[i] /= norm
 
 
 def find_borders(expected: Expected, lasers: Array, angles: Array) -> npt.NDArray[np.bool_]:
