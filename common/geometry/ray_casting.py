@@ -103,9 +103,9 @@ def _cast(
             ux, uy = math.cos(heading), math.sin(heading)
             r, nx, ny = _nearest_outline(outlines, x, y, ux, uy)
             for s in range(people.shape[0]):
-                person = _distance_to_circle(people[s], x, y, ux, uy)
+                person = _distance_to_circle(people, s, x, y, ux, uy)
                 if person < r:
-                    r, nx, ny = person, *_circle_normal(people[s], x, y, ux, uy, person)
+                    r, nx, ny = person, *_circle_normal(people, s, x, y, ux, uy, person)
             if occupied.size:
                 heading -= frame[2]
                 hit, hx, hy = _nearest_cell(
@@ -137,9 +137,9 @@ def _nearest_outline(outlines: IndexArrays, x: float, y: float, ux: float, uy: f
         for m in range(starts[cell], starts[cell + 1]):
             s = members[m]
             if s < segments.shape[0]:
-                r = _distance_to_segment(segments[s], x, y, ux, uy)
+                r = _distance_to_segment(segments, s, x, y, ux, uy)
             else:
-                r = _distance_to_circle(circles[s - segments.shape[0]], x, y, ux, uy)
+                r = _distance_to_circle(circles, s - segments.shape[0], x, y, ux, uy)
             # At a corner, the first of the outlines that meet there, whichever cell lists it first.
             if r < nearest or (r == nearest and s < which):
                 nearest, which = r, s
@@ -154,17 +154,17 @@ def _nearest_outline(outlines: IndexArrays, x: float, y: float, ux: float, uy: f
     if which < 0:
         return np.inf, 0.0, 0.0
     if which >= segments.shape[0]:
-        return nearest, *_circle_normal(circles[which - segments.shape[0]], x, y, ux, uy, nearest)
+        return nearest, *_circle_normal(circles, which - segments.shape[0], x, y, ux, uy, nearest)
     ex, ey = segments[which, 2] - segments[which, 0], segments[which, 3] - segments[which, 1]
     length = math.hypot(ex, ey)
     return nearest, -ey / length, ex / length
 
 
 @jit
-def _distance_to_segment(segment: Array, x: float, y: float, ux: float, uy: float) -> float:
-    """Distance in m from (x, y) along (ux, uy) to a segment (4,); +inf if the ray misses it."""
-    ax, ay = segment[0] - x, segment[1] - y
-    ex, ey = segment[2] - segment[0], segment[3] - segment[1]
+def _distance_to_segment(segments: Array, s: int, x: float, y: float, ux: float, uy: float) -> float:
+    """Distance in m from (x, y) along (ux, uy) to segment s of (S, 4); +inf if the ray misses it."""
+    ax, ay = segments[s, 0] - x, segments[s, 1] - y
+    ex, ey = segments[s, 2] - segments[s, 0], segments[s, 3] - segments[s, 1]
     det = ux * ey - uy * ex
     if det == 0.0:
         return np.inf
@@ -173,9 +173,9 @@ def _distance_to_segment(segment: Array, x: float, y: float, ux: float, uy: floa
 
 
 @jit
-def _distance_to_circle(circle: Array, x: float, y: float, ux: float, uy: float) -> float:
-    """Distance in m from (x, y) along (ux, uy) to a circle (3,); +inf if the ray misses it or begins in it."""
-    cx, cy, radius = circle[0] - x, circle[1] - y, circle[2]
+def _distance_to_circle(circles: Array, c: int, x: float, y: float, ux: float, uy: float) -> float:
+    """Distance in m from (x, y) along (ux, uy) to circle c of (C, 3); +inf if the ray misses it or begins in it."""
+    cx, cy, radius = circles[c, 0] - x, circles[c, 1] - y, circles[c, 2]
     middle = cx * ux + cy * uy
     discriminant = middle * middle - (cx * cx + cy * cy - radius * radius)
     if discriminant < 0.0:
@@ -185,9 +185,9 @@ def _distance_to_circle(circle: Array, x: float, y: float, ux: float, uy: float)
 
 
 @jit
-def _circle_normal(circle: Array, x: float, y: float, ux: float, uy: float, r: float) -> tuple[float, float]:
-    """The normal of a circle (3,) where a ray ends after ``r`` m."""
-    return (x + r * ux - circle[0]) / circle[2], (y + r * uy - circle[1]) / circle[2]
+def _circle_normal(circles: Array, c: int, x: float, y: float, ux: float, uy: float, r: float) -> tuple[float, float]:
+    """The normal of circle c of (C, 3) where a ray ends after ``r`` m."""
+    return (x + r * ux - circles[c, 0]) / circles[c, 2], (y + r * uy - circles[c, 1]) / circles[c, 2]
 
 
 @jit
