@@ -9,12 +9,13 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, get_args
 
 from prometheus_client import CollectorRegistry, Gauge, Histogram, Info, ProcessCollector, disable_created_metrics
 from prometheus_client.core import CounterMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from common.bus.inbox import OTHERS
 from common.messages.definitions import Belief, Health, Stamped, Status
 from common.messages.topics import ROOT
 from common.versions import PROTOCOL, versions
@@ -176,17 +177,25 @@ def topic_labels(key: str) -> tuple[str, str]:
     return (parts[1], parts[2]) if len(parts) == 3 and parts[0] == ROOT else ("", key)
 
 
+@dataclass(frozen=True)
+class LoopCounts:
+    """Totals of a service's loop since it began."""
+
+    published: Mapping[str, int]  # messages by key
+    undecodable: Mapping[str, int]  # messages by key
+    failed: int  # steps that raised an error
+    events: Mapping[str, int]  # by name
+    began: float  # s, monotonic clock
+
+
 class ServiceMetrics(Collector):
     """Metrics of one service. The service's loop updates them; scrapes read them from another thread.
 
     The counters are collected at each scrape: the loop already has their totals, and a Counter can only be incremented.
     """
 
-    def __init__(self, robot: str, service: str, inbox: Inbox, counts: Callable[[], Mapping[str, Any]]) -> None:
-        """Collects from ``inbox`` and ``counts``.
-
-        ``counts()`` returns published and undecodable by key, failed, events by name, and began (s, monotonic clock).
-        """
+    def __init__(self, robot: str, service: str, inbox: Inbox, counts: Callable[[], LoopCounts]) -> None:
+        """Collects from ``inbox`` and from ``counts``, which is called at each scrape."""
         self.service, self._labels, self._inbox, self._counts = service, (robot, service), inbox, counts
         self._health: Health | None = None
         self._last_health_time = time.monotonic()
@@ -194,7 +203,7 @@ class ServiceMetrics(Collector):
         registry.register(self)
         add_build_info(registry, *self._labels)
         uptime, health_age = gauge(registry, "presage_uptime_seconds"), gauge(registry, "presage_health_age_seconds")
-        uptime.labels(*self._labels).set_function(lambda: time.monotonic() - counts()["began"])
+        uptime.labels(*self._labels).set_function(lambda: time.monotonic() - counts().began)
         health_age.labels(*self._labels).set_function(lambda: time.monotonic() - self._last_health_time)
         self._rate = gauge(registry, "presage_message_rate_hertz")
         self._free_energy = gauge(registry, "presage_free_energy_nats")
@@ -241,7 +250,7 @@ class ServiceMetrics(Collector):
         """Yields the counters."""
         counts = self._counts()
         received, dropped, oversized = self._inbox.received_counts()
-        undecodable = counts["undecodable"]
+        undecodable = counts.undecodable
         counters = {
             "received": received,
             # All received keys, also with 0: Prometheus needs a first value to compute a rate.
@@ -252,9 +261,9 @@ class ServiceMetrics(Collector):
             requests = [((*self._labels, key), number) for key, number in by_key.items() if not _is_key(key)]
             yield _counter(f"presage_messages_{name}", self._by_topic(by_key))
             yield _counter(f"presage_requests_{name}", requests)
-        yield _counter("presage_messages_published", self._by_topic(counts["published"]))
-        yield _counter("presage_steps_failed", [(self._labels, counts["failed"])])
-        events = dict(counts["events"])
+        yield _counter("presage_messages_published", self._by_topic(counts.published))
+        yield _counter("presage_steps_failed", [(self._labels, counts.failed)])
+        events = dict(counts.events)
         if (written := events.pop("written_bytes", None)) is not None:
             yield _counter("presage_recorder_written_bytes", [(self._labels, written)])
         yield _counter("presage_events", [((*self._labels, name), number) for name, number in events.items()])
@@ -279,8 +288,8 @@ def _counter(name: str, values: Values) -> CounterMetricFamily:
 
 
 def _is_key(name: str) -> bool:
-    """Whether a counter's name is a message's key. Requests are counted under the name of the query."""
-    return "/" in name or name == "others"
+    """Whether a counter's name is a message's key, or `OTHERS`. Requests are counted under the name of the query."""
+    return "/" in name or name == OTHERS
 
 
 def table() -> str:

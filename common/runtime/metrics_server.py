@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from prometheus_client import CollectorRegistry, start_http_server
 
 from common.errors import UserError
-from common.runtime.metrics import ServiceMetrics
+from common.runtime.metrics import LoopCounts, ServiceMetrics
 
 if TYPE_CHECKING:
     from common.runtime.service_loop import ServiceLoop
@@ -53,15 +53,15 @@ def serve_loop_metrics(loop: ServiceLoop, setting: str) -> Iterator[ServiceMetri
     """Serves the metrics of a service loop at the address ``setting`` until the block ends; yields the metrics."""
     service = loop.service
 
-    def counts() -> dict[str, Any]:
+    def counts() -> LoopCounts:
         # Copies, because a scrape reads them from another thread.
-        return {
-            "published": loop.published.copy(),
-            "undecodable": loop.undecodable.copy(),
-            "failed": loop.failed,
-            "events": dict(service.counters),
-            "began": loop.began,
-        }
+        return LoopCounts(
+            published=loop.published.copy(),
+            undecodable=loop.undecodable.copy(),
+            failed=loop.failed,
+            events=dict(service.counters),
+            began=loop.began,
+        )
 
     metrics = ServiceMetrics(loop.bus.robot, service.name, loop.inbox, counts)
     with serve_registry(metrics.registry, setting) as address:

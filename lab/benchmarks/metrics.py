@@ -20,7 +20,7 @@ from common.bus.bus import open_bus
 from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
 from common.messages.topics import SCAN
-from common.runtime.metrics import ServiceMetrics
+from common.runtime.metrics import LoopCounts, ServiceMetrics
 from lab.benchmarks.cpu import cpu_seconds
 from presage.session.ports import free_port
 from presage.session.stack import Stack
@@ -81,7 +81,7 @@ def _round(stack: Stack, seconds: float, cost: ScrapeCost, ports: dict[str, int]
 
 def observation_us() -> float:
     """Processor time in µs to record one message in the histograms."""
-    metrics = ServiceMetrics("bench", "bench", Inbox(), dict)
+    metrics = ServiceMetrics("bench", "bench", Inbox(), lambda: LoopCounts({}, {}, 0, {}, 0.0))
     sample = Sample(SCAN, SCAN.key("bench"), b"", time.time_ns(), time.monotonic_ns())
     began = time.process_time()
     for _ in range(MESSAGES):

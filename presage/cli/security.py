@@ -58,7 +58,9 @@ def add(
     robots: Robots = "",
     hosts: Hosts = "",
     days: Days = 365,
-    force: Annotated[bool, typer.Option("--force", help="Renew the credentials of an existing member.")] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Issue a new certificate, key and password to an existing member.")
+    ] = False,
 ) -> None:
     """Add a member, or with --force renew the credentials of one.
 
@@ -122,8 +124,8 @@ def show(
     expiring = [name for name, end in ends.items() if end - now < EXPIRY_WARNING]
     if expiring:
         console.print(
-            f"[bold red]soon to expire: {', '.join(expiring)}[/]; "
-            "renew them with `presage secure add DIR ROLE NAME --force`",
+            f"[bold red]expired, or expiring within {EXPIRY_WARNING.days} days: {', '.join(expiring)}[/]; "
+            "renew each with `presage secure add FOLDER ROLE NAME --force`",
             soft_wrap=True,
         )
     raise typer.Exit(1 if expiring else 0)

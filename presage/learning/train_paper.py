@@ -60,13 +60,13 @@ def train(options: TrainPaperOptions, link: Link, console: Console) -> Path:
         data = {}
         for name, count in (("train", options.samples), ("test", TEST_SAMPLES)):
             poses = np.column_stack([world.sample_free(count, rng, Robot().radius), np.full(count, heading)])
-            samples = checkpoint.samples(name)
+            samples = checkpoint.load_samples(name)
             if samples is None:
                 with scanner_on_bus(link, options.world, options.simulator_arguments, world, scanner, console) as bus:
                     noise_seed = options.parameters.seed if name == "train" else None  # test scans have no noise
                     ranges = collect(bus, poses, scanner, noise_seed, bar, f"{name} samples")
                 samples = TrainingData(poses, usable_ranges(ranges, scanner.range_max))
-                checkpoint.keep_samples(name, samples)
+                checkpoint.save_samples(name, samples)
             data[name] = samples
         trainer, seconds = _fit(options, world, scanner, data, checkpoint, bar)
     _save(options, world, scanner, heading, data, trainer, seconds, path)
@@ -91,13 +91,13 @@ def _fit(
     norm = Normalisation.of(world.bounds, float(data["train"].ranges.max()))
     shape = DecoderShape(scanner.beams, HIDDEN, CHANNELS)
     trainer = Trainer(shape, norm, options.parameters, data["train"], data["test"])
-    if checkpoint.restore(trainer):
+    if checkpoint.restore_state(trainer):
         bar.console.print(f"resuming an interrupted run after epoch {trainer.progress.epoch}")
     task = bar.add_task("epochs", total=options.parameters.epochs, completed=trainer.progress.epoch)
     start = time.monotonic()
 
     def report(progress: training.Progress) -> None:
-        checkpoint.save(trainer)
+        checkpoint.save_state(trainer)
         test = progress.test_l1[-1]
         bar.update(task, completed=progress.epoch, description=f"epochs, test error {test:.3f} m")
 

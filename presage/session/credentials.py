@@ -97,9 +97,11 @@ def add(
     hosts: Sequence[str] = (),
     force: bool = False,
 ) -> Member:
-    """Adds a member and returns it; with ``force``, renews the credentials of an existing member.
+    """Adds a member and returns it.
 
-    Raises UserError if the role is unknown, a name is not allowed, or the member exists and ``force`` is not given.
+    With ``force``, an existing member gets a new certificate, key and password. It keeps its robots, and a router its
+    hosts, unless others are given. Raises UserError if the role is unknown, a name is not allowed, or the member exists
+    with another role, or without ``force``.
     """
     if role not in ROLES:
         raise UserError(f"no role {role!r}: choose one of {', '.join(ROLES)}")
@@ -115,8 +117,14 @@ def add(
     for robot in robots:
         check_robot(robot)
     authority, members = _authority(folder), list(read_members(folder / ROUTER))
-    if not force and any(each.name == name for each in members):
-        raise UserError(f"{folder / name}: exists already; --force renews its credentials")
+    existing = next((each for each in members if each.name == name), None)
+    if existing is not None:
+        if existing.role != role:
+            raise UserError(f"{folder / name}: has the role {existing.role!r}; choose another name, or remove it first")
+        if not force:
+            raise UserError(f"{folder / name}: exists already; --force renews its credentials")
+        robots = robots or existing.robots
+        hosts = hosts or _hosts_of(_certificate(folder / name / CERTIFICATE))
     member = Member(name=name, role=role, robots=tuple(robots) or EVERY_ROBOT)
     _write_member(folder, authority, member, days, hosts)
     _write_list(folder, [*(each for each in members if each.name != name), member])
@@ -252,6 +260,11 @@ def _host(text: str) -> x509.GeneralName:
         return x509.IPAddress(ipaddress.ip_address(text))
     except ValueError:
         return x509.DNSName(text)
+
+
+def _hosts_of(certificate: x509.Certificate) -> list[str]:
+    names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    return [str(name.value) for name in names]
 
 
 def _pem(key: Key) -> bytes:

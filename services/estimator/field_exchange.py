@@ -1,4 +1,4 @@
-"""Splits a field that was learned while driving into messages, and joins the messages again."""
+"""Splits a distance field that was learned while driving into messages, and joins the messages again."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ PART_BYTES = 1 << 19  # of data in one message; the bus accepts payloads of twic
 
 
 def split_into_messages(data: bytes, version: int, base: str, stamp_ns: int) -> list[LearnedField]:
-    """Splits an encoded field into messages."""
+    """Splits an encoded distance field into messages of at most `PART_BYTES`.
+
+    ``base`` is the SHA-256 of the weights from which learning began, ``version`` the number of the learned version.
+    """
     pieces = [data[begin : begin + PART_BYTES] for begin in range(0, len(data), PART_BYTES)]
     return [
         LearnedField(
@@ -32,7 +35,7 @@ class FieldAssembler:
         self._parts: list[LearnedField] = []
 
     def add(self, message: LearnedField) -> bytes | None:
-        """Adds a part; returns the encoded field if this was its last part and none is missing, else None."""
+        """Adds a part. Returns the encoded field after its last part, if all parts came in order."""
         if message.part == 0:
             self._parts = []
         self._parts.append(message)

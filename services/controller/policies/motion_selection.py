@@ -130,8 +130,8 @@ class PoseBelief:
         metres = np.full(points.shape[:2], 1.0)  # length of the part of the way that each point represents
         metres[:, -len(LINE_SAMPLES) :] *= line_length[:, None] / len(LINE_SAMPLES)
         metres[:, : -len(LINE_SAMPLES)] *= length[:, None] / (points.shape[1] - len(LINE_SAMPLES))
-        ambiguity = np.sum(metres * self.scans.free_grid.interpolate(self.scans.ambiguity, points), axis=1)
-        information = self.scans.matrix[self.scans.grid.cell_of(se2.transform(self.pose, ends))]
+        ambiguity = np.sum(metres * self.scans.ambiguity_grid.interpolate(self.scans.ambiguity, points), axis=1)
+        information = self.scans.information[self.scans.information_grid.cell_of(se2.transform(self.pose, ends))]
         information = information * seconds / motion_model.STEP_S
         before = efe.remaining_entropy(self.covariance, np.zeros((3, 3)))
         return ambiguity, before - efe.remaining_entropy(self.covariance, information)

@@ -42,17 +42,21 @@ UNKNOWN_VARIANCE = 1e4  # m² and rad², of a pose about which scans give no inf
 class ScanInformation:
     """Expected information of scans, and the ambiguity of the pose that they leave."""
 
-    grid: Grid  # coarse
-    matrix: Array  # (cells of grid, 3, 3) of one scan about x, y, yaw in map, averaged over headings: 1/m², 1/m, 1/rad²
-    free_grid: Grid  # fine
-    ambiguity: Array  # (rows, columns of free_grid) nats per metre
+    information_grid: Grid  # coarse
+    # (cells of information_grid, 3, 3) of one scan about x, y, yaw in map, averaged over headings: 1/m², 1/m, 1/rad²
+    information: Array
+    ambiguity_grid: Grid  # fine
+    ambiguity: Array  # (rows, columns of ambiguity_grid) nats, charged once for each metre driven
 
     @classmethod
     def of(cls, graph: FreeSpaceGraph, scan: Scan, scans_per_metre: float) -> ScanInformation:
-        """The expected information of scans like ``scan``, of which only the scanner matters."""
+        """The expected information of scans by the scanner of ``scan``, whose ranges are not used.
+
+        ``scans_per_metre`` is the number of scans on each metre driven.
+        """
         grid = _coarse_grid(graph.grid)
-        matrix = _information(graph.free, _places_with_room(graph.free, grid, graph.radius), scan)
-        return cls(grid, matrix, graph.grid, _ambiguity(graph, grid, scans_per_metre * matrix))
+        information = _information(graph.free, _places_with_room(graph.free, grid, graph.radius), scan)
+        return cls(grid, information, graph.grid, _ambiguity(graph, grid, scans_per_metre * information))
 
 
 def _information(free: FreeSpace, places: Array, scan: Scan) -> Array:
@@ -65,12 +69,12 @@ def _information(free: FreeSpace, places: Array, scan: Scan) -> Array:
     distance = np.where(hit, distance, 0.0)[..., None]
     normal = free.normal_at(start + np.maximum(distance - free.grid.resolution, 0.0) * ray)
     lever = distance[..., 0] * np.sum(normal * np.stack([-ray[:, 1], ray[:, 0]], axis=-1), axis=-1)
-    measured = np.concatenate([normal, lever[..., None]], axis=-1)
+    jacobian = np.concatenate([normal, lever[..., None]], axis=-1)
     incidence = np.maximum(np.abs(np.sum(normal * ray, axis=-1)), MIN_INCIDENCE)
     sigma = np.hypot(scan.sigma or DEFAULT_SIGMA_M, scan.sigma_relative * distance[..., 0])
     variance = (sigma * incidence) ** 2 + MAP_ERROR_M**2
     precision = np.where(hit, len(scan.ranges) / DIRECTIONS / variance, 0.0)
-    return np.asarray(np.einsum("cd,cdi,cdj->cij", precision, measured, measured))
+    return np.asarray(np.einsum("cd,cdi,cdj->cij", precision, jacobian, jacobian))
 
 
 def _ambiguity(graph: FreeSpaceGraph, grid: Grid, information: Array) -> Array:
@@ -104,9 +108,9 @@ def _propagate_deviation(graph: FreeSpaceGraph, deviation: Array) -> Array:
     additional = csr_matrix(np.append(np.maximum(distance, 1e-9), 0.0))
     lengths = graph.lengths
     lengths.resize((len(distance), len(distance) + 1))
-    found = dijkstra(vstack([lengths, additional], format="csr"), indices=len(distance))
+    path_lengths = dijkstra(vstack([lengths, additional], format="csr"), indices=len(distance))
     # Cells that are not free have no edges.
-    return np.asarray(efe.DRIFT_PER_METRE * np.minimum(distance, found[:-1]))
+    return np.asarray(efe.DRIFT_PER_METRE * np.minimum(distance, path_lengths[:-1]))
 
 
 def _coarse_grid(grid: Grid) -> Grid:

@@ -21,10 +21,10 @@ DAMAGED_FILE_ERRORS = (zipfile.BadZipFile, zlib.error, safetensors.SafetensorErr
 
 
 class Checkpoint:
-    """State of an unfinished training in a folder, from which a training with the same ``recipe`` can resume."""
+    """A folder with the state of an unfinished training, which a training with the same ``recipe`` can resume."""
 
     def __init__(self, folder: Path, recipe: dict[str, Any]) -> None:
-        """Removes the state of a training with another recipe; ``discarded`` is true if there was one."""
+        """Opens the folder. It is emptied if it is that of another recipe; ``discarded`` is true if that had begun."""
         self.folder, self.recipe = folder, json.loads(json.dumps(recipe))
         self.discarded = False
         if folder.exists() and self._read("recipe.json") != self.recipe:
@@ -33,7 +33,7 @@ class Checkpoint:
         folder.mkdir(parents=True, exist_ok=True)
         self._write("recipe.json", self.recipe)
 
-    def samples(self, name: str) -> TrainingData | None:
+    def load_samples(self, name: str) -> TrainingData | None:
         """Returns the stored samples, or None if there are none. Raises UserError if they cannot be read."""
         path = self.folder / f"{name}.npz"
         if not path.exists():
@@ -44,13 +44,13 @@ class Checkpoint:
                 raise ValueError(f"poses {poses.shape} and ranges {ranges.shape} do not fit")
             return TrainingData(poses, ranges)
 
-    def keep_samples(self, name: str, data: TrainingData) -> None:
+    def save_samples(self, name: str, data: TrainingData) -> None:
         """Stores samples for a later run."""
         partial = self.folder / f"{name}.partial.npz"
         np.savez(partial, poses=data.poses, ranges=data.ranges.astype(np.float32))
         partial.replace(self.folder / f"{name}.npz")
 
-    def save(self, trainer: Trainer) -> None:
+    def save_state(self, trainer: Trainer) -> None:
         """Stores the state of the training atomically."""
         state = trainer.state()
         tensors = {f"decoder.{name}": tensor.contiguous() for name, tensor in state["decoder"].items()}
@@ -62,7 +62,7 @@ class Checkpoint:
         safetensors.torch.save_file(tensors, partial, metadata=meta)
         partial.replace(self.folder / "state.safetensors")
 
-    def restore(self, trainer: Trainer) -> bool:
+    def restore_state(self, trainer: Trainer) -> bool:
         """Restores the stored state; returns False if there is none. Raises UserError if it cannot be read."""
         path = self.folder / "state.safetensors"
         if not path.exists():
@@ -103,7 +103,7 @@ class Checkpoint:
             raise UserError(
                 f"{path}: the unfinished training cannot be resumed ({' '.join(str(error).split())[:200]}); "
                 f"remove {self.folder} and train from the start"
-            ) from None
+            ) from error
 
     def finish(self) -> None:
         """Removes the folder, once the weights are written."""

@@ -289,7 +289,7 @@ class PreciseEstimator:
             odom,
             command,
             hypothesis.velocity,
-            hypothesis.drift_covariance,
+            hypothesis.slip_covariance,
         )
 
     def _predict_local_motion(self, period: float, odom: Array | None, command: Array | None) -> list[MotionCandidate]:
@@ -298,7 +298,7 @@ class PreciseEstimator:
             self.hypotheses[0],
             pose=self._local_pose,
             noise_covariance=np.zeros((3, 3)),
-            drift_covariance=np.zeros((3, 3)),
+            slip_covariance=np.zeros((3, 3)),
         )
         return self._predict_motion(last, period, odom, command)
 

@@ -52,7 +52,7 @@ class TrackedHypothesis:
     scan_surroundings: Array = field(default_factory=lambda: FIRST_SURROUNDINGS)  # (3,) at the present scan
     motion_cost: float = 0.0  # nats, of the motion since the last scan, see `motion_model.motion_cost`
     velocity: Array | None = None  # (3,) in base_link; None while unknown
-    drift_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))  # covariance of the pose with the drift
+    slip_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))  # as in `MotionCandidate`
     weight: float = 1.0
     # number of consecutive scans at which neither the map nor the local map showed the motion along some direction
     unobserved_scans: int = 0
@@ -191,8 +191,8 @@ def update_hypothesis(
 
     The scan's information reduces the noise covariance. The model's errors are alike from scan to scan, so their
     standard deviations are averaged instead of their variances, weighted by each scan's information. ``unobserved`` is
-    true if neither the scan nor the local map shows the motion along some direction. The drift is not estimated, but
-    its covariance with the pose shrinks.
+    true if neither the scan nor the local map shows the motion along some direction. The scale
+    errors of odometry are not estimated, but their covariance with the pose shrinks.
     """
     inverse = np.linalg.inv(fused.information)
     prior_information = fused.information - evidence.curvature[k]
@@ -215,7 +215,7 @@ def update_hypothesis(
         log_evidence=hypothesis.log_evidence,
         surroundings=hypothesis.surroundings,
         velocity=velocity,
-        drift_covariance=inverse @ prior_information @ fused.candidate.drift_covariance,
+        slip_covariance=inverse @ prior_information @ fused.candidate.slip_covariance,
         unobserved_scans=hypothesis.unobserved_scans + 1 if unobserved else 0,
     )
 

@@ -12,7 +12,7 @@ The evidence of the scan selects the candidate. So the scans of a standing robot
 moving robot does not lag.
 
 Slipping wheels lose a fraction of every motion, on each axis, so the errors of odometry are alike from scan to scan:
-their deviations add, not their variances. The fractions are therefore a state of the filter, here called drift. They
+their deviations add, not their variances. These scale errors of odometry are therefore part of the filter's state. They
 are not estimated, but their covariance with the pose is kept (Schmidt-Kalman filter). Scans that observe the pose
 reduce it.
 """
@@ -43,8 +43,8 @@ class MotionNoise:
     period: float = 1 / 15  # s between scans, used if they have no stamps
     acceleration: float = 1.0  # m/s²
     turn_acceleration: float = 3.0  # rad/s²
-    speed: float = 1.0  # m/s
-    turn: float = 2.0  # rad/s
+    speed: float = 1.0  # m/s, the full speed
+    turn: float = 2.0  # rad/s, the full turn rate
     turn_by_turn: float = 1e-3  # variance of odometry, rad² per radian turned (Thrun et al. 2005, table 5.6)
     turn_by_path: float = 5e-4  # rad² per metre travelled
     path_by_path: float = 1e-3  # m² per metre travelled
@@ -52,7 +52,7 @@ class MotionNoise:
     slip: float = 0.05  # scale error of odometry on each axis, the same for all motions (a guess)
     command_share: float = 0.2  # error of the commanded velocity, as a fraction of it
     standing: float = 1e-4  # m and rad per scan: motion of a robot that stands still
-    surprise: float = 0.02  # probability (a guess) that odometry is wrong, and that of any other motion
+    unexpected: float = 0.02  # probability (a guess) that odometry is wrong, and of a motion that nothing foretells
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,8 @@ class MotionCandidate:
     mean: Array  # (3,)
     covariance: Array  # (3, 3) in map
     probability: float
-    drift_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))  # with the drift, of unit variance
+    # (3, 3) of the pose with the scale errors of odometry, which are in units of their standard deviation
+    slip_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
     def squared_distance(self, pose: Array) -> float:
         """Squared Mahalanobis distance of ``pose`` (3,) from the mean."""
@@ -82,19 +83,19 @@ def predict_motion(
     odom: Array | None = None,
     command: Array | None = None,
     velocity: Array | None = None,
-    drift_covariance: Array | None = None,
+    slip_covariance: Array | None = None,
 ) -> list[MotionCandidate]:
     """Returns the candidates after ``period`` s, from the last posterior (3,), (3, 3); the last one is the widest.
 
-    ``drift_covariance`` (3, 3) is that of the posterior with the drift; 0 by default. ``odom`` (3,) is the motion since
-    then in base_link. ``command`` and ``velocity`` (3,) are in m/s, m/s, rad/s in base_link; a command takes precedence
+    ``slip_covariance`` (3, 3) is that of the posterior, 0 by default. ``odom`` (3,) is the motion since then in
+    base_link. ``command`` and ``velocity`` (3,) are in m/s, m/s, rad/s in base_link; a command takes precedence
     over the velocity.
     """
     full_speed = np.array([noise.speed, noise.speed, noise.turn]) * period
-    before = MotionCandidate(pose, covariance, 1.0, np.zeros((3, 3)) if drift_covariance is None else drift_covariance)
-    likely = 1 - noise.surprise
-    probability = likely if odom is None else likely * noise.surprise  # of the motions that odometry does not give
-    any_motion = noise.surprise
+    before = MotionCandidate(pose, covariance, 1.0, np.zeros((3, 3)) if slip_covariance is None else slip_covariance)
+    likely = 1 - noise.unexpected
+    probability = likely if odom is None else likely * noise.unexpected  # of the motions that odometry does not give
+    any_motion = noise.unexpected
     if command is not None or velocity is not None:
         probability /= 2
     elif odom is None:
@@ -114,7 +115,7 @@ def predict_motion(
         position = np.sqrt(noise.path_by_path * moved + noise.path_by_turn * turned) + noise.standing
         heading = np.sqrt(noise.turn_by_turn * turned + noise.turn_by_path * moved) + noise.standing
         by_odometry = _propagate(before, odom, np.array([position, position, heading]), likely**2)
-        found.append(_add_drift(by_odometry, noise.slip * odom, float(pose[2])))
+        found.append(_add_slip(by_odometry, noise.slip * odom, float(pose[2])))
     centre = np.zeros(3) if odom is None else odom
     found.append(_propagate(before, centre, full_speed + np.abs(centre), any_motion))  # any motion
     return found
@@ -131,13 +132,13 @@ def expected_motion(candidates: list[MotionCandidate]) -> MotionCandidate:
 def motion_cost(noise: MotionNoise, candidates: list[MotionCandidate], pose: Array, covariance: Array) -> float:
     """How much less probable a motion to ``pose`` (3,), known with ``covariance`` (3, 3), is than expected, in nats.
 
-    It is 0 within `MAX_MOTION_SIGMAS` of an expected motion, and rises with the distance from that. At most, it is the
-    cost of any possible motion (the widest candidate): the difference of the largest log densities of an expected
-    motion and of this candidate, and more if the robot is hardly capable of the motion.
+    It is 0 within `MAX_MOTION_SIGMAS` of an expected motion. Elsewhere, it is the smallest cost of a candidate: by how
+    much its largest log density is below that of an expected motion, plus (z² - `MAX_MOTION_SIGMAS`²) / 2, if that is
+    positive, with the Mahalanobis distance z of the pose from its mean.
     """
     widened = [replace(each, covariance=each.covariance + covariance) for each in candidates]
     peaks = np.array([np.log(each.probability) - 0.5 * np.linalg.slogdet(each.covariance)[1] for each in widened])
-    expected = min(peak for peak, each in zip(peaks, widened, strict=True) if each.probability > noise.surprise)
+    expected = min(peak for peak, each in zip(peaks, widened, strict=True) if each.probability > noise.unexpected)
     squares = np.array([each.squared_distance(pose) for each in widened])
     costs = np.maximum(0.0, expected - peaks) + 0.5 * np.maximum(0.0, squares - MAX_MOTION_SIGMAS**2)
     return float(costs.min())
@@ -166,15 +167,15 @@ def _velocity_variance(pose: Array, covariance: Array, period: float) -> Array:
 def _propagate(before: MotionCandidate, step: Array, deviation: Array, probability: float) -> MotionCandidate:
     by_pose, by_step = se2.compose_jacobians(before.mean, step)
     covariance = by_pose @ before.covariance @ by_pose.T + (by_step * deviation**2) @ by_step.T
-    return MotionCandidate(se2.compose(before.mean, step), covariance, probability, by_pose @ before.drift_covariance)
+    return MotionCandidate(se2.compose(before.mean, step), covariance, probability, by_pose @ before.slip_covariance)
 
 
-def _add_drift(candidate: MotionCandidate, lost: Array, yaw: float) -> MotionCandidate:
-    """Adds the drift of one period: the motion that slipping may have ``lost`` (3,) in base_link at the heading."""
+def _add_slip(candidate: MotionCandidate, lost: Array, yaw: float) -> MotionCandidate:
+    """Adds the motion (3,) in base_link that slipping may have ``lost``, one standard deviation, at heading ``yaw``."""
     growth = se2.rotation(yaw) * lost
-    cross = growth @ candidate.drift_covariance.T
+    cross = growth @ candidate.slip_covariance.T
     covariance = candidate.covariance + cross + cross.T + growth @ growth.T
-    return replace(candidate, covariance=covariance, drift_covariance=candidate.drift_covariance + growth)
+    return replace(candidate, covariance=covariance, slip_covariance=candidate.slip_covariance + growth)
 
 
 def widen_unobserved(
@@ -207,13 +208,13 @@ def limit_covariance(candidate: MotionCandidate, unknown: Array) -> MotionCandid
         return candidate
     scale = 1 / np.maximum(excess, 1.0)
     covariance = candidate.covariance * np.outer(scale, scale)
-    return replace(candidate, covariance=covariance, drift_covariance=candidate.drift_covariance * scale[:, None])
+    return replace(candidate, covariance=covariance, slip_covariance=candidate.slip_covariance * scale[:, None])
 
 
 def reachable_poses(noise: MotionNoise, pose: Array, period: float, basin: float) -> Array:
-    """Further starts (K, 3) of a descent without odometry: standing or driving forwards at full speed, and turning.
+    """Further starts (K, 3) of a descent without odometry: at 0, half and full speed forwards, with five turn rates.
 
-    Returns none if the robot cannot leave the basin of attraction of one descent, ``basin`` m or rad.
+    There are none if the robot cannot leave the basin of attraction of one descent, ``basin`` m or rad.
     """
     if noise.speed * period < basin and noise.turn * period < basin:
         return np.zeros((0, 3))
@@ -233,21 +234,20 @@ class FusedMotion:
     negative_log_evidence: float  # nats, with that of the candidate's prior probability; without the scan's constant
 
 
-def fuse(candidate: MotionCandidate, peak: Array, slope: Array, curvature: Array) -> FusedMotion:
+def fuse(candidate: MotionCandidate, pose: Array, xi: Array, curvature: Array) -> FusedMotion:
     """Updates a candidate by Laplace's approximation of the scan's likelihood.
 
-    The scan's -ln p is approximated by a parabola at ``peak`` (3,), with ``slope`` (3,) minus its gradient there and
-    ``curvature`` (3, 3) its Hessian.
+    The scan's -ln p is expanded to second order at ``pose`` (3,): ``xi`` (3,), per m and rad, is minus its gradient
+    there, and ``curvature`` (3, 3) its Hessian.
 
-    Along a direction without curvature the parabola is a straight line, and with a wide prior the minimum may be
-    kilometres away. The step is therefore limited to a trust region: `MAX_STEP` beyond ``peak``, and `MAX_EXTRA_STEP`
-    beyond what the candidate's covariance makes plausible.
+    Along a direction without curvature this is a straight line, and with a wide prior the minimum may be kilometres
+    away. The step is therefore limited to a trust region: `MAX_STEP` beyond ``pose``, and `MAX_EXTRA_STEP` beyond what
+    the candidate's covariance makes plausible.
     """
     information = np.linalg.inv(candidate.covariance)
     total = curvature + information
-    off = se2.difference(peak, candidate.mean)
-    # Minus the gradient of the parabola at the candidate's mean.
-    pull = slope + curvature @ off
+    off = se2.difference(pose, candidate.mean)
+    pull = xi + curvature @ off  # minus the gradient at the candidate's mean
     step = np.linalg.solve(total, pull)
     regularised = curvature + 1e-9 * np.trace(curvature) * np.eye(3) + 1e-9 * np.eye(3)
     misfit = float(pull @ np.linalg.solve(regularised, pull) - pull @ step)

@@ -85,19 +85,22 @@ class TrackedDrive:
 
     poses: Array  # (N, 3) of all scans
     pieces: npt.NDArray[np.int_]  # (N,) of the drive, or `NO_PIECE`
-    keys: list[int]  # scans that are key scans
+    keys: list[int]  # indices of the key scans
     key_scans: KeyScanGraph
-    unmatched: int  # scans
+    unmatched: int  # number of scans that are suspect, or of which too little matches
 
 
 @dataclass(frozen=True)
 class ScanPose:
-    """The pose of one scan in the frame of the first, and how it was found."""
+    """The pose of one scan, and how it was found.
 
-    pose: Array  # (3,); of `Mapper.add`, in map
+    `FrontEnd.add` returns it in the frame of the first scan, `Mapper.add` in map.
+    """
+
+    pose: Array  # (3,)
     covariance: Array  # (3, 3) relative to the last key scans
-    # to the local map; also true for the first scan of a piece, whose pose is arbitrary. Of `Mapper.add`, only if the
-    # piece belongs to the map
+    # Whether the scan matched the local map, or begins a piece, at an arbitrary pose. For `Mapper.add`, the piece must
+    # also be connected to the map.
     matched: bool
     piece: int = 0  # of the drive, or `NO_PIECE` for a suspect scan
     linked: bool = False  # whether this scan begins a piece with a link to the one before
@@ -136,12 +139,16 @@ class FrontEnd:
         self._odom: Array | None = None  # (3,) of the last scan
         self._velocity: Array | None = None  # (3,) base_link
         self._scale = np.ones(3)  # of the deviations of the motion, learned
-        self._since_key = np.zeros((3, 3))  # covariance of the motion since the last key scan, by the motion model
+        self._covariance_since_key = np.zeros((3, 3))  # of the motion since the last key scan, by the motion model
         self._suspect_scans = 0  # in a row until now
         self._recent_contradiction = 0.0  # recent maximum of the share of contradictions, see `FADING_SCANS`
 
     def add(self, stamp: float, ranges: Array, odom: Array | None = None) -> ScanPose:
-        """Registers a scan ``ranges`` (B,) m at ``stamp`` s, later than the one before, with or without odometry."""
+        """Registers a scan and returns its pose in the frame of the first scan.
+
+        ``ranges`` (B,) are in m, +inf without a return and -inf if not measured. ``stamp`` in s must be larger than
+        that of the scan before. ``odom`` (3,) is the pose of base_link in odom, or None if it is unknown.
+        """
         period = stamp - self.stamps[-1] if self.stamps else 0.0
         motion, deviation = self._predict_motion(period, odom)
         scan = self._correct(ranges, motion, period)
@@ -151,12 +158,12 @@ class FrontEnd:
             return self._begin_piece(np.zeros(3), scan)
         prior, covariance = self._prior(motion, deviation)
         shows_first_surfaces = len(self._local.elements) < MIN_CORRESPONDENCES <= len(scan.elements)
-        if shows_first_surfaces and self.is_empty:
+        if shows_first_surfaces and self.shows_too_little:
             self._remove_key_scans()
             return self._begin_piece(prior.mean, scan)
         if shows_first_surfaces and self._odom is None:
             return self._begin_piece(self.poses[-1], scan)  # so far there was nothing that a scan could match
-        self._since_key = self._since_key + PRIOR_INFLATION**2 * covariance
+        self._covariance_since_key = self._covariance_since_key + PRIOR_INFLATION**2 * covariance
         found = self._register(scan, prior, period)
         contradiction = self._contradiction(scan, found, prior)
         reachable_from = [self.poses[-1], prior.mean] if used_odometry else [self.poses[-1]]
@@ -176,8 +183,8 @@ class FrontEnd:
         return self._add_unmatched(scan, prior.mean, is_key=shows_first_surfaces)
 
     @property
-    def is_empty(self) -> bool:
-        """Whether the only key scan shows too little for others to match; the first that shows enough replaces it."""
+    def shows_too_little(self) -> bool:
+        """Whether there is one key scan, on which too little is seen for others to match; another will replace it."""
         return len(self.keys) == 1 and len(self._elements[0]) < MIN_CORRESPONDENCES
 
     def key_scans(self) -> KeyScanGraph:
@@ -186,7 +193,7 @@ class FrontEnd:
         pieces = np.array(self._key_pieces)
         return KeyScanGraph(poses, self._elements.copy(), self._ranges.copy(), self._links.copy(), pieces)
 
-    def track(self) -> TrackedDrive:
+    def tracked_drive(self) -> TrackedDrive:
         """Returns the drive so far."""
         return TrackedDrive(
             np.array(self.poses), np.array(self.pieces), self.keys.copy(), self.key_scans(), self.unmatched
@@ -246,8 +253,9 @@ class FrontEnd:
     ) -> bool:
         """Whether a registration implies that the robot was kidnapped, or may match by chance.
 
-        It was kidnapped if it is farther from all poses ``reachable_from`` (3,) than it can drive in ``period`` s: the
-        last pose and, with odometry, the one that it predicts: after a pause it reports the motion of several scans.
+        The robot was kidnapped if it cannot have driven there within ``period`` s from any pose in ``reachable_from``.
+        These are the last pose and, with odometry, the pose that odometry predicts: after a pause, odometry reports the
+        motion of several scans at once.
         """
         pose = prior.mean if found is None else found.pose
         if all((np.abs(se2.between(each, pose)) > MAX_VELOCITY * period).any() for each in reachable_from):
@@ -294,7 +302,7 @@ class FrontEnd:
 
         It is a key scan if ``is_key``, or if the robot has moved far enough.
         """
-        scan_pose = ScanPose(pose, self._since_key, matched=False, piece=self._key_pieces[-1])
+        scan_pose = ScanPose(pose, self._covariance_since_key, matched=False, piece=self._key_pieces[-1])
         self._append(scan_pose)
         # A scan that sees something new is a key scan sooner, but not this one: its pose is only predicted.
         if is_key or self._is_key_due(scan, early=False):
@@ -306,7 +314,7 @@ class FrontEnd:
         self._suspect_scans += 1
         if self._suspect_scans >= MAX_SUSPECT_SCANS and len(scan.elements) >= MIN_CORRESPONDENCES:
             return self._begin_piece(pose, scan)
-        scan_pose = ScanPose(pose, self._since_key, matched=False, piece=NO_PIECE)
+        scan_pose = ScanPose(pose, self._covariance_since_key, matched=False, piece=NO_PIECE)
         self._append(scan_pose)
         return scan_pose
 
@@ -338,7 +346,7 @@ class FrontEnd:
     def _add_linked_key(self, scan: _Scan, information: Array) -> None:
         """Makes the last scan, registered with an ``information`` (3, 3), a key scan with a link to the last one."""
         last_key, pose = self.poses[self.keys[-1]], self.poses[-1]
-        self._links.append(_link(len(self.keys) - 1, last_key, pose, information, self._since_key))
+        self._links.append(_link(len(self.keys) - 1, last_key, pose, information, self._covariance_since_key))
         self._add_key(scan)
 
     def _add_key(self, scan: _Scan) -> None:
@@ -348,7 +356,7 @@ class FrontEnd:
         self._key_pieces.append(piece)
         self._elements.append(scan.elements)
         self._ranges.append(self._evenly_spaced(scan))
-        self._since_key = np.zeros((3, 3))
+        self._covariance_since_key = np.zeros((3, 3))
         recent = range(max(self._first_local, len(self.keys) - LOCAL_SCANS), len(self.keys))
         poses = np.array([self.poses[self.keys[k]] for k in recent])
         local = concatenate([self._elements[k].transformed(pose) for k, pose in zip(recent, poses, strict=True)])
@@ -371,7 +379,7 @@ def track_drive(drive: RawDrive, report: Callable[[float], None] = lambda _done:
         odom = None if drive.odom is None or not np.isfinite(drive.odom[k]).all() else drive.odom[k]
         front_end.add(float(stamp), ranges, odom)
         report(k / len(drive.ranges))
-    return front_end.track()
+    return front_end.tracked_drive()
 
 
 def _is_far(found: Registration | None, prior: PosePrior) -> bool:
@@ -394,10 +402,14 @@ def _learn_scale(scale: Array, deviation: Array, expected: Array, found: Registr
     return np.asarray(scale * np.sqrt(1 + (np.minimum(squared, MAX_LEARNED_SIGMAS**2) - 1) / LEARNING_SCANS))
 
 
-def _link(number: int, first: Array, second: Array, information: Array, motion: Array) -> PoseLink:
-    """The link between two successive key scans; ``information`` and ``motion`` are in the frame of the track."""
+def _link(number: int, first: Array, second: Array, information: Array, motion_covariance: Array) -> PoseLink:
+    """The link from key scan ``number`` to the next one, from two measurements of the motion between them.
+
+    These are a registration, with its ``information`` (3, 3), and the motion model, with its covariance (3, 3), both in
+    the frame of the front end.
+    """
     turn = se2.rotation(-float(first[2]))
-    noise = np.linalg.inv(turn @ information @ turn.T + 1e-6 * np.eye(3))
-    by_registration = np.linalg.inv(noise + np.diag(REGISTRATION_DEVIATION**2))
-    by_motion = np.linalg.inv(turn @ motion @ turn.T)
-    return PoseLink(number, number + 1, se2.between(first, second), by_registration + by_motion)
+    registration_covariance = np.linalg.inv(turn @ information @ turn.T + 1e-6 * np.eye(3))
+    registration_information = np.linalg.inv(registration_covariance + np.diag(REGISTRATION_DEVIATION**2))
+    motion_information = np.linalg.inv(turn @ motion_covariance @ turn.T)
+    return PoseLink(number, number + 1, se2.between(first, second), registration_information + motion_information)

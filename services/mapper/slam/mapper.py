@@ -61,7 +61,7 @@ class Mapper:
 
         A first key scan that shows too little does not count: another one will replace it.
         """
-        if self._front_end.is_empty:
+        if self._front_end.shows_too_little:
             return False
         return self.map is None or len(self.map.poses) < len(self._front_end.keys)
 
@@ -98,11 +98,11 @@ class Mapper:
 
     def trajectory(self) -> tuple[Array, Array]:
         """Stamps (N,) in s and poses (N, 3) in map of all scans that are connected to the map."""
-        track = self._front_end.track()
-        known = np.isin(track.key_scans.pieces, list(self._pieces))
-        poses = np.where(known[:, None], se2.compose(self._origin, track.key_scans.poses), np.nan)
+        drive = self._front_end.tracked_drive()
+        known = np.isin(drive.key_scans.pieces, list(self._pieces))
+        poses = np.where(known[:, None], se2.compose(self._origin, drive.key_scans.poses), np.nan)
         if self.map is not None:
             poses[: len(self.map.poses)] = self.map.poses
-        poses = poses_of_all_scans(track, poses)
+        poses = poses_of_all_scans(drive, poses)
         placed = np.isfinite(poses[:, 0])
         return np.array(self._front_end.stamps)[placed], poses[placed]

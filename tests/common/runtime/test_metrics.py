@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 import urllib.request
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
 from common.messages.definitions import Belief, Health, Pose, Scan, Status, TopicHealth
 from common.messages.topics import BELIEF, CMD_VEL, GOAL, HEALTH, SCAN, STATUS
-from common.runtime.metrics import METRICS, ServiceMetrics
+from common.runtime.metrics import METRICS, LoopCounts, ServiceMetrics
 from common.runtime.metrics_server import split_address
 from tests.conftest import ROOT, WAIT_TIMEOUT_S
 
@@ -135,8 +136,8 @@ def test_metrics_of_the_router(processes, free_port):
 
 
 def metrics_of(service: str, **counts) -> ServiceMetrics:
-    defaults = {"published": {}, "undecodable": {}, "failed": 0, "events": {}, "began": time.monotonic()}
-    return ServiceMetrics("robot", service, Inbox(), lambda: {**defaults, **counts})
+    none = LoopCounts(published={}, undecodable={}, failed=0, events={}, began=time.monotonic())
+    return ServiceMetrics("robot", service, Inbox(), lambda: replace(none, **counts))
 
 
 def belief(state: str, energy: float) -> Belief:

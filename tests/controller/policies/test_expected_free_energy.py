@@ -202,7 +202,7 @@ def test_information_of_scans():
     observed = scan(0, [4.0, 3.0, 0.0], hall)
     found = information_of(hall, observed)
     pose = np.array([4.25, 3.25, 0.0])  # the centre of a cell
-    (cell,) = found.grid.cell_of(pose[None, :2])
+    (cell,) = found.information_grid.cell_of(pose[None, :2])
     angles = np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS
     differences = [
         hall.ray_distances((pose + e)[None], angles)[0] - hall.ray_distances((pose - e)[None], angles)[0]
@@ -212,7 +212,7 @@ def test_information_of_scans():
     incidence = 1 / np.hypot(J[:, 0], J[:, 1])
     variance = 0.02**2 + (MAP_ERROR_M / incidence) ** 2
     exact = len(observed.ranges) / DIRECTIONS * np.einsum("b,bi,bj->ij", 1 / variance, J, J)
-    np.testing.assert_allclose(found.matrix[cell], exact, rtol=0.15, atol=0.03 * exact.max())
+    np.testing.assert_allclose(found.information[cell], exact, rtol=0.15, atol=0.03 * exact.max())
     short = information_of(hall, observed.model_copy(update={"range_max": 1.0}))
     assert short.matrix[cell] == pytest.approx(0)
     block = information_of(room(8, 6, box(4, 3, 1.2, 1.2)), observed)  # no scan is possible from the cells inside
@@ -255,5 +255,7 @@ def test_out_of_sight():
     """In a hall with a range of 2 m, a metre costs more the farther the walls are out of sight; near them, little."""
     hall = room(12, 9, *(box(x, y, 0.5, 0.6, "") for x in range(1, 12, 2) for y in (0.3, 8.7)))
     short = information_of(hall, scan(0, [6.0, 1.5, 0.0], hall).model_copy(update={"range_max": 2.0}))
-    near, edge, middle = short.free_grid.interpolate(short.ambiguity, np.array([[6.0, 1.3], [6.0, 3.4], [6.0, 4.5]]))
+    near, edge, middle = short.ambiguity_grid.interpolate(
+        short.ambiguity, np.array([[6.0, 1.3], [6.0, 3.4], [6.0, 4.5]])
+    )
     assert near < 0.01 < edge < middle

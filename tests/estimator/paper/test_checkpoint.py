@@ -28,20 +28,20 @@ def folder(tmp_path):
     """The folder of an interrupted training."""
     checkpoint = Checkpoint(tmp_path / "unfinished", RECIPE)
     assert not checkpoint.discarded
-    checkpoint.keep_samples("train", DATA)
+    checkpoint.save_samples("train", DATA)
     one = trainer()
-    one.run(lambda progress: checkpoint.save(one) if progress.epoch == 2 else None)
+    one.run(lambda progress: checkpoint.save_state(one) if progress.epoch == 2 else None)
     return checkpoint.folder
 
 
 def test_resumed(folder):
     again = Checkpoint(folder, RECIPE)
     assert not again.discarded
-    kept = again.samples("train")
+    kept = again.load_samples("train")
     assert np.array_equal(kept.poses, DATA.poses)
     assert kept.ranges == pytest.approx(DATA.ranges, abs=1e-5)
     whole, rest = trainer(), trainer()
-    assert again.restore(rest)
+    assert again.restore_state(rest)
     assert rest.progress.epoch == 2
     for a, b in zip(whole.run().decoder.parameters(), rest.run().decoder.parameters(), strict=True):
         assert torch.equal(a, b)
@@ -50,8 +50,8 @@ def test_resumed(folder):
 def test_other_recipe(folder):
     other = Checkpoint(folder, {**RECIPE, "epochs": 4})
     assert other.discarded
-    assert other.samples("train") is None
-    assert not other.restore(trainer())
+    assert other.load_samples("train") is None
+    assert not other.restore_state(trainer())
     assert not Checkpoint(folder, RECIPE).discarded  # nothing was in it yet
 
 
@@ -85,7 +85,11 @@ def test_damaged_file(folder, name, damage):
     path = folder / name
     path.write_bytes(damage(path.read_bytes()))
     checkpoint = Checkpoint(folder, RECIPE)
-    read = partial(checkpoint.samples, "train") if name == "train.npz" else partial(checkpoint.restore, trainer())
+    read = (
+        partial(checkpoint.load_samples, "train")
+        if name == "train.npz"
+        else partial(checkpoint.restore_state, trainer())
+    )
     with pytest.raises(UserError, match="cannot be resumed") as error:
         read()
     assert str(path) in str(error.value)

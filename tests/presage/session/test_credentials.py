@@ -52,6 +52,8 @@ def test_overwriting(tmp_path):
     secure.add(tmp_path, "controller", "controller", force=True)
     assert (tmp_path / "controller" / "own.key").read_bytes() != before
     secure.add(tmp_path, "operator", "anna")
+    with pytest.raises(UserError, match="has the role 'operator'"):
+        secure.add(tmp_path, "replay", "anna", force=True)
     secure.init(tmp_path, force=True)
     assert not (tmp_path / "anna").exists()
     (tmp_path / "home").mkdir()
@@ -96,10 +98,23 @@ def test_secure_commands(tmp_path):
     assert added.exit_code == 0, added.output
     shown = run.invoke(app, ["secure", "show", folder])
     assert shown.exit_code == 1, shown.output  # guest's ends soon
-    assert "soon to expire: guest" in shown.output
+    assert "expiring within 30 days: guest" in shown.output
     assert "controller-two" in shown.output
     assert run.invoke(app, ["secure", "remove", folder, "guest"]).exit_code == 0
     assert run.invoke(app, ["secure", "show", folder]).exit_code == 0
     config = json.loads(run.invoke(app, ["secure", "show", folder, "--zenoh", "observer"]).output)
     assert config["mode"] == "client"
     assert config["transport"]["link"]["tls"]["enable_mtls"] is True
+
+
+def test_renewed_credentials_keep_their_limits(tmp_path):
+    secure.init(tmp_path, hosts=["robot.lan", "10.0.0.1"], robots=["one"])
+    password = (tmp_path / "controller-one" / "password").read_text()
+    renewed = secure.add(tmp_path, "controller", "controller-one", force=True)
+    assert renewed.robots == ("one",)
+    assert (tmp_path / "controller-one" / "password").read_text() != password
+    assert secure.add(tmp_path, "controller", "controller-one", ["two"], force=True).robots == ("two",)
+    secure.add(tmp_path, "router", "router", force=True)
+    names = certificate(tmp_path, "router").extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert names.get_values_for_type(x509.DNSName) == ["robot.lan"]
+    assert [str(address) for address in names.get_values_for_type(x509.IPAddress)] == ["10.0.0.1"]
