@@ -424,10 +424,15 @@ def _load(name: str, folder: Path, *, is_floor: bool = False) -> World:
         raise UserError(f"world {path}: not valid YAML ({' '.join(str(error).split())})") from None
 
 
+def world_name(path: Path) -> str:
+    """Name of the world in a file that does not state it."""
+    return re.sub(r"[^\w.-]+", "-", path.resolve().stem)
+
+
 def _world_of(path: Path, data: Any, *, is_floor: bool) -> World:
     """The world in the ``data`` of a file; raises UserError or ValidationError if they are invalid."""
     if isinstance(data, dict):
-        data.setdefault("name", re.sub(r"[^\w.-]+", "-", path.resolve().stem))
+        data.setdefault("name", world_name(path))
     if not building.is_building(data):
         return World.model_validate(ros_map.read_map(path, data) if ros_map.is_map(data) else data)
     if is_floor:

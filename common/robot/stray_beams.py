@@ -21,4 +21,6 @@ def has_neighbours(ends: Array) -> npt.NDArray[np.bool_]:
     cell = np.floor(ends / CELL_M).astype(np.int64)
     cell -= cell.min(axis=0)
     index = cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1]
-    return np.asarray(np.bincount(index)[index] >= MIN_ENDS_PER_CELL)
+    # Counted without an array of all cells, which would be huge for ranges that are not in m.
+    _, of_end, counts = np.unique(index, return_inverse=True, return_counts=True)
+    return np.asarray(counts[of_end] >= MIN_ENDS_PER_CELL)

@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from common.errors import UserError
 from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.world import load_world
@@ -69,7 +70,10 @@ def run(job: DistortionJob) -> list[dict[str, Any]]:
                 estimates.append(estimator.update(observation).pose)
                 update_ms[kind].append((time.process_time() - began) * 1e3)
             errors[kind].append(full_speed_errors(np.array(estimates), path, scene.scanner.rate))
-    rows = [_row(job, kind, np.concatenate(errors[kind])) for kind in SCANS]
+    joined = {kind: np.concatenate(errors[kind]) for kind in SCANS}
+    if not len(joined[SCANS[0]]):
+        raise UserError(f"no scan at full speed in drives of {job.seconds:g} s: give more --seconds")
+    rows = [_row(job, kind, joined[kind]) for kind in SCANS]
     for row in rows:
         row["update_ms_median"] = float(np.median(update_ms[row["scans"]]))
         row["over_instantaneous"] = row["position_error_rms_m"] / rows[0]["position_error_rms_m"]

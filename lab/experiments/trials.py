@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,6 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from common.errors import UserError
+from common.geometry.world import load_world
 from common.versions import checkout_state
 from lab.workers import pool
 
@@ -82,14 +84,38 @@ def _run_in_parallel(
         ) from None
 
 
+def run_key(jobs: Sequence[Any]) -> str:
+    """A digest of all that the results of ``jobs`` depend on: their values, the files these name, and the checkout."""
+    plain = [asdict(job) for job in jobs]
+    files = {name: _digest(Path(name)) for name in set(_texts(plain)) if name and Path(name).is_file()}
+    text = json.dumps([checkout_state(), plain, files], sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _texts(value: Any) -> Iterator[str]:
+    """All texts and paths in nested dictionaries, lists and tuples."""
+    if isinstance(value, dict | list | tuple):
+        for each in value.values() if isinstance(value, dict) else value:
+            yield from _texts(each)
+    elif isinstance(value, str | Path):
+        yield str(value)
+
+
+def _digest(path: Path) -> str:
+    """A digest of a file, or for a map of the world that it and its images describe."""
+    if path.suffix == ".yaml":
+        with suppress(UserError):  # other settings
+            return hashlib.sha256(load_world(str(path)).model_dump_json().encode()).hexdigest()
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
 class TrialStore:
-    """A file with the results of an unfinished run, one per line, valid for the same jobs and `checkout_state` only."""
+    """A file with the results of an unfinished run, one per line, valid for the same `run_key` only."""
 
     def __init__(self, path: Path, jobs: Sequence[Any]) -> None:
         """Stores the path and the jobs' key; the file is neither read nor written yet."""
         self.path = path
-        plain = json.dumps([checkout_state(), [asdict(job) for job in jobs]], sort_keys=True, default=str)
-        self.key = hashlib.sha256(plain.encode()).hexdigest()
+        self.key = run_key(jobs)
 
     def read(self) -> dict[int, TrialResult]:
         """Results by index. Ignores an incomplete last line; deletes a file of other jobs or another checkout."""

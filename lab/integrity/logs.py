@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lab.experiments.trials import run_key
 from lab.integrity.cases import IntegrityTrial
 from lab.integrity.maps import grid_of
 from lab.real_logs.drive import START_COVARIANCE, drive_at
@@ -81,7 +82,7 @@ def log_trial(case: LogCase) -> IntegrityTrial:
 
 def log_field_file(folder: Path, case: LogCase) -> Path:
     """The weights learned from the other half, learned now unless the folder has them."""
-    path = weights.path_of(folder, case.drive_name)
+    path = weights.path_of(folder, f"{case.drive_name}-{run_key([case])[:8]}")
     if not path.exists():
         start = time.monotonic()
         options = TrainDriveOptions(Path(case.log), share=0.5, recipe=Recipe(resolution=0.05))

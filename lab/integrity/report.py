@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -43,7 +44,7 @@ def bench_integrity(plan: IntegrityPlan, out: Path, workers: int, console: Conso
 
 
 def _check(plan: IntegrityPlan) -> None:
-    """Raises UserError for unknown names."""
+    """Raises UserError for unknown or repeated names, or if there is nothing to measure."""
     for kind, given, known in (
         ("case", plan.cases, CASES),
         ("estimator", plan.estimators, ESTIMATORS),
@@ -51,6 +52,12 @@ def _check(plan: IntegrityPlan) -> None:
     ):
         if unknown := [name for name in given if name not in known]:
             raise UserError(f"no {kind} {unknown[0]!r} in this benchmark: choose from {', '.join(known)}")
+    logs = [log.name for log in plan.logs]
+    for kind, names in (("case", plan.cases), ("estimator", plan.estimators), ("log of the name", logs)):
+        if repeated := [name for name, count in Counter(names).items() if count > 1]:
+            raise UserError(f"the {kind} {repeated[0]!r} is given twice: its scans would count twice")
+    if not plan.sources() or not plan.estimators:
+        raise UserError("nothing to measure: give at least one world or log, one case and one estimator")
 
 
 def table(scores: dict[str, dict[str, Any]]) -> str:

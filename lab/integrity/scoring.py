@@ -115,17 +115,21 @@ def score_trial(scans: Estimates, rate: float, kidnappings: Sequence[int], *, se
 def score_case(trials: Sequence[dict[str, Any]], scans: Estimates) -> dict[str, Any]:
     """Scores of a case, from those of its trials and from all their scans, with 95 % intervals.
 
-    Scans of one building depend on each other, so the intervals of shares of scans are by building.
+    Scans of one building depend on each other, so the intervals of shares of scans are by building. Shares of drives
+    and of kidnappings have one only if each is in a building of its own.
     """
     longest = [trial["longest_wrong_s"] for trial in trials]
     distance = np.hypot(scans.error[:, 0], scans.error[:, 1])[scans.correct]
+    buildings, kidnapped = len({trial["seed"] for trial in trials}), sum(trial["kidnapped"] for trial in trials)
     return {
         "trials": len(trials),
         "scans": sum(trial["scans"] for trial in trials),
         "tracking": share_of_scans(trials, "tracking", "scans"),
         "wrong": share_of_scans(trials, "wrong", "tracking"),
         "longest_wrong_s": max(longest),
-        "trials_wrong": share(sum(trial["wrong"] > 0 for trial in trials), len(trials)),
+        "trials_wrong": share(
+            sum(trial["wrong"] > 0 for trial in trials), len(trials), independent=len(trials) == buildings
+        ),
         "trials_wrong_longer": sum(value > MAX_WRONG_S for value in longest),
         "correct": share_of_scans(trials, "correct", "in_map"),
         "nees_xy": _mean(scans.nees[scans.tracking, 0]),
@@ -133,7 +137,7 @@ def score_case(trials: Sequence[dict[str, Any]], scans: Estimates) -> dict[str, 
         "nees": _mean(scans.nees[scans.tracking, 1]),
         "error_median_m": _median(distance),
         "error_rms_m": float(np.sqrt(np.mean(distance**2))) if len(distance) else None,
-        "recovered": share(sum(trial["recovered"] for trial in trials), sum(trial["kidnapped"] for trial in trials)),
+        "recovered": share(sum(trial["recovered"] for trial in trials), kidnapped, independent=kidnapped == buildings),
         "beyond_protection": [_mean((axis > 1)[np.isfinite(axis)]) for axis in scans.excess.T],
         "reliability": reliability(scans.probability, scans.correct),
         "update_ms": [1e3 * float(np.quantile(scans.update_s, q)) for q in (0.5, 0.95, 1.0)],
@@ -163,9 +167,10 @@ def _ratio_of_sums(counts: Array) -> float:
     return float(count / of) if of else 0.0
 
 
-def share(count: int, of: int) -> dict[str, Any] | None:
-    """``count``, ``of`` and Wilson's interval, for independent events; None if ``of`` is 0."""
-    return {"count": count, "of": of, "interval_95": wilson_interval(count, of)} if of else None
+def share(count: int, of: int, *, independent: bool = True) -> dict[str, Any] | None:
+    """``count``, ``of`` and, for independent events, Wilson's 95 % interval; None if ``of`` is 0."""
+    interval = wilson_interval(count, of) if of and independent else None
+    return {"count": count, "of": of, "interval_95": interval} if of else None
 
 
 def reliability(probability: Array, correct: Mask) -> list[dict[str, Any]]:

@@ -137,18 +137,20 @@ def _clearance_to_people(trace: RunTrace, robot: Robot) -> float | None:
 def _localisation(trace: RunTrace) -> dict[str, Any]:
     """Localisation errors from the first belief in state `tracking` on, its time, and for how long tracking was lost.
 
-    `claimed_error_max_m` covers only beliefs in state `tracking`; `longest_untracked_s` also the time before the first.
+    `claimed_error_max_m` covers only beliefs in state `tracking`. `longest_untracked_s` covers the whole drive; without
+    a belief in this state, the other values are None.
     """
     count = min(len(trace.truths), len(trace.beliefs))  # an aborted run may lack the last belief
     tracking = np.array([belief.state == "tracking" for belief in trace.beliefs[:count]], bool)
+    longest_untracked_s = _longest_untracked(trace, tracking)
     if not tracking.any():
-        return dict.fromkeys(LOCALISATION)
+        return dict.fromkeys(LOCALISATION) | {"longest_untracked_s": longest_untracked_s}
     first = int(np.argmax(tracking))
     error = np.hypot(*(trace.believed()[first:count] - trace.path()[first:count])[:, :2].T)
     return {
         "tracking_s": trace.truths[first].stamp_ns * 1e-9,
         "untracked_s": float(np.mean(~tracking[first:])) * (_seconds(trace) - trace.truths[first].stamp_ns * 1e-9),
-        "longest_untracked_s": _longest_untracked(trace, tracking),
+        "longest_untracked_s": longest_untracked_s,
         "error_median_m": float(np.median(error)),
         "error_max_m": float(error.max()),
         "claimed_error_max_m": float(error[tracking[first:]].max()),

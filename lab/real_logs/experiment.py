@@ -20,9 +20,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from common.errors import UserError
 from common.geometry.world import load_world
-from common.versions import checkout_state
 from lab.experiments import results
-from lab.experiments.trials import run_trials
+from lab.experiments.trials import run_key, run_trials
 from lab.real_logs.drive import (
     GLOBAL,
     KIDNAPPED,
@@ -156,12 +155,12 @@ def _train_and_tune(
 ) -> tuple[Path, weights.FieldCard, TunedSettings]:
     """The model trained on the training half, and the settings of the particle filter tuned on it.
 
-    An interrupted run's model and settings are reused if the command and all files of the checkout are the same.
+    An interrupted run's model and settings are reused if the command, its files and the checkout are the same.
     """
     world = load_world(job.map)
     path = out / f".{job.result}" / "model.safetensors"
     kept = path.with_name("tuned.json")
-    key = json.dumps([checkout_state(), asdict(job)], sort_keys=True, default=str)
+    key = run_key([job])
     with suppress(OSError, ValueError, KeyError, TypeError, UserError):  # no usable files of an interrupted run
         before = json.loads(kept.read_text(encoding="utf-8"))
         if before["key"] == key:

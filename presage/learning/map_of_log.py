@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,14 +16,14 @@ from common.geometry.rasterisation import rasterise
 from common.geometry.ros_map_writer import write_grid
 from common.geometry.se2 import Array
 from common.geometry.tum import write_tum
-from common.geometry.world import World, load_world
+from common.geometry.world import World, load_world, world_name
 from presage.learning.map_picture import draw_map
 from presage.learning.placement import place_drive
 from presage.learning.pose_refinement import refine_poses
 from presage.learning.train_drive import TrainDriveOptions, drive_of, enough_scans, split, train_on_drive, usable_scans
 from presage.logs.log import Reading
 from presage.logs.scan_files import Scans, read_scans
-from presage.terminal.output import make_folder
+from presage.terminal.output import output_folder
 from presage.terminal.progress import working
 from services.estimator.precise.learning import drive_learning, weights
 from services.mapper.slam.drive import Laser, RawDrive
@@ -50,9 +51,16 @@ class MapOptions:
 def map_command(options: MapOptions, console: Console, progress: Console) -> Path:
     """Writes the map and its image, and returns its path; raises UserError if that fails."""
     _check(options)
+    with ExitStack() as folders:
+        folders.enter_context(output_folder(options.out.parent))
+        if options.models is not None:
+            folders.enter_context(output_folder(options.models, "--models"))
+        return _write_map(options, console, progress)
+
+
+def _write_map(options: MapOptions, console: Console, progress: Console) -> Path:
     rough = load_world(options.refine) if options.refine else None
     former = None if rough is None else _model_of(rough, options)
-    make_folder(options.out.parent)
     scans = read_scans(options.log, reading=options.reading)
     scans.print_notes(progress)
     stamps = scans.stamps
@@ -108,7 +116,7 @@ def _check(options: MapOptions) -> None:
         raise UserError("--refine computes the poses from the scans: leave out --poses reference")
     files = [options.out.with_suffix(suffix) for suffix in (".yaml", ".pgm", ".tum", ".png")]
     if options.models is not None:
-        files.append(weights.path_of(options.models, options.out.stem))
+        files.append(weights.path_of(options.models, world_name(options.out)))
     if existing := [str(path) for path in files if path.exists()]:
         raise UserError(f"exists already: {', '.join(existing)}; choose another name with --out, or delete these files")
 

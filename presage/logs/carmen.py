@@ -149,17 +149,16 @@ def _range_max(first_pass: _FirstPass, name: str, reading: Reading, notes: list[
     longest = max(float(np.max(line.ranges)) for line in lines)
     near_codes = LMS_NEAR_CODES[0] <= longest <= LMS_NEAR_CODES[1]
     if (header := lines[0].beams) is not None:
-        near, far = (low <= header.range_max <= high for low, high in LMS_STATED_RANGES)
-        if not near and not far:
-            return header.range_max
-        range_max, stated = LMS_NEAR_RANGE_MAX if near or near_codes else LMS_FAR_RANGE_MAX, header.range_max
+        stated = header.range_max
     else:
-        param = first_pass.params.get(f"robot_{_side(name)}_laser_max", "")
         try:
-            stated = float(param)
+            stated = float(first_pass.params.get(f"robot_{_side(name)}_laser_max", ""))
         except ValueError:
             stated = 0.0
-        range_max = LMS_NEAR_RANGE_MAX if near_codes else stated if 0 < stated < np.inf else LMS_FAR_RANGE_MAX
+    near, far = (low <= stated <= high for low, high in LMS_STATED_RANGES)
+    # A PARAM line does not know the mode of an LMS.
+    of_lms = near or far or not 0 < stated < np.inf or (header is None and near_codes)
+    range_max = stated if not of_lms else LMS_NEAR_RANGE_MAX if near or near_codes else LMS_FAR_RANGE_MAX
     if range_max != stated:
         notes.append(
             f"assumed: ranges from {range_max:g} m on mean no return (change with range_max in section log of --config)"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,7 +20,6 @@ FIXED_TOLERANCE = 0.01  # m and rad; a frame that changes more moves against its
 class TransformHistory:
     """A frame in its parent over time."""
 
-    parent: str
     first: Transform
     track: PoseTrack = field(default_factory=PoseTrack)
     moves: bool = False
@@ -34,31 +34,30 @@ class FrameHistory:
     """The transforms of tf and tf_static over the whole log."""
 
     def __init__(self) -> None:
-        self._edges: dict[str, TransformHistory] = {}
+        # By child and parent. Some logs state a frame in two parents, such as two kinds of odometry.
+        self._edges: dict[str, dict[str, TransformHistory]] = {}
 
     def __contains__(self, frame: str) -> bool:
-        return frame in self._edges or any(edge.parent == frame for edge in self._edges.values())
+        return frame in self._edges or any(frame in parents for parents in self._edges.values())
 
     def add(self, parent: str, child: str, stamp_ns: int, transform: Transform) -> None:
-        """Adds the transform of ``child`` in ``parent`` at a time; a new parent replaces the earlier one."""
+        """Adds the transform of ``child`` in ``parent`` at a time."""
         parent, child = parent.lstrip("/"), child.lstrip("/")
         if child == parent:
             return
-        edge = self._edges.get(child)
-        if edge is None or edge.parent != parent:
-            edge = self._edges[child] = TransformHistory(parent, transform)
-        edge.add(stamp_ns, transform)
+        self._edges.setdefault(child, {}).setdefault(parent, TransformHistory(transform)).add(stamp_ns, transform)
 
     def chain(self, parent: str, child: str) -> list[TransformHistory] | None:
-        """The edges from ``parent`` down to ``child``; None if ``child`` is not a descendant of ``parent``."""
-        found: list[TransformHistory] = []
-        while child != parent:
-            edge = self._edges.get(child)
-            if edge is None or edge in found:
-                return None
-            found.insert(0, edge)
-            child = edge.parent
-        return found
+        """The shortest way from ``parent`` down to ``child``; None if ``child`` is not a descendant of ``parent``."""
+        chains: dict[str, list[TransformHistory]] = {child: []}  # from each ancestor down to the child
+        waiting = deque([child])
+        while waiting and parent not in chains:
+            frame = waiting.popleft()
+            for above, edge in self._edges.get(frame, {}).items():
+                if above not in chains:
+                    chains[above] = [edge, *chains[frame]]
+                    waiting.append(above)
+        return chains.get(parent)
 
     def at(self, chain: list[TransformHistory], stamp_ns: int) -> Array | None:
         """Planar pose (3,) of the last frame of a chain in its first; None if a transform is unknown at that time."""

@@ -72,7 +72,7 @@ def _check_arrays(path: Path, data: dict[str, Array], ranges: Array) -> None:
     for name, shape in shapes.items():
         if name in data and data[name].shape != shape:
             raise UserError(f"{path}: {name} has the shape {data[name].shape}; for these ranges it must be {shape}")
-        if name in data and name != "reference" and not np.isfinite(data[name]).all():
+        if name in data and name not in {"odom", "reference"} and not np.isfinite(data[name]).all():
             raise UserError(f"{path}: {name} has numbers that are not finite")
     if (span := float(np.ptp(data["angles"]))) > MAX_SPAN:
         raise UserError(f"{path}: angles cover {span:.4g} rad, more than one turn: are they in degrees?")
@@ -84,9 +84,11 @@ def _read_scans(
     ranges: Array, range_max: float, stamps: Array | None, odom: Array | None, reference: Array | None
 ) -> Iterator[LoggedScan]:
     for k, row in enumerate(ranges):
-        pose = None if reference is None or not np.isfinite(reference[k]).all() else reference[k]
         stamp = None if stamps is None else round(float(stamps[k]) * 1e9)
-        yield LoggedScan(stamp, normalise_driver_ranges(row, 0.0, range_max), None if odom is None else odom[k], pose)
+        pose, reference_pose = (
+            None if poses is None or not np.isfinite(poses[k]).all() else poses[k] for poses in (odom, reference)
+        )
+        yield LoggedScan(stamp, normalise_driver_ranges(row, 0.0, range_max), pose, reference_pose)
 
 
 def _load_arrays(path: Path) -> dict[str, Array]:

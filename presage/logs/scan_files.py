@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from rich.console import Console
 
 from common.errors import UserError
 from common.geometry.se2 import Array
-from common.messages.definitions import CmdVel, Goal, Odom, Scan, Stamped, Truth
+from common.messages.definitions import CmdVel, Goal, Odom, Scan, Truth
 from common.messages.topics import CMD_VEL, GOAL, ODOM, SCAN, TRUTH
 from common.robot.ranges import ranges_for_localisation
 from presage.laser_scan import LaserScan
@@ -179,22 +179,20 @@ def _read_recording(path: Path) -> Scans:
     recording = read_recording(path)
     world = recording.world()
     scans: list[Scan] = []
-    keys: list[tuple[int, int]] = []  # of each scan
-    odoms: dict[tuple[int, int], Array] = {}
-    truths: dict[tuple[int, int], Array] = {}
+    logged_ns: list[int] = []  # of each scan
+    odoms, truths = _PosesByStamp(), _PosesByStamp()
     commands, goals = [], []  # of each scan
     command = goal = unknown = np.full(3, np.nan)
-    key_of = _StampCounter()
-    for _, message, _ in entries(recording, robot_of(recording), SCAN, ODOM, TRUTH, CMD_VEL, GOAL):
+    for _, message, raw in entries(recording, robot_of(recording), SCAN, ODOM, TRUTH, CMD_VEL, GOAL):
         if isinstance(message, Scan) and (not scans or message.stamp_ns != scans[-1].stamp_ns):
             scans.append(message)
-            keys.append(key_of(message))
+            logged_ns.append(raw.logged_ns)
             commands.append(command)
             goals.append(goal)
         elif isinstance(message, Odom):
-            odoms[key_of(message)] = message.pose.array()
+            odoms.add(message, raw.logged_ns)
         elif isinstance(message, Truth):
-            truths[key_of(message)] = message.pose.array()
+            truths.add(message, raw.logged_ns)
         elif isinstance(message, CmdVel):
             command = message.twist.array()
         elif isinstance(message, Goal):
@@ -212,9 +210,9 @@ def _read_recording(path: Path) -> Scans:
         replace(ScannerGeometry.of_scan(first), mount_assumed=mount_assumed(recording)),
         np.array([ranges_for_localisation(s.ranges) for s in scans]),
         seconds([s.stamp_ns for s in scans]),
-        np.array([odoms.get(key, unknown) for key in keys]) if odoms else None,
+        odoms.of_scans(scans, logged_ns),
         None,
-        np.array([truths.get(key, unknown) for key in keys]) if truths else None,
+        truths.of_scans(scans, logged_ns),
         world.name if world is not None else None,
         recording.metadata.get("log", {}).get("reference") or RECORDED_TRUTH,
         commands=np.array(commands),
@@ -224,15 +222,26 @@ def _read_recording(path: Path) -> Scans:
     )
 
 
-class _StampCounter:
-    """Tells equal stamps of a simulation and of its restart apart: returns (number of the run, stamp in ns)."""
+class _PosesByStamp:
+    """Poses by the stamp of their message. After a restart of a simulation, the same stamps come again."""
 
     def __init__(self) -> None:
-        self._runs: Counter[type[Stamped]] = Counter()
-        self._last: dict[type[Stamped], int] = {}
+        self._poses: defaultdict[int, list[tuple[int, Array]]] = defaultdict(list)  # with the time of reception, ns
 
-    def __call__(self, message: Stamped) -> tuple[int, int]:
-        kind = type(message)
-        self._runs[kind] += message.stamp_ns < self._last.get(kind, 0)
-        self._last[kind] = message.stamp_ns
-        return self._runs[kind], message.stamp_ns
+    def add(self, message: Odom | Truth, logged_ns: int) -> None:
+        """Adds a message that was received at a time."""
+        self._poses[message.stamp_ns].append((logged_ns, message.pose.array()))
+
+    def of_scans(self, scans: list[Scan], logged_ns: list[int]) -> Array | None:
+        """For each scan the pose (N, 3) of the same stamp, of several the one received nearest in time; else NaN.
+
+        Returns None if there are no poses.
+        """
+        if not self._poses:
+            return None
+        found = np.full((len(scans), 3), np.nan)
+        for k, (scan, received_ns) in enumerate(zip(scans, logged_ns, strict=True)):
+            if poses := self._poses.get(scan.stamp_ns):
+                delays = [abs(pose_received_ns - received_ns) for pose_received_ns, _ in poses]
+                found[k] = poses[delays.index(min(delays))][1]
+        return found

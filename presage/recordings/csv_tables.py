@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Union, get_args, get_origin
+from typing import Any, TextIO, Union, get_args, get_origin
 
 import numpy as np
 from rich.console import Console
@@ -23,6 +23,7 @@ from presage.terminal.output import make_folder
 from services.recorder.reader import Recording
 
 README = "README.md"
+MAX_OPEN_FILES = 100  # an array of variable length has a file for each length, and a process may open about 1000
 TIMES = {
     "log_time_ns": "reception by the recorder, ns of wall time",
     "publish_time_ns": "publication, ns of wall time",
@@ -93,26 +94,33 @@ def _element(get: Callable[[Any], Any], index: tuple[int, ...], message: Any) ->
 
 
 class CsvTables:
-    """The CSV files in a folder; each is opened when its first row comes."""
+    """The CSV files in a folder; each is created when its first row comes."""
 
-    def __init__(self, folder: Path, stack: ExitStack, *, force: bool) -> None:
-        """The files are written into ``folder`` and closed by ``stack``."""
+    def __init__(self, folder: Path, *, force: bool) -> None:
+        """The files are written into ``folder``."""
         self.folder, self.rows = folder, dict[str, int]()  # number of rows by file name
-        self._stack, self._force = stack, force
-        self._writers: dict[str, Any] = {}
+        self._force = force
+        self._open: dict[str, TextIO] = {}  # by file name, the one opened first comes first
+
+    def close(self) -> None:
+        """Closes all files."""
+        for stream in self._open.values():
+            stream.close()
 
     def add(self, name: str, header: list[str], row: list[Value]) -> None:
         """Adds a row to NAME.csv; None becomes an empty cell, and booleans become true and false."""
-        writer = self._writers.get(name)
-        if writer is None:
-            path = self.folder / f"{name}.csv"
+        path = self.folder / f"{name}.csv"
+        if path.name not in self.rows:
             refuse_to_overwrite([path], force=self._force)
-            stream = self._stack.enter_context(path.open("w", newline="", encoding="utf-8"))
-            writer = self._writers[name] = csv.writer(stream, lineterminator="\n")
-            writer.writerow(header)
+            path.write_text(",".join(header) + "\n", encoding="utf-8")
             self.rows[path.name] = 0
-        writer.writerow([str(cell).lower() if isinstance(cell, bool) else cell for cell in row])
-        self.rows[f"{name}.csv"] += 1
+        if path.name not in self._open:
+            if len(self._open) >= MAX_OPEN_FILES:
+                self._open.pop(next(iter(self._open))).close()
+            self._open[path.name] = path.open("a", newline="", encoding="utf-8")
+        cells = [str(cell).lower() if isinstance(cell, bool) else cell for cell in row]
+        csv.writer(self._open[path.name], lineterminator="\n").writerow(cells)
+        self.rows[path.name] += 1
 
 
 class _TopicLayout:
@@ -164,8 +172,7 @@ def export_csv(
         raise UserError(f"{recording.path}: no message of presage in it, so there is nothing to export")
     layouts = {topic.name: _TopicLayout(topic) for topic in dict.fromkeys(keys.values())}
     counts = recording.counts()
-    with ExitStack() as stack:
-        tables = CsvTables(folder, stack, force=force)
+    with closing(CsvTables(folder, force=force)) as tables:
         messages = with_progress(entries(recording, name), sum(counts[key] for key in keys), "csv", console)
         for topic, message, raw in messages:
             layouts[topic.name].write(tables, message, [raw.logged_ns, raw.published_ns], arrays=arrays)

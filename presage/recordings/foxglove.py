@@ -78,7 +78,7 @@ def export_foxglove(recording: Recording, out: Path, robot: str, console: Consol
         raise UserError(f"{out}: is the recording itself; choose another place with --out")
     if not keys_of(recording, name):
         raise UserError(f"{recording.path}: no message of presage in it, so there is nothing to export")
-    unfinished = out.with_name(out.name + ".active")
+    unfinished = out.with_name(out.name + ".partial")  # .active is the recorder's
     try:
         with unfinished.open("wb") as stream:
             writer = Writer(stream, compression=CompressionType.ZSTD)

@@ -28,27 +28,32 @@ def check_file(file: Path | None, option: str) -> None:
         file.unlink()
 
 
-def make_folder(folder: Path) -> None:
-    """Creates ``folder`` with its parents; raises UserError if it cannot be created or written into."""
+def make_folder(folder: Path, option: str = "--out") -> None:
+    """Creates ``folder`` with its parents. Raises UserError if it cannot be created or written into.
+
+    ``option`` chooses another folder.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
         raise UserError(
-            f"{folder}: cannot be written to ({error.strerror}); choose another folder with --out"
+            f"{folder}: cannot be written to ({error.strerror}); choose another folder with {option}"
         ) from None
 
 
 @contextmanager
-def output_folder(folder: Path) -> Iterator[None]:
-    """`make_folder` for the block; removes the folder if the block, perhaps interrupted, leaves it empty."""
-    make_folder(folder)
+def output_folder(folder: Path, option: str = "--out") -> Iterator[None]:
+    """`make_folder` for the block; removes a new folder if the block, perhaps interrupted, leaves it empty."""
+    existed = folder.exists()
+    make_folder(folder, option)
     try:
         yield
     finally:
-        with suppress(OSError):  # it is not empty
-            folder.rmdir()
+        if not existed:
+            with suppress(OSError):  # it is not empty
+                folder.rmdir()
 
 
 def write_json(file: Path | None, data: dict[str, Any]) -> None:

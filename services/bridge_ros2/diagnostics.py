@@ -33,7 +33,7 @@ def diagnose(
     """
     topic = options.topic(options.scan_topic)
     if not linked:
-        return f"waiting for the zenoh router at {options.ros_connect}: the connection is lost"
+        return f"waiting for the zenoh router at {options.ros_endpoint}: the connection is lost"
     if mismatch := graph.distro_mismatch(topic):
         return mismatch
     if scan_age > SCAN_TIMEOUT_S:
@@ -96,7 +96,7 @@ def _explain_missing_endpoints(options: BridgeRos2Settings, graph: RosGraph) -> 
         domain = "" if options.domain in domains else f" --domain {domains[0]}"
         return f"the robot uses rmw_zenoh, not zenoh-bridge-ros2dds; set --flavor rmw_zenoh{domain}"
     where = (
-        f"there are no ROS nodes at {options.ros_connect}. Check that this is the robot's router, not presage's, and"
+        f"there are no ROS nodes at {options.ros_endpoint}. Check that this is the robot's router, not presage's, and"
     )
     if options.flavor == "ros2dds":
         return f"{where} that zenoh-bridge-ros2dds runs there with the ROS_DOMAIN_ID of the robot's nodes"

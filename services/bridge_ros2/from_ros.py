@@ -32,11 +32,11 @@ def scan_of(message: Any, mount: Mount, stamp_ns: int) -> Scan:
     if step == 0:  # some drivers do not set it
         step = (float(message.angle_max) - first) / (beams - 1)
     nearest, farthest = float(message.range_min), float(message.range_max)
-    if not np.isfinite([first, step, nearest, farthest]).all() or step == 0 or farthest <= max(nearest, 0.0):
+    if not np.isfinite([first, step, nearest]).all() or step == 0 or not farthest > max(nearest, 0.0):
         raise ValueError(
             f"angles from {first:g} by {step:g} rad, ranges from {nearest:g} to {farthest:g} m: no scanner has those"
         )
-    farthest = min(farthest, MAX_DISTANCE_M)  # some drivers write the largest float for "no limit"
+    farthest = min(farthest, MAX_DISTANCE_M)  # some drivers write the largest float, or infinity, for "no limit"
     ranges = np.asarray(message.ranges, np.float32)
     side = -1.0 if mount.upside_down else 1.0
     first, step = side * first, side * step

@@ -69,7 +69,7 @@ class BridgeRos2Service(Service):
         self.motion = MountAndOdometry(settings.base_frame, settings.odom_frame, settings.build_mount())
         self.self_filter = settings.build_self_filter()
         self.gate = CommandGate(settings.build_robot(), self.self_filter, obstacle_stop=settings.obstacle_stop)
-        self.note, self.idle = f"waiting for the zenoh router at {settings.ros_connect}", True
+        self.note, self.idle = f"waiting for the zenoh router at {settings.ros_endpoint}", True
         self._ros: RosSession | None = None
         self._publishers: dict[str, RosPublisher] = {}  # by the option's topic name
         # Message type and handler of each subscribed ROS topic, by the name of its inbox topic.
@@ -139,7 +139,7 @@ class BridgeRos2Service(Service):
                 self._handlers[inbox_topic.name] = (kind, handler)
                 ros.subscribe(inbox_topic, options.topic(name), kind, qos, self.loop.inbox)
         self.note = f"no scan on {options.topic(options.scan_topic)} yet"
-        self.log.info("connected to the robot's router", endpoint=options.ros_connect, flavor=options.flavor)
+        self.log.info("connected to the robot's router", endpoint=options.ros_endpoint, flavor=options.flavor)
 
     def due(self) -> float | None:
         """Seconds until the next check, or until a robot without commands is stopped."""

@@ -138,6 +138,11 @@ class BridgeRos2Settings(SelfFilterSettings):
         """Zenoh keys of the configured flavour and domain."""
         return RosKeys(self.flavor, self.domain, hashes=self.distro != "humble")
 
+    @property
+    def ros_endpoint(self) -> str:
+        """Where the robot's router is, as the user gave it: the endpoint, or the file that states it."""
+        return str(self.ros_config or self.ros_connect)
+
     def check(self) -> None:
         """Raises UserError if settings contradict each other, or if a file is missing."""
         frames = {"the map": MAP_FRAME, "--odom-frame": self.odom_frame, "--base-frame": self.base_frame}

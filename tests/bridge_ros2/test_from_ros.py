@@ -69,8 +69,9 @@ def test_full_circle():
     assert missing.angle_increment == pytest.approx(0.5)
 
 
-def test_largest_range_max():
-    scan = scan_of(laser([1.0, 2.0, np.inf], range_max=float(np.finfo(np.float32).max)), Mount(), 0)
+@pytest.mark.parametrize("unlimited", [float(np.finfo(np.float32).max), np.inf])
+def test_unlimited_range(unlimited):
+    scan = scan_of(laser([1.0, 2.0, np.inf], range_max=unlimited), Mount(), 0)
     assert scan.range_max == MAX_DISTANCE_M
     assert scan.ranges.tolist() == [1.0, 2.0, np.inf]
 
@@ -82,7 +83,7 @@ def test_largest_range_max():
         {"ranges": [1.0] * 32_769},
         {"angle_min": np.nan},
         {"range_max": 0.0},
-        {"range_max": np.inf},
+        {"range_max": np.nan},
         {"angle_increment": 0.0, "angle_max": -1.0},
     ],
     ids=lambda wrong: str(wrong)[:40],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from rich.console import Console
 
 from common.errors import UserError
 from lab.integrity.cases import BEAMS, CASES, make_trial
+from lab.integrity.logs import LogCase
 from lab.integrity.report import bench_integrity
 from lab.integrity.runner import RECOVERING_FILTER, IntegrityPlan
 
@@ -65,3 +67,18 @@ def test_a_filter_with_recovery_finds_a_kidnapped_robot(tmp_path):
 def test_unknown_names(cases, estimators, model, tmp_path):
     with pytest.raises(UserError, match="choose from"):
         bench_integrity(IntegrityPlan(1, 1, cases, estimators, model), tmp_path, 1, Console(quiet=True))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"cases": ("crowd", "crowd")}, "case 'crowd' is given twice"),
+        ({"estimators": ("precise", "precise")}, "estimator 'precise' is given twice"),
+        ({"logs": (LogCase("a/x.npz", None, False, False), LogCase("b/x.npz", None, False, False))}, "x-second-laser"),
+        ({"worlds": 0}, "at least one world or log"),
+    ],
+)
+def test_trials_that_would_count_twice_or_not_at_all(changes, message, tmp_path):
+    plan = replace(IntegrityPlan(1, 1, ("crowd",), ("precise",), "exact"), **changes)
+    with pytest.raises(UserError, match=message):
+        bench_integrity(plan, tmp_path, 1, Console(quiet=True))

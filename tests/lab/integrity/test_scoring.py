@@ -51,7 +51,9 @@ def test_case(scans):
     trial = {"seed": 1, **score_trial(scans, 1.0, [], separate=False)}
     row = score_case([trial, trial], Estimates.joined([scans, scans]))
     assert row["wrong"] == {"count": 4, "of": 8, "interval_95": None}
-    assert (row["trials_wrong"]["count"], row["trials_wrong"]["of"]) == (2, 2)
+    assert row["trials_wrong"] == {"count": 2, "of": 2, "interval_95": None}  # in one building
+    other = score_case([trial, trial | {"seed": 2}], Estimates.joined([scans, scans]))
+    assert other["trials_wrong"]["interval_95"] == pytest.approx([0.342, 1.0], abs=1e-3)
     assert row["trials_wrong_longer"] == 2
     assert row["nees_xy"] == pytest.approx((0 + 1 + 9 + 9) / 4)
     assert row["error_median_m"] == 0

@@ -184,6 +184,7 @@ def test_errors_by_state():
     assert found["untracked_s"] == pytest.approx(0.3 / 4)  # of four scans since 0.1 s one
     never = driven.measure(RunTrace(trace.truths, [belief(k, 9.0, "lost") for k in range(5)]), TASK, HALL, ROBOT)
     assert never["tracking_s"] is never["error_max_m"] is None
+    assert never["longest_untracked_s"] == pytest.approx(0.4)  # the whole drive
 
 
 def test_reasons_without_places():

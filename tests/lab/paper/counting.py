@@ -11,6 +11,7 @@ class Count:
     index: int
     folder: str
     fails_at: int = -1
+    world: str = ""
 
 
 def count(job):

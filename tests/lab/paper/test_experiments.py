@@ -12,6 +12,7 @@ import shapely
 from rich.console import Console
 
 from common.errors import UserError
+from common.geometry.world import FOLDER
 from lab.accuracy.scenes import Scene
 from lab.experiments import results
 from lab.experiments.estimators import PAPER_DESCENT, ExperimentWorld, parse_estimators
@@ -58,6 +59,15 @@ def test_results_of_other_jobs(tmp_path):
     TrialStore(path, jobs(tmp_path)).add(0, {"square": 99})
     assert TrialStore(path, jobs(tmp_path, fails_at=3)).read() == {}
     assert not path.exists()
+
+
+def test_results_of_a_file_that_was_replaced(tmp_path):
+    named = tmp_path / "hall.yaml"
+    named.write_text((FOLDER / "maze.yaml").read_text())
+    TrialStore(tmp_path / "store", jobs(tmp_path, world=str(named))).add(0, {"square": 99})
+    assert TrialStore(tmp_path / "store", jobs(tmp_path, world=str(named))).read() == {0: {"square": 99}}
+    named.write_text((FOLDER / "office.yaml").read_text())
+    assert TrialStore(tmp_path / "store", jobs(tmp_path, world=str(named))).read() == {}
 
 
 def test_incomplete_last_line(tmp_path):

@@ -111,6 +111,31 @@ def test_what_cannot_be_is_said(log, tmp_path):
     assert not list(tmp_path.glob("*.yaml"))
 
 
+def test_ranges_in_another_unit(tmp_path):
+    path, drive = tmp_path / "far.npz", real_drive.drive(20)
+    millimetres = replace(drive, ranges=1000 * drive.ranges, range_max=1000 * drive.range_max)
+    standing = replace(
+        millimetres, poses=np.zeros_like(drive.poses), ranges=np.repeat(millimetres.ranges[:1], 20, axis=0)
+    )
+    for made, message in ((millimetres, "no two beams end near each other"), (standing, "is too large for")):
+        real_drive.save(path, replace(made, odom=made.poses))
+        with pytest.raises(UserError, match=rf"{message}.* range_max in section log"):
+            map_command(MapOptions(path, tmp_path / "f.yaml", reading=HERE), QUIET, QUIET)
+    assert not (tmp_path / "f.yaml").exists()
+
+
+def test_folder_of_the_model_is_checked_first(log, tmp_path):
+    (tmp_path / "file").touch()
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models" / "a-room-precise.safetensors").touch()
+    for models, message in (("file", "choose another folder with --models"), ("models", "exists already")):
+        with pytest.raises(UserError, match=message):
+            map_command(MapOptions(log, tmp_path / "a room.yaml", models=tmp_path / models), QUIET, QUIET)
+    with pytest.raises(UserError, match="no such file"):
+        map_command(MapOptions(tmp_path / "no.npz", tmp_path / "new" / "a.yaml"), QUIET, QUIET)
+    assert not (tmp_path / "new").exists()
+
+
 def test_mount_of_a_recording(tmp_path):
     recorded.write(tmp_path / "run.mcap")
     with pytest.raises(UserError, match="contains the description of its scanner"):

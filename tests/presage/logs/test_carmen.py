@@ -134,6 +134,19 @@ def test_maximum_range_of_an_lms(tmp_path, stated, longest, range_max):
     assert any("range_max" in note for note in log.notes) == (stated != range_max)
 
 
+@pytest.mark.parametrize(
+    ("stated", "longest", "range_max"),
+    [(81.9, 81.83, 80.0), (8.19, 8.187, 8.18), (50.0, 8.187, 8.18), (30.0, 12.0, 30.0)],
+)
+def test_maximum_range_in_a_parameter(tmp_path, stated, longest, range_max):
+    row = np.full(181, 2.0)
+    row[3] = longest
+    line = f"FLASER 181 {words(row)} 0 0 0 0 0 0 1.0 host 0.1"
+    log, scans = read(write(tmp_path, [f"PARAM robot_front_laser_max {stated} h 0", line]))
+    assert log.range_max == range_max
+    assert np.isinf(scans[0].ranges[3]) == (longest >= range_max)
+
+
 @pytest.mark.parametrize(("name", "range_max"), [("FLASER", 20.0), ("RLASER", 10.0), ("LASER3", 80.0)])
 def test_parameters_of_lasers(tmp_path, name, range_max):
     line = f"{name} 181 {words(np.full(181, 2.0))} {{0}} 0 0 0 0 0 {{0}} host {{0}}"  # its poses are corrected

@@ -44,6 +44,18 @@ def test_mount_refusals():
         frames.mount("base_link", "nodding")
 
 
+def test_frame_in_two_parents():
+    """Two kinds of odometry, published in turn."""
+    frames = FrameHistory()
+    for k in range(10):
+        for parent, speed in (("odom", 1.0), ("odom_combined", 2.0)):
+            frames.add(parent, "base_link", k * SECOND, transform(speed * k))
+    frames.add("base_link", "laser", 0, transform(0.5))
+    for parent, speed in (("odom", 1.0), ("odom_combined", 2.0)):
+        pose = frames.at(frames.chain(parent, "laser"), 4 * SECOND)
+        np.testing.assert_allclose(pose, [4 * speed + 0.5, 0, 0], atol=1e-12)
+
+
 def test_cycles_of_frames():
     frames = FrameHistory()
     for parent, child in (("a", "b"), ("b", "c"), ("c", "a"), ("d", "d")):

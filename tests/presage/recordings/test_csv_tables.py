@@ -15,6 +15,7 @@ from rich.console import Console
 from common.errors import UserError
 from common.messages.definitions import Pose, Truth, Twist
 from common.messages.topics import BELIEF, HEALTH, ODOM, SCAN, TOPICS, TRUTH
+from presage.recordings import csv_tables
 from presage.recordings.csv_tables import columns_of, export_csv
 from presage.recordings.export import ExportOptions, run_export
 from presage.recordings.tum import export_tum
@@ -85,6 +86,16 @@ def test_readme_explains_columns(tmp_path):
         )
     assert "| `twist.vx` | m/s, forward; base_link |" in text
     assert "| `free_energy` | nats" in text
+
+
+def test_more_files_than_may_be_open(tmp_path, monkeypatch):
+    (tmp_path / "all").mkdir()
+    expected, _ = tables(tmp_path / "all", arrays=True)
+    monkeypatch.setattr(csv_tables, "MAX_OPEN_FILES", 2)
+    folder, _ = tables(tmp_path, arrays=True)
+    names = sorted(path.name for path in expected.iterdir())
+    assert sorted(path.name for path in folder.iterdir()) == names
+    assert [(folder / name).read_bytes() for name in names] == [(expected / name).read_bytes() for name in names]
 
 
 @pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)

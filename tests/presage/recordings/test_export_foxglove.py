@@ -338,10 +338,13 @@ def test_layout_names_exported_topics(tmp_path):
 
 def test_unfinished_recording(tmp_path):
     active = driven.write(tmp_path / "run.mcap", finish=False)
-    recording = read_recording(active)
-    counts = export_foxglove(recording, tmp_path / "view.mcap", "", Console(quiet=True), force=False)
-    assert counts["/scan"] == driven.STEPS
+    recording, before = read_recording(active), active.read_bytes()
+    for name in ("view.mcap", "run.mcap"):
+        counts = export_foxglove(recording, tmp_path / name, "", Console(quiet=True), force=False)
+        assert counts["/scan"] == driven.STEPS
     assert recording.warning
+    assert active.read_bytes() == before
+    assert len(list(tmp_path.iterdir())) == 3
 
 
 def test_refusals_leave_no_file(tmp_path):

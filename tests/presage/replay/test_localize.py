@@ -191,6 +191,23 @@ def test_stamps_and_ranges_of_an_npz(tmp_path):
     assert scans[0].ranges.tolist() == [1.0, np.inf, np.inf, -np.inf, -np.inf, -np.inf]
 
 
+def test_unknown_odometry_in_an_npz(tmp_path):
+    odom = PATH - PATH[0]
+    odom[:2] = np.nan
+    np.testing.assert_array_equal(read_scans(npz(tmp_path, odom=odom)).odom, odom)
+
+
+def test_late_odometry_in_a_recording(tmp_path):
+    """One message that comes late leaves the others where they were."""
+    writer = RecordingWriter(tmp_path / "r.mcap")
+    scan = Scan(stamp_ns=0, angle_min=0.0, angle_increment=0.1, range_min=0.0, range_max=9.0, ranges=np.ones(4))
+    for number, stamp in enumerate([0, 1, 3, 2, 4, 5]):
+        odom = Odom(stamp_ns=stamp, pose=Pose(x=float(stamp), y=0.0), twist=Twist(), covariance=np.eye(3))
+        for topic, message in ((ODOM, odom), (SCAN, scan.model_copy(update={"stamp_ns": number}))):
+            writer.write(topic, topic.key("robot"), message.encode(), 10 * number, 10 * number)
+    assert read_scans(writer.finish()).odom[:, 0].tolist() == [0, 1, 2, 3, 4, 5]
+
+
 def plain(rows):
     return [{name: value for name, value in row.items() if name != "update_ms"} for row in rows]
 

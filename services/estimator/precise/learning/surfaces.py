@@ -10,11 +10,16 @@ import numpy.typing as npt
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from common.errors import UserError
 from common.geometry.se2 import Array, compose
 from services.estimator.precise.field import DistanceField, Floats
 from services.estimator.precise.learning.beam_cells import count_crossings
 
 BEAMS_AT_ONCE = 2_000_000  # processed together, which limits memory
+MAX_CELLS = 100_000_000  # 250 000 m² in cells of 5 cm, which need 6 GB
+WRONG_RANGES = (
+    "Are the ranges in m? From which range on there is no return is set with range_max in section log of --config"
+)
 POOL_CELLS = 1  # cells to each side whose points are pooled to find a normal
 ELEMENT_RADIUS_CELLS = 2.0  # around a surface element, within which it shapes the field
 MIN_POINTS_PER_CELL = 3  # cells with fewer points are no surface
@@ -87,10 +92,18 @@ class SurfaceCells:
 
     @classmethod
     def of(cls, beams: Beams, cell_m: float) -> SurfaceCells:
-        """The cells of ``cell_m`` m in which beams end."""
+        """The cells of ``cell_m`` m in which beams end. Raises UserError if there are too many, or no beams."""
+        if not len(beams.ranges):
+            raise UserError(f"no surface to learn from: no two beams end near each other. {WRONG_RANGES}")
         low, high = beams.bounds()
         low = low - 4 * cell_m
         shape = np.ceil((high + 4 * cell_m - low) / cell_m).astype(int)[::-1] + 1
+        if float(np.prod(shape, dtype=float)) > MAX_CELLS:
+            width, height = high - low
+            raise UserError(
+                f"the beams end in an area of {width:.0f} m x {height:.0f} m, which is too large for cells of "
+                f"{cell_m:g} m. {WRONG_RANGES}"
+            )
         sums = np.zeros((8, int(shape.prod())))
         for part in beams.parts():
             local, (ux, uy) = part.ends() - low, part.unit().T
