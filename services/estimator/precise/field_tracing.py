@@ -34,7 +34,7 @@ def lookup(phi: Floats, x: float, y: float) -> tuple[float, float, float, bool]:
     Returns phi, its derivatives by x and y (m per cell), and whether the point is inside the grid.
     """
     ny, nx = phi.shape
-    if not (0 <= x < nx - 1 and 0 <= y < ny - 1):
+    if not (x >= 0.0 and x < nx - 1 and y >= 0.0 and y < ny - 1):  # a chain of comparisons compiles to slow code
         return 0.0, 0.0, 0.0, False
     j, i = int(x), int(y)
     u, v = x - j, y - i
@@ -45,35 +45,45 @@ def lookup(phi: Floats, x: float, y: float) -> tuple[float, float, float, bool]:
 
 
 @jit
-def trace_beam(phi: Floats, h: float, x: float, y: float, ux: float, uy: float) -> tuple[float, float]:
-    """Traces one beam by sphere tracing, in grid coordinates.
+def trace_beams(phi: Floats, h: float, x: Array, y: Array, ux: Array, uy: Array, lengths: Array, dips: Array) -> None:
+    """Traces beams (B,) by sphere tracing, from starts and along directions in grid coordinates.
 
-    Returns the length of the beam and the smallest distance at which it passed another surface (inf if none), in m.
+    Fills the length of each beam and the smallest distance at which it passed another surface, in m; +inf if there is
+    none. The beams take turns step by step, because a processor overlaps steps that do not depend on each other.
     """
-    t, step, previous, falling, dip, solid = 0.0, 0.0, 0.0, False, np.inf, True
+    lengths[:], dips[:] = np.inf, np.inf
+    t, step, previous = np.zeros(len(x)), np.zeros(len(x)), np.zeros(len(x))
+    falling, solid = np.zeros(len(x), np.bool_), np.ones(len(x), np.bool_)
+    running, count = np.arange(len(x)), len(x)  # the first `count` of these beams have not ended
     for _ in range(MAX_STEPS):
-        value, _, _, inside = lookup(phi, x + t * ux, y + t * uy)
-        if not inside:
-            return np.inf, dip
-        value /= h
-        if solid:  # a laser cannot be inside something, so what the map has there was removed: leave it first
-            if value <= 0.0:
-                t += max(-value, MIN_STEP_CELLS)
+        left = 0
+        for n in range(count):
+            b = running[n]
+            value, _, _, inside = lookup(phi, x[b] + t[b] * ux[b], y[b] + t[b] * uy[b])
+            if not inside:
                 continue
-            solid = False
-        if value <= 0.0:
-            t -= step * -value / (previous - value)  # regula falsi with the last point in free space
-            value, gx, gy, _ = lookup(phi, x + t * ux, y + t * uy)
-            slope = gx * ux + gy * uy
-            if slope < -MIN_COSINE * h:  # one Newton step onto the surface
-                t -= min(max(value / slope, -1.0), 1.0)
-            return max(t, 0.0) * h, dip
-        if falling and value > previous:
-            dip = min(dip, previous * h)
-        falling, previous = value < previous, value
-        step = max(0.98 * value, MIN_STEP_CELLS)  # not all of phi, because it is not exactly a distance
-        t += step
-    return np.inf, dip
+            value /= h
+            if value > 0.0:
+                if falling[b] and value > previous[b]:
+                    dips[b] = min(dips[b], previous[b] * h)
+                solid[b], falling[b], previous[b] = False, value < previous[b], value
+                step[b] = max(0.98 * value, MIN_STEP_CELLS)  # not all of phi, because it is not exactly a distance
+                t[b] += step[b]
+            elif solid[b]:  # a laser cannot be inside something, so what the map has there was removed: leave it first
+                t[b] += max(-value, MIN_STEP_CELLS)
+            else:
+                t[b] -= step[b] * -value / (previous[b] - value)  # regula falsi with the last point in free space
+                value, gx, gy, _ = lookup(phi, x[b] + t[b] * ux[b], y[b] + t[b] * uy[b])
+                slope = gx * ux[b] + gy * uy[b]
+                if slope < -MIN_COSINE * h:  # one Newton step onto the surface
+                    t[b] -= min(max(value / slope, -1.0), 1.0)
+                lengths[b] = max(t[b], 0.0) * h
+                continue
+            running[left] = b
+            left += 1
+        count = left
+        if not count:
+            break
 
 
 @jit
@@ -95,25 +105,26 @@ def trace(
     These are ranges (N, B), jacobian (N, B, 3), and dip, edge and facing (N, B). The derivative of a range is
     dr = -(n . dp + r n . u' dyaw) / (n . u). Edge is the depth one cell behind the surface, relative to a plane.
     """
+    x, y, ux, uy = np.empty(len(angles)), np.empty(len(angles)), np.empty(len(angles)), np.empty(len(angles))
     for k in range(lasers.shape[0]):
-        x, y = (lasers[k, 0] - ox) / h, (lasers[k, 1] - oy) / h
+        x[:], y[:] = (lasers[k, 0] - ox) / h, (lasers[k, 1] - oy) / h
+        ux[:], uy[:] = np.cos(lasers[k, 2] + angles), np.sin(lasers[k, 2] + angles)
+        trace_beams(phi, h, x, y, ux, uy, ranges[k], dip[k])
         for b in range(angles.shape[0]):
-            ux, uy = math.cos(lasers[k, 2] + angles[b]), math.sin(lasers[k, 2] + angles[b])
-            r, passed = trace_beam(phi, h, x, y, ux, uy)
-            ranges[k, b], dip[k, b] = r, passed
+            r = ranges[k, b]
             jacobian[k, b, :] = 0.0
             edge[k, b], facing[k, b] = 0.0, 0.0
             if r == np.inf:
                 continue
-            hx, hy = x + r / h * ux, y + r / h * uy
+            hx, hy = x[b] + r / h * ux[b], y[b] + r / h * uy[b]
             _, gx, gy, _ = lookup(phi, hx, hy)
             length = max(math.hypot(gx, gy), 1e-9)
             nx, ny = gx / length, gy / length
-            cosine = -min(nx * ux + ny * uy, -MIN_COSINE)
+            cosine = -min(nx * ux[b] + ny * uy[b], -MIN_COSINE)
             if cosine > GRAZING:
                 jacobian[k, b, 0], jacobian[k, b, 1] = nx / cosine, ny / cosine
-                jacobian[k, b, 2] = r * (ny * ux - nx * uy) / cosine
-            behind, _, _, _ = lookup(phi, hx + ux, hy + uy)
+                jacobian[k, b, 2] = r * (ny * ux[b] - nx * uy[b]) / cosine
+            behind, _, _, _ = lookup(phi, hx + ux[b], hy + uy[b])
             edge[k, b], facing[k, b] = -behind / (h * cosine), cosine
 
 
@@ -122,14 +133,13 @@ def trace_behind(
     phi: Floats, ox: float, oy: float, h: float, lasers: Array, angles: Array, ranges: Array, behind: Array
 ) -> None:
     """Fills behind (N, B) m, ranges to the next surface behind the one at ``ranges`` (N, B) m; none behind +inf."""
+    dips = np.empty(len(angles))
     for k in range(lasers.shape[0]):
-        for b in range(angles.shape[0]):
-            behind[k, b] = np.inf
-            if ranges[k, b] < np.inf:
-                ux, uy = math.cos(lasers[k, 2] + angles[b]), math.sin(lasers[k, 2] + angles[b])
-                inside = ranges[k, b] + 0.5 * h
-                x, y = lasers[k, 0] + inside * ux, lasers[k, 1] + inside * uy
-                behind[k, b] = inside + trace_beam(phi, h, (x - ox) / h, (y - oy) / h, ux, uy)[0]
+        ux, uy = np.cos(lasers[k, 2] + angles), np.sin(lasers[k, 2] + angles)
+        inside = ranges[k] + 0.5 * h  # +inf is outside the grid, so beams that met nothing meet nothing behind it
+        x, y = (lasers[k, 0] + inside * ux - ox) / h, (lasers[k, 1] + inside * uy - oy) / h
+        trace_beams(phi, h, x, y, ux, uy, behind[k], dips)
+        behind[k] += inside
 
 
 @jit
@@ -138,14 +148,15 @@ def mark_crossed(
 ) -> None:
     """Marks the nodes (ny, nx) that beams at ``angles`` (B,) from lasers (N, 3) pass."""
     ny, nx = phi.shape
+    x, y, ends, dips = np.empty(len(angles)), np.empty(len(angles)), np.empty(len(angles)), np.empty(len(angles))
     for k in range(lasers.shape[0]):
-        x, y = (lasers[k, 0] - ox) / h, (lasers[k, 1] - oy) / h
+        x[:], y[:] = (lasers[k, 0] - ox) / h, (lasers[k, 1] - oy) / h
+        ux, uy = np.cos(lasers[k, 2] + angles), np.sin(lasers[k, 2] + angles)
+        trace_beams(phi, h, x, y, ux, uy, ends, dips)
         for b in range(angles.shape[0]):
-            ux, uy = math.cos(lasers[k, 2] + angles[b]), math.sin(lasers[k, 2] + angles[b])
-            end, _ = trace_beam(phi, h, x, y, ux, uy)
             t = 0.0
-            while t < min(end / h, nx + ny):
-                column, row = int(x + t * ux + 0.5), int(y + t * uy + 0.5)
+            while t < min(ends[b] / h, nx + ny):
+                column, row = int(x[b] + t * ux[b] + 0.5), int(y[b] + t * uy[b] + 0.5)
                 if not (0 <= column < nx and 0 <= row < ny):
                     break
                 crossed[row, column] = True
@@ -173,7 +184,7 @@ def end_in_unseen_cells(
             unseen_length, t, step = 0.0, 0.0, 0.5 * h
             while t < ranges[k, b]:
                 x, y = (lasers[k, 0] + t * ux - ox) / h, (lasers[k, 1] + t * uy - oy) / h
-                inside = 0 <= x < columns and 0 <= y < rows
+                inside = x >= 0.0 and x < columns and y >= 0.0 and y < rows
                 if not inside or not seen[int(y), int(x)]:
                     unseen_length += step
                     if unseen_length > allowed:
