@@ -68,7 +68,7 @@ def recursive(scene: Scene, path: Array, drift: OdometryNoise, start: Array | No
             length, turn = float(np.hypot(step[0], step[1])), abs(float(step[2]))
             along = drift.path_by_path * length + drift.path_by_turn * turn
             around = drift.turn_by_turn * turn + drift.turn_by_path * length
-            by_pose, by_step = se2.compose_jacobians(path[k], step)
-            spread = (by_step * np.array([along, along, around])) @ by_step.T
-            predicted = np.linalg.inv(by_pose @ covariance @ by_pose.T + spread + 1e-14 * np.eye(3))
+            pose_jacobian, step_jacobian = se2.compose_jacobians(path[k], step)
+            spread = (step_jacobian * np.array([along, along, around])) @ step_jacobian.T
+            predicted = np.linalg.inv(pose_jacobian @ covariance @ pose_jacobian.T + spread + 1e-14 * np.eye(3))
     return np.array(bounds)

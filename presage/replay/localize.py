@@ -252,9 +252,9 @@ def _row(scans: Scans, k: int, timed: TimedBelief, *, laser: bool) -> dict[str, 
     pose, covariance = posterior.pose, posterior.covariance
     mount = scans.geometry.mount
     if laser and mount.any():  # the estimator localises base_link
-        by_pose, _ = se2.compose_jacobians(pose, mount)
+        jacobian, _ = se2.compose_jacobians(pose, mount)
         pose = se2.compose(pose, mount)
-        covariance = None if covariance is None else by_pose @ covariance @ by_pose.T
+        covariance = None if covariance is None else jacobian @ covariance @ jacobian.T
     values = [None if covariance is None else float(covariance[i, j]) for i, j in UPPER_TRIANGLE]
     stamp = None if scans.stamps is None else float(scans.stamps[k])
     belief = [posterior.free_energy, posterior.state, posterior.probability]

@@ -40,6 +40,7 @@ class Odometer:
         turn_variance = drift.turn_by_turn * turn + drift.turn_by_path * path
         variance = np.array([path_variance, path_variance, turn_variance])
         noisy = step + np.sqrt(variance) * self._rng.standard_normal(3)
-        by_pose, by_step = se2.compose_jacobians(self.pose, noisy)
-        self.covariance = by_pose @ self.covariance @ by_pose.T + by_step @ np.diag(variance) @ by_step.T
+        pose_jacobian, step_jacobian = se2.compose_jacobians(self.pose, noisy)
+        noise = step_jacobian @ np.diag(variance) @ step_jacobian.T
+        self.covariance = pose_jacobian @ self.covariance @ pose_jacobian.T + noise
         self.pose = se2.compose(self.pose, noisy)

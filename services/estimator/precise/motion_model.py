@@ -100,25 +100,25 @@ def predict_motion(
         probability /= 2
     elif odom is None:
         probability = any_motion = 0.5  # nothing tells whether the robot stands
-    found = [_propagate(before, np.zeros(3), np.full(3, noise.standing), probability)]  # standing still
+    candidates = [_propagate(before, np.zeros(3), np.full(3, noise.standing), probability)]  # standing still
     acceleration = np.array([noise.acceleration, noise.acceleration, noise.turn_acceleration])
     change = acceleration * period * max(period, SMOOTHING_TIME_S)
     if command is not None:
         change = change + noise.command_share * np.abs(command) * period
-        found.append(_propagate(before, command * period, change, probability))
+        candidates.append(_propagate(before, command * period, change, probability))
     elif velocity is not None:
         motion = limit_steps(velocity * period, MAX_MOTION_SIGMAS * full_speed)
         deviation = np.sqrt(change**2 + _velocity_variance(pose, covariance, period))
-        found.append(_propagate(before, motion, deviation, probability))
+        candidates.append(_propagate(before, motion, deviation, probability))
     if odom is not None:
         moved, turned = float(np.hypot(odom[0], odom[1])), abs(float(odom[2]))
         position = np.sqrt(noise.path_by_path * moved + noise.path_by_turn * turned) + noise.standing
         heading = np.sqrt(noise.turn_by_turn * turned + noise.turn_by_path * moved) + noise.standing
-        by_odometry = _propagate(before, odom, np.array([position, position, heading]), likely**2)
-        found.append(_add_slip(by_odometry, noise.slip * odom, float(pose[2])))
+        without_slip = _propagate(before, odom, np.array([position, position, heading]), likely**2)
+        candidates.append(_add_slip(without_slip, noise.slip * odom, float(pose[2])))
     centre = np.zeros(3) if odom is None else odom
-    found.append(_propagate(before, centre, full_speed + np.abs(centre), any_motion))  # any motion
-    return found
+    candidates.append(_propagate(before, centre, full_speed + np.abs(centre), any_motion))  # any motion
+    return candidates
 
 
 def expected_motion(candidates: list[MotionCandidate]) -> MotionCandidate:
@@ -165,9 +165,11 @@ def _velocity_variance(pose: Array, covariance: Array, period: float) -> Array:
 
 
 def _propagate(before: MotionCandidate, step: Array, deviation: Array, probability: float) -> MotionCandidate:
-    by_pose, by_step = se2.compose_jacobians(before.mean, step)
-    covariance = by_pose @ before.covariance @ by_pose.T + (by_step * deviation**2) @ by_step.T
-    return MotionCandidate(se2.compose(before.mean, step), covariance, probability, by_pose @ before.slip_covariance)
+    pose_jacobian, step_jacobian = se2.compose_jacobians(before.mean, step)
+    covariance = pose_jacobian @ before.covariance @ pose_jacobian.T + (step_jacobian * deviation**2) @ step_jacobian.T
+    return MotionCandidate(
+        se2.compose(before.mean, step), covariance, probability, pose_jacobian @ before.slip_covariance
+    )
 
 
 def _add_slip(candidate: MotionCandidate, lost: Array, yaw: float) -> MotionCandidate:

@@ -205,8 +205,8 @@ class FrontEnd:
         if odom is not None and self._odom is not None:
             motion = se2.between(self._odom, odom)
             # A robot that seems to stop suddenly may go on: odometry lags behind the scans, or pauses.
-            either = np.abs([motion, np.zeros(3) if velocity is None else velocity * period])
-            moved, turned = np.hypot(either[:, 0], either[:, 1]).max(), either[:, 2].max()
+            possible = np.abs([motion, np.zeros(3) if velocity is None else velocity * period])
+            moved, turned = np.hypot(possible[:, 0], possible[:, 1]).max(), possible[:, 2].max()
             path, turn = ODOMETRY_PATH * moved, ODOMETRY_TURN_BY_PATH * moved + ODOMETRY_TURN * turned
             return motion, STANDING_DEVIATION + np.array([path, path, turn])
         if velocity is None:
@@ -225,8 +225,8 @@ class FrontEnd:
     def _prior(self, motion: Array, deviation: Array) -> tuple[PosePrior, Array]:
         """The pose after a motion, and the covariance (3, 3) of the motion."""
         last = self.poses[-1]
-        _, by_step = se2.compose_jacobians(last, motion)
-        covariance = (by_step * (self._scale * deviation) ** 2) @ by_step.T
+        _, jacobian = se2.compose_jacobians(last, motion)
+        covariance = (jacobian * (self._scale * deviation) ** 2) @ jacobian.T
         return PosePrior(se2.compose(last, motion), np.asarray(np.linalg.inv(covariance), float)), covariance
 
     def _register(self, scan: _Scan, prior: PosePrior, period: float) -> Registration | None:

@@ -189,6 +189,6 @@ def _supports(a: LoopClosure, b: LoopClosure, poses: Array, uncertainty: Uncerta
 
 def _composed(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[Array, Array]:
     """The composition of two independent poses (3,), each with its covariance (3, 3)."""
-    by_first, by_second = se2.compose_jacobians(first[0], second[0])
-    covariance = by_first @ first[1] @ by_first.T + by_second @ second[1] @ by_second.T
+    first_jacobian, second_jacobian = se2.compose_jacobians(first[0], second[0])
+    covariance = first_jacobian @ first[1] @ first_jacobian.T + second_jacobian @ second[1] @ second_jacobian.T
     return se2.compose(first[0], second[0]), covariance
