@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 MIN_STEP_CELLS = 0.25  # shorter steps would take long along walls, longer ones would jump over corners
 MAX_STEPS = 2000
+BEAMS_AT_ONCE = 256  # traced in turns
 GRAZING = 0.05  # no derivative is computed if |n . u| is less (below three degrees of incidence, or at an edge)
 
 jit = numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -87,6 +88,19 @@ def trace_beams(phi: Floats, h: float, x: Array, y: Array, ux: Array, uy: Array,
 
 
 @jit
+def aim(
+    ox: float, oy: float, h: float, lasers: Array, angles: Array, first: int, end: int
+) -> tuple[Array, Array, Array, Array]:
+    """Starts (x, y) and directions (ux, uy) in grid coordinates of beams ``first`` to ``end`` of all lasers."""
+    x, y, ux, uy = np.empty(end - first), np.empty(end - first), np.empty(end - first), np.empty(end - first)
+    for n in range(end - first):
+        k, b = divmod(first + n, len(angles))
+        x[n], y[n] = (lasers[k, 0] - ox) / h, (lasers[k, 1] - oy) / h
+        ux[n], uy[n] = math.cos(lasers[k, 2] + angles[b]), math.sin(lasers[k, 2] + angles[b])
+    return x, y, ux, uy
+
+
+@jit
 def trace(
     phi: Floats,
     ox: float,
@@ -105,27 +119,28 @@ def trace(
     These are ranges (N, B), jacobian (N, B, 3), and dip, edge and facing (N, B). The derivative of a range is
     dr = -(n . dp + r n . u' dyaw) / (n . u). Edge is the depth one cell behind the surface, relative to a plane.
     """
-    x, y, ux, uy = np.empty(len(angles)), np.empty(len(angles)), np.empty(len(angles)), np.empty(len(angles))
-    for k in range(lasers.shape[0]):
-        x[:], y[:] = (lasers[k, 0] - ox) / h, (lasers[k, 1] - oy) / h
-        ux[:], uy[:] = np.cos(lasers[k, 2] + angles), np.sin(lasers[k, 2] + angles)
-        trace_beams(phi, h, x, y, ux, uy, ranges[k], dip[k])
-        for b in range(angles.shape[0]):
-            r = ranges[k, b]
-            jacobian[k, b, :] = 0.0
-            edge[k, b], facing[k, b] = 0.0, 0.0
+    flat_ranges, flat_dip, flat_jacobian = ranges.reshape(-1), dip.reshape(-1), jacobian.reshape(-1, 3)
+    flat_edge, flat_facing = edge.reshape(-1), facing.reshape(-1)
+    for first in range(0, len(flat_ranges), BEAMS_AT_ONCE):
+        part = slice(first, min(first + BEAMS_AT_ONCE, len(flat_ranges)))
+        x, y, ux, uy = aim(ox, oy, h, lasers, angles, part.start, part.stop)
+        trace_beams(phi, h, x, y, ux, uy, flat_ranges[part], flat_dip[part])
+        for n in range(len(x)):
+            r, beam = flat_ranges[first + n], first + n
+            flat_jacobian[beam, :] = 0.0
+            flat_edge[beam], flat_facing[beam] = 0.0, 0.0
             if r == np.inf:
                 continue
-            hx, hy = x[b] + r / h * ux[b], y[b] + r / h * uy[b]
+            hx, hy = x[n] + r / h * ux[n], y[n] + r / h * uy[n]
             _, gx, gy, _ = lookup(phi, hx, hy)
             length = max(math.hypot(gx, gy), 1e-9)
             nx, ny = gx / length, gy / length
-            cosine = -min(nx * ux[b] + ny * uy[b], -MIN_COSINE)
+            cosine = -min(nx * ux[n] + ny * uy[n], -MIN_COSINE)
             if cosine > GRAZING:
-                jacobian[k, b, 0], jacobian[k, b, 1] = nx / cosine, ny / cosine
-                jacobian[k, b, 2] = r * (ny * ux[b] - nx * uy[b]) / cosine
-            behind, _, _, _ = lookup(phi, hx + ux[b], hy + uy[b])
-            edge[k, b], facing[k, b] = -behind / (h * cosine), cosine
+                flat_jacobian[beam, 0], flat_jacobian[beam, 1] = nx / cosine, ny / cosine
+                flat_jacobian[beam, 2] = r * (ny * ux[n] - nx * uy[n]) / cosine
+            behind, _, _, _ = lookup(phi, hx + ux[n], hy + uy[n])
+            flat_edge[beam], flat_facing[beam] = -behind / (h * cosine), cosine
 
 
 @jit
@@ -133,13 +148,17 @@ def trace_behind(
     phi: Floats, ox: float, oy: float, h: float, lasers: Array, angles: Array, ranges: Array, behind: Array
 ) -> None:
     """Fills behind (N, B) m, ranges to the next surface behind the one at ``ranges`` (N, B) m; none behind +inf."""
-    dips = np.empty(len(angles))
-    for k in range(lasers.shape[0]):
-        ux, uy = np.cos(lasers[k, 2] + angles), np.sin(lasers[k, 2] + angles)
-        inside = ranges[k] + 0.5 * h  # +inf is outside the grid, so beams that met nothing meet nothing behind it
-        x, y = (lasers[k, 0] + inside * ux - ox) / h, (lasers[k, 1] + inside * uy - oy) / h
-        trace_beams(phi, h, x, y, ux, uy, behind[k], dips)
-        behind[k] += inside
+    flat_ranges, flat_behind = ranges.reshape(-1), behind.reshape(-1)
+    for first in range(0, len(flat_ranges), BEAMS_AT_ONCE):
+        part = slice(first, min(first + BEAMS_AT_ONCE, len(flat_ranges)))
+        x, y, ux, uy = aim(ox, oy, h, lasers, angles, part.start, part.stop)
+        inside = flat_ranges[part] + 0.5 * h  # +inf is outside the grid: behind nothing there is nothing
+        for n in range(len(x)):
+            k = (first + n) // len(angles)
+            x[n] = (lasers[k, 0] + inside[n] * ux[n] - ox) / h
+            y[n] = (lasers[k, 1] + inside[n] * uy[n] - oy) / h
+        trace_beams(phi, h, x, y, ux, uy, flat_behind[part], np.empty(len(x)))
+        flat_behind[part] += inside
 
 
 @jit
@@ -148,11 +167,10 @@ def mark_crossed(
 ) -> None:
     """Marks the nodes (ny, nx) that beams at ``angles`` (B,) from lasers (N, 3) pass."""
     ny, nx = phi.shape
-    x, y, ends, dips = np.empty(len(angles)), np.empty(len(angles)), np.empty(len(angles)), np.empty(len(angles))
     for k in range(lasers.shape[0]):
-        x[:], y[:] = (lasers[k, 0] - ox) / h, (lasers[k, 1] - oy) / h
-        ux, uy = np.cos(lasers[k, 2] + angles), np.sin(lasers[k, 2] + angles)
-        trace_beams(phi, h, x, y, ux, uy, ends, dips)
+        x, y, ux, uy = aim(ox, oy, h, lasers[k : k + 1], angles, 0, len(angles))
+        ends = np.empty(len(angles))
+        trace_beams(phi, h, x, y, ux, uy, ends, np.empty(len(angles)))
         for b in range(angles.shape[0]):
             t = 0.0
             while t < min(ends[b] / h, nx + ny):
