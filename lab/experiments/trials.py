@@ -85,9 +85,9 @@ def _run_in_parallel(
 
 
 def run_key(jobs: Sequence[Any]) -> str:
-    """A digest of all that the results of ``jobs`` depend on: their values, the files these name, and the checkout."""
+    """A digest of what the results of ``jobs`` depend on: values, files and ROS bags that they name, the checkout."""
     plain = [asdict(job) for job in jobs]
-    files = {name: _digest(Path(name)) for name in set(_texts(plain)) if name and Path(name).is_file()}
+    files = {name: _digest(path) for name in set(_texts(plain)) if name and _is_input(path := Path(name))}
     text = json.dumps([checkout_state(), plain, files], sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -101,12 +101,21 @@ def _texts(value: Any) -> Iterator[str]:
         yield str(value)
 
 
+def _is_input(path: Path) -> bool:
+    """Whether this is a file, or the folder of a ROS 2 bag; other folders are for results."""
+    return path.is_file() or (path / "metadata.yaml").is_file()
+
+
 def _digest(path: Path) -> str:
-    """A digest of a file, or for a map of the world that it and its images describe."""
-    if path.suffix == ".yaml":
+    """A digest of a file or ROS bag, or for a map of the world that it and its images describe."""
+    if path.suffix in {".yaml", ".yml"}:
         with suppress(UserError):  # other settings
             return hashlib.sha256(load_world(str(path)).model_dump_json().encode()).hexdigest()
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    files = sorted(each for each in path.rglob("*") if each.is_file()) if path.is_dir() else [path]
+    total = hashlib.sha256()
+    for file in files:
+        total.update(file.read_bytes())
+    return total.hexdigest()
 
 
 class TrialStore:

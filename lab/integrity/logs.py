@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +35,11 @@ class LogCase:
         path = Path(self.log)
         stem = path.parent.name if path.stem == "log" else path.stem
         return f"{stem}-{'first' if self.exchanged else 'second'}"
+
+    @property
+    def map_name(self) -> str:
+        """Name of the map, and of the weights learned for it; another log or mount has another one."""
+        return f"{self.drive_name}-{run_key([replace(self, odometry=False)])[:8]}"
 
     @property
     def name(self) -> str:
@@ -69,7 +74,7 @@ def log_trial(case: LogCase) -> IntegrityTrial:
         for k, ranges in enumerate(drive.ranges)
     ]
     return IntegrityTrial(
-        map_world=grid_of(case.drive_name, learned),
+        map_world=grid_of(case.map_name, learned),
         scanner=scanner_of(drive, 0.0, case.drive_name),
         observations=observations,
         truths=drive.poses,
@@ -82,12 +87,12 @@ def log_trial(case: LogCase) -> IntegrityTrial:
 
 def log_field_file(folder: Path, case: LogCase) -> Path:
     """The weights learned from the other half, learned now unless the folder has them."""
-    path = weights.path_of(folder, f"{case.drive_name}-{run_key([case])[:8]}")
+    path = weights.path_of(folder, case.map_name)
     if not path.exists():
         start = time.monotonic()
         options = TrainDriveOptions(Path(case.log), share=0.5, recipe=Recipe(resolution=0.05))
         drive, _ = case.halves()
         learned = learn_drive(drive, options.recipe, None, lambda _stage, _done: None)
-        card = card_of(options, grid_of(case.drive_name, drive), drive, learned, time.monotonic() - start)
+        card = card_of(options, grid_of(case.map_name, drive), drive, learned, time.monotonic() - start)
         weights.save(path, learned.model, learned.places, card)
     return path

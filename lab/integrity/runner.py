@@ -48,7 +48,7 @@ class TrialSource:
     def map_key(self) -> tuple[str, str, int]:
         """What the map depends on."""
         if self.log:
-            return "log", self.log.drive_name, 0
+            return "log", self.log.map_name, 0
         return CASES[self.case].building, CASES[self.case].map, self.seed
 
     def field_file(self, folder: Path) -> Path:

@@ -120,16 +120,15 @@ def score_case(trials: Sequence[dict[str, Any]], scans: Estimates) -> dict[str, 
     """
     longest = [trial["longest_wrong_s"] for trial in trials]
     distance = np.hypot(scans.error[:, 0], scans.error[:, 1])[scans.correct]
-    buildings, kidnapped = len({trial["seed"] for trial in trials}), sum(trial["kidnapped"] for trial in trials)
+    buildings = [trial["seed"] for trial in trials]
+    of_kidnappings = [trial["seed"] for trial in trials for _ in range(trial["kidnapped"])]
     return {
         "trials": len(trials),
         "scans": sum(trial["scans"] for trial in trials),
         "tracking": share_of_scans(trials, "tracking", "scans"),
         "wrong": share_of_scans(trials, "wrong", "tracking"),
         "longest_wrong_s": max(longest),
-        "trials_wrong": share(
-            sum(trial["wrong"] > 0 for trial in trials), len(trials), independent=len(trials) == buildings
-        ),
+        "trials_wrong": share(sum(trial["wrong"] > 0 for trial in trials), len(trials), independent=_differ(buildings)),
         "trials_wrong_longer": sum(value > MAX_WRONG_S for value in longest),
         "correct": share_of_scans(trials, "correct", "in_map"),
         "nees_xy": _mean(scans.nees[scans.tracking, 0]),
@@ -137,7 +136,9 @@ def score_case(trials: Sequence[dict[str, Any]], scans: Estimates) -> dict[str, 
         "nees": _mean(scans.nees[scans.tracking, 1]),
         "error_median_m": _median(distance),
         "error_rms_m": float(np.sqrt(np.mean(distance**2))) if len(distance) else None,
-        "recovered": share(sum(trial["recovered"] for trial in trials), kidnapped, independent=kidnapped == buildings),
+        "recovered": share(
+            sum(trial["recovered"] for trial in trials), len(of_kidnappings), independent=_differ(of_kidnappings)
+        ),
         "beyond_protection": [_mean((axis > 1)[np.isfinite(axis)]) for axis in scans.excess.T],
         "reliability": reliability(scans.probability, scans.correct),
         "update_ms": [1e3 * float(np.quantile(scans.update_s, q)) for q in (0.5, 0.95, 1.0)],
@@ -169,8 +170,13 @@ def _ratio_of_sums(counts: Array) -> float:
 
 def share(count: int, of: int, *, independent: bool = True) -> dict[str, Any] | None:
     """``count``, ``of`` and, for independent events, Wilson's 95 % interval; None if ``of`` is 0."""
-    interval = wilson_interval(count, of) if of and independent else None
-    return {"count": count, "of": of, "interval_95": interval} if of else None
+    if not of:
+        return None
+    return {"count": count, "of": of, "interval_95": wilson_interval(count, of) if independent else None}
+
+
+def _differ(buildings: Sequence[int]) -> bool:
+    return len(set(buildings)) == len(buildings)
 
 
 def reliability(probability: Array, correct: Mask) -> list[dict[str, Any]]:

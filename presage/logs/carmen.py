@@ -157,8 +157,9 @@ def _range_max(first_pass: _FirstPass, name: str, reading: Reading, notes: list[
             stated = 0.0
     near, far = (low <= stated <= high for low, high in LMS_STATED_RANGES)
     # A PARAM line does not know the mode of an LMS.
-    of_lms = near or far or not 0 < stated < np.inf or (header is None and near_codes)
-    range_max = stated if not of_lms else LMS_NEAR_RANGE_MAX if near or near_codes else LMS_FAR_RANGE_MAX
+    if not (near or far or (header is None and near_codes)) and 0 < stated < np.inf:
+        return stated
+    range_max = LMS_NEAR_RANGE_MAX if near or near_codes else LMS_FAR_RANGE_MAX
     if range_max != stated:
         notes.append(
             f"assumed: ranges from {range_max:g} m on mean no return (change with range_max in section log of --config)"

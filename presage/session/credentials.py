@@ -124,7 +124,8 @@ def add(
         if not force:
             raise UserError(f"{folder / name}: exists already; --force renews its credentials")
         robots = robots or existing.robots
-        hosts = hosts or _hosts_of(_certificate(folder / name / CERTIFICATE))
+        if role == ROUTER and not hosts:
+            hosts = _hosts_of(_certificate(folder / name / CERTIFICATE))
     member = Member(name=name, role=role, robots=tuple(robots) or EVERY_ROBOT)
     _write_member(folder, authority, member, days, hosts)
     _write_list(folder, [*(each for each in members if each.name != name), member])
@@ -201,6 +202,8 @@ def _authority(folder: Path) -> Authority:
 def _certificate(path: Path) -> x509.Certificate:
     try:
         return x509.load_pem_x509_certificate(path.read_bytes())
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror})") from None
     except ValueError:
         raise UserError(f"{path}: not a certificate in PEM format") from None
 

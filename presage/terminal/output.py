@@ -45,15 +45,15 @@ def make_folder(folder: Path, option: str = "--out") -> None:
 
 @contextmanager
 def output_folder(folder: Path, option: str = "--out") -> Iterator[None]:
-    """`make_folder` for the block; removes a new folder if the block, perhaps interrupted, leaves it empty."""
-    existed = folder.exists()
+    """`make_folder` for the block; removes new folders if the block, perhaps interrupted, leaves them empty."""
+    new = [each for each in (folder, *folder.parents) if not each.exists()]
     make_folder(folder, option)
     try:
         yield
     finally:
-        if not existed:
+        for each in new:
             with suppress(OSError):  # it is not empty
-                folder.rmdir()
+                each.rmdir()
 
 
 def write_json(file: Path | None, data: dict[str, Any]) -> None:

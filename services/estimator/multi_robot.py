@@ -194,10 +194,10 @@ class FleetLoop:
         except UserError as error:
             self.log.warning(str(error), robot=robot.robot)
             self._remove(robot)
-            self._pause(robot.robot)
+            self._retry_later(robot.robot)
 
-    def _pause(self, name: str) -> None:
-        """Leaves a robot that cannot be served alone for `RETRY_PERIOD_S`."""
+    def _retry_later(self, name: str) -> None:
+        """Does not try a robot again for `RETRY_PERIOD_S`."""
         now = time.monotonic()
         waiting = {other: at for other, at in self._retry_at.items() if at > now}
         self._retry_at = {**waiting, name: now + RETRY_PERIOD_S}
@@ -258,7 +258,7 @@ class FleetLoop:
                     self._remove(robot)
 
     def _try_to_add(self, name: str, *, named: bool) -> None:
-        """Serves a robot, or logs why that cannot be. Does nothing while the robot is left alone."""
+        """Serves a robot, or logs why that cannot be. Does nothing soon after a failure."""
         if time.monotonic() < self._retry_at.get(name, 0.0):
             return
         robot = FleetRobot(self.settings, name, self.models, self._start_search, named=named)
@@ -270,7 +270,7 @@ class FleetLoop:
             loop.bus.undeclare_all()
             if self._may_log(name):
                 self.log.warning(str(error), robot=name)
-            self._pause(name)
+            self._retry_later(name)
             return
         self._robots[name] = robot
         self._count()

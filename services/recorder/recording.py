@@ -125,7 +125,7 @@ def parts_of(options: RecorderSettings, *, numbered: bool = False) -> Callable[[
 
 
 def check_no_parts(path: Path) -> None:
-    """Raises NameTakenError if another recording has parts of this name, on which this one would end."""
+    """Raises NameTakenError if another recording has parts of this name, which this one would need later."""
     pattern = re.compile(rf"{re.escape(path.stem)}-\d{{3,}}\.mcap({re.escape(UNFINISHED_SUFFIX)})?")
     for existing in sorted(path.parent.glob("*.mcap*")):
         if pattern.fullmatch(existing.name):

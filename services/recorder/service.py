@@ -114,23 +114,24 @@ class RecorderService(Service):
             self._missing[key] += recording.message_counts.lost(key).missing
         writer = recording.writer
         try:
-            *_, path = files = writer.finish()
+            files = writer.finish()
         finally:
             if writer.failed:
                 self._ended = self._ended.model_copy(update={"messages": writer.saved})
                 self.log.error(
                     "recording is incomplete",
-                    file=str(writer.part.active),
+                    file=str(writer.part.active) if writer.part.active.exists() else "none",
                     messages=writer.saved,
                     lost=recording.lost(),
                     dropped=dropped,
                     missing=missing,
                 )
-        self._ended = self._ended.model_copy(update={"file": str(path)})
+        file = str(files[-1]) if files else ""
+        self._ended = self._ended.model_copy(update={"file": file})
         if not writer.failed:
             parts = {"parts": len(files)} if len(files) > 1 else {}
             counts = {"messages": state.messages, "dropped": dropped, "missing": missing}
-            self.log.info("recorded", file=str(path), **counts, **parts)
+            self.log.info("recorded", file=file, **counts, **parts)
 
     def extra_counts(self, key: str) -> dict[str, int]:
         """Written and missing messages of a key, for the health message."""

@@ -310,6 +310,12 @@ def test_tools_of_a_real_robot(look):
     visible = seen.see("arg.filter((name) => document.querySelector(`[data-mode=${name}]`).checkVisibility())", names)
     assert (visible, seen.see("modes.name")) == (["goal", "look"], "goal")
     assert not seen.page.locator("#pause").is_visible()
+    seen.page.keyboard.press(" ")
+    seen.toast("only in a simulation", ok=False)
+    seen.see("store.takeServices(arg, [{ name: 'simulator' }])", rows)  # the robot's scans pause
+    assert seen.see("store.simulated") is False
+    seen.see("store.takeServices(arg, [])", [*rows, {**rows[0], "name": "simulator"}])
+    assert seen.see("store.simulated") is True
 
 
 def test_robot_that_was_watched_before_the_viewer_restarted(look):
@@ -317,18 +323,26 @@ def test_robot_that_was_watched_before_the_viewer_restarted(look):
     seen.see("(window.watched = [], presage.actions.watch = (robot) => window.watched.push(robot), 0)")
 
     def hello(robot, *robots):
-        message = {"type": "hello", "control": True, "version": "stub", "robots": robots, "robot": robot}
-        seen.see("presage.connection.on.message(arg)", message)
-        return seen.see("window.watched.splice(0)")
+        return {"type": "hello", "control": True, "version": "stub", "robots": robots, "robot": robot}
 
-    hello("robot", "robot", "truck")
+    def watched(*messages):
+        """The robots that the page asks for, after each message."""
+        take = "arg.map((message) => (presage.connection.on.message(message), window.watched.splice(0).join()))"
+        return seen.see(take, messages)
+
+    both = ("robot", "truck")
+    assert watched(hello("robot", *both)) == [""]
     seen.page.locator("#robot").select_option("truck")
-    assert hello("truck", "robot", "truck") == ["truck"]
+    assert watched(hello("truck", *both)) == ["truck"]
     seen.see("store.connected = false")
-    assert hello("robot", "robot") == []  # the viewer does not know the truck yet
-    assert hello("robot", "robot", "truck") == ["truck"]
-    assert hello("truck", "robot", "truck") == []
-    assert hello("robot", "robot", "truck") == []  # the server shows another robot: a recording was closed
+    restarted = [hello("robot", "robot"), hello("robot", *both), hello("truck", *both)]
+    # The viewer does not know the truck at once. Then the server shows another robot: a recording was closed.
+    assert watched(*restarted, hello("robot", *both)) == ["", "truck", "", ""]
+    seen.see("store.connected = false")
+    seen.see("performance.now = ((now) => () => now() + (window.later ?? 0))(performance.now.bind(performance))")
+    assert watched(hello("robot", "robot")) == [""]
+    seen.see("window.later = 60000")
+    assert watched(hello("robot", *both)) == [""]  # too late: the visitor looks at another robot
 
 
 @pytest.mark.parametrize("part", ["js/map.js", "css/base.css"])

@@ -43,7 +43,7 @@ BORDER_M = 0.1
 PLAUSIBLE_SIGMAS = 2.0  # a larger error makes it less probable that a beam ends at a surface of the map
 MEAN_PENALTY = 0.04  # nats, of Gaussian errors due to that; it is added back, so that the penalty is 0 on average
 
-STATES = 4  # a constant, so that the compiler unrolls loops over them; they also avoid temporary arrays
+STATES = 4  # a constant, so that loops over the states are unrolled; array operations would allocate memory
 jit = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
@@ -207,8 +207,8 @@ def _forward_backward(
 ) -> None:
     """Fills the fields of `SurfaceEvidence` by the forward and the backward algorithm."""
     used = np.flatnonzero(~np.isnan(ranges) & (ranges > -np.inf))
-    size, states = len(used), STATES
-    forward, emitted, keep = np.empty((size, states)), np.empty((size, states)), np.empty((size, states))
+    size = len(used)
+    forward, emitted, keep = np.empty((size, STATES)), np.empty((size, STATES)), np.empty((size, STATES))
     for k in range(expected.shape[0]):
         explained[k] = 0.0
         by_beam[k] = 0.0
@@ -234,7 +234,7 @@ def _forward_backward(
                 emitted[n],
             )
             by_beam[k, b] = _step_forward(forward, emitted, prior, keep[n], n)
-        backward = np.ones(states)
+        backward = np.ones(STATES)
         for n in range(size - 1, -1, -1):
             b = used[n]
             if n < size - 1:

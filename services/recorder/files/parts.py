@@ -79,11 +79,11 @@ class PartsWriter:
         self.part.flush()
 
     def finish(self) -> list[Path]:
-        """Completes the last part and returns the paths of all parts."""
+        """Completes the last part and returns the paths of all parts, without a failed one that holds no message."""
         if not self.part.failed:
             self._write_ending()
-        self.finished.append(self.part.finish())
-        return self.finished
+        path = self.part.finish()
+        return [*self.finished, path] if path.exists() else self.finished
 
     def _is_over(self, now_ns: int) -> bool:
         limits, began = self._limits, self._began_ns

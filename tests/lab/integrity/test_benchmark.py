@@ -14,6 +14,7 @@ from lab.integrity.cases import BEAMS, CASES, make_trial
 from lab.integrity.logs import LogCase
 from lab.integrity.report import bench_integrity
 from lab.integrity.runner import RECOVERING_FILTER, IntegrityPlan
+from tests.lab.real_logs import drives as real_drive
 
 
 @pytest.mark.parametrize("name", ["kidnapped-similar", "crowd", "slip", "wrong-map"])
@@ -82,3 +83,13 @@ def test_trials_that_would_count_twice_or_not_at_all(changes, message, tmp_path)
     plan = replace(IntegrityPlan(1, 1, ("crowd",), ("precise",), "exact"), **changes)
     with pytest.raises(UserError, match=message):
         bench_integrity(plan, tmp_path, 1, Console(quiet=True))
+
+
+def test_log_with_a_learned_model(tmp_path):
+    log = tmp_path / "x.npz"
+    real_drive.save(log, real_drive.drive(240))
+    logs = tuple(LogCase(str(log), (0.0, 0.0, 0.0), False, odometry) for odometry in (False, True))
+    assert bench_integrity(IntegrityPlan(0, 1, (), ("precise",), logs=logs), tmp_path, 1, Console(quiet=True)) == 0
+    assert len(list((tmp_path / "models").glob("*.safetensors"))) == 1
+    scores = json.loads((tmp_path / "integrity.json").read_text())["summary"]["precise"]
+    assert scores["x-second-odometry"]["correct"]["count"] > 100

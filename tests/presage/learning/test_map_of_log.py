@@ -132,7 +132,9 @@ def test_folder_of_the_model_is_checked_first(log, tmp_path):
         with pytest.raises(UserError, match=message):
             map_command(MapOptions(log, tmp_path / "a room.yaml", models=tmp_path / models), QUIET, QUIET)
     with pytest.raises(UserError, match="no such file"):
-        map_command(MapOptions(tmp_path / "no.npz", tmp_path / "new" / "a.yaml"), QUIET, QUIET)
+        map_command(
+            MapOptions(tmp_path / "no.npz", tmp_path / "new" / "maps" / "a.yaml", models=tmp_path / "new"), QUIET, QUIET
+        )
     assert not (tmp_path / "new").exists()
 
 

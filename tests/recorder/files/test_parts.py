@@ -105,8 +105,7 @@ def test_part_that_cannot_begin(tmp_path):
     writer.write(TRUTH, KEY, truth(0), 0, 0)
     with pytest.raises(UserError, match=r"run-2\.mcap\.active: recording failed .* it holds no message"):
         writer.write(TRUTH, KEY, truth(1), 0, 5 * SECOND_NS)
-    writer.finish()
-    assert list(tmp_path.iterdir()) == [tmp_path / "run-1.mcap"]
+    assert writer.finish() == list(tmp_path.iterdir()) == [tmp_path / "run-1.mcap"]
 
 
 def test_part_that_cannot_end(tmp_path):
@@ -120,5 +119,4 @@ def test_part_that_cannot_end(tmp_path):
     writer.flush()
     with pytest.raises(UserError, match=r"run-1\.mcap\.active: recording failed .* `presage recover"):
         writer.write(TRUTH, KEY, truth(1), 0, 5 * SECOND_NS)
-    writer.finish()
-    assert list(tmp_path.iterdir()) == [tmp_path / "run-1.mcap.active"]
+    assert writer.finish() == list(tmp_path.iterdir()) == [tmp_path / "run-1.mcap.active"]

@@ -4,6 +4,9 @@ import { moved, placeText } from "./geometry.js";
 
 const rounded = (pose) => Object.fromEntries(Object.entries(pose).filter(([, v]) => Number.isFinite(v)).map(([k, v]) => [k, Math.round(v * 1e4) / 1e4]));
 
+const OF_SIMULATION = new Set(["teleport", "obstacle", "pause", "resume", "step", "reset", "speed"]);
+const REAL_ROBOT = { ok: false, reason: "only in a simulation, but these scans come from a real robot" };
+
 export class Actions {
   constructor(store, connection, toast) {
     Object.assign(this, { store, connection, toast });
@@ -13,7 +16,8 @@ export class Actions {
 
   /** Sends a request and shows its result: the reply's reason, else the text `done`. */
   async request(action, fields, done, { quiet = false } = {}) {
-    const reply = await this.connection.request(action, fields);
+    const possible = this.store.simulated || !OF_SIMULATION.has(action);
+    const reply = possible ? await this.connection.request(action, fields) : REAL_ROBOT;
     if (!reply.ok) this.toast(reply.reason || `${action} was refused`, false);
     else if (!quiet) this.toast(reply.reason || done, true);
     this.changed();

@@ -19,6 +19,8 @@ import { startTheme } from "./theme.js";
 import { toast } from "./toasts.js";
 import { Toolbar } from "./toolbar.js";
 
+const DISCOVERY_TIME = 10_000; // ms after connecting, in which a robot that was shown before is shown again
+
 const store = new Store();
 const view = new MapView(store);
 const floors = new Floors(store, view);
@@ -35,7 +37,7 @@ const player = new Player(store, connection, toast);
 const draw = oncePerFrame(() => panels.draw());
 reasons.drawJournal();
 let layout = storedSetting("layout"); // "wide" or "side"; null: by the shape of the world
-let wanted = new URLSearchParams(location.search).get("robot");
+let wanted = new URLSearchParams(location.search).get("robot"), wantedUntil = 0; // ms
 
 startTheme(() => {
   view.invalidate();
@@ -76,6 +78,7 @@ function takeHello(hello) {
   const moved = store.hello && store.hello.robot !== hello.robot;
   if (moved) store.clear();
   if (moved && !first) wanted = hello.robot; // chosen here, or by a recording that was opened or closed
+  if (first) wantedUntil = performance.now() + DISCOVERY_TIME; // a viewer that just started does not know all robots yet
   if (first) Object.assign(store, { player: null, servicesKnown: false });
   store.hello = hello;
   store.connected = true;
@@ -85,7 +88,8 @@ function takeHello(hello) {
   $("robot").parentElement.hidden = names.length < 1;
   $("robot").disabled = names.length < 2;
   wanted ??= hello.robot;
-  if (wanted !== hello.robot && names.includes(wanted)) actions.watch(wanted); // a viewer that just started learns it late
+  if (performance.now() > wantedUntil) wanted = hello.robot;
+  if (wanted !== hello.robot && names.includes(wanted)) actions.watch(wanted);
   if (first && hello.control) actions.recordStatus();
   $("joystick").hidden = !hello.control || !matchMedia("(pointer: coarse)").matches;
   view.rearrange();
@@ -117,7 +121,7 @@ function takeMap(message) {
 }
 
 function takeServices({ services: rows, missing }) {
-  Object.assign(store, { services: rows, missing: missing ?? [], servicesKnown: true });
+  store.takeServices(rows, missing ?? []);
   toolbar.draw();
   services.draw();
   draw();

@@ -79,7 +79,7 @@ export class Services {
     return h("div", { class: "sheet" },
       h("h2", {}, all ? "Nothing is running yet" : "Waiting for the world"),
       h("p", {}, all ? "The page works, but no robot is running. Start everything at once, in a terminal beside this one:"
-        : "The simulator is running but has not sent its world yet."),
+        : this.store.simulated ? "The simulator is running but has not sent its world yet." : "The estimator has not sent its map yet."),
       ...(all ? [this.start("presage up")] : []),
       ...(missing.length ? [h("p", { class: "or" }, all ? "or one by one:" : "Also missing:")] : []),
       ...missing.map((one) => h("div", {}, this.start(one.start))),

@@ -22,6 +22,7 @@ export class Store {
     this.services = [];
     this.missing = [];
     this.servicesKnown = false;
+    this.simulated = true; // false once the scans come from a real robot, until a simulator starts
     this.player = null;
     this.paused = false;
     this.pausedAt = 0; // ms, time of the last pause or step
@@ -45,9 +46,11 @@ export class Store {
     return this.services.filter((one) => one.state === "late");
   }
 
-  /** Whether the scans come from a simulator, or would if it were running, and not from a real robot. */
-  get simulated() {
-    return !this.servicesKnown || [...this.services, ...this.missing].some((one) => one.name === "simulator");
+  takeServices(services, missing) {
+    Object.assign(this, { services, missing, servicesKnown: true });
+    const among = (rows) => rows.some((one) => one.name === "simulator");
+    if (among(services)) this.simulated = true;
+    else if (!among(missing)) this.simulated = false;
   }
 
   /** The distance field of the current goal; null if there is none. */
