@@ -54,6 +54,8 @@ class VelocityCommand:
         """
         motion, end_ns, first_ns = np.zeros(3), stamp_ns, stamp_ns - round(delay_s * 1e9)
         for sent_ns, velocity in reversed(self._sent):
+            if end_ns <= first_ns:
+                break
             begin_ns = min(max(sent_ns, first_ns), end_ns)
             motion = se2.compose(velocity * (end_ns - begin_ns) * 1e-9, motion)
             end_ns = begin_ns
