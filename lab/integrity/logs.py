@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -39,7 +40,7 @@ class LogCase:
     @property
     def map_name(self) -> str:
         """Name of the map, and of the weights learned for it; another log or mount has another one."""
-        return f"{self.drive_name}-{run_key([replace(self, odometry=False)])[:8]}"
+        return f"{self.drive_name}-{_map_key(replace(self, odometry=False))[:8]}"
 
     @property
     def name(self) -> str:
@@ -52,6 +53,12 @@ class LogCase:
         drive = drive_at(self.log, self.mount, self.exchanged)
         numbers = np.arange(len(drive.ranges))
         return drive.part(numbers < size), drive.part(numbers >= size)
+
+
+@functools.cache
+def _map_key(case: LogCase) -> str:
+    """`run_key` of a case; cached, because it reads the log."""
+    return run_key([case])
 
 
 def cases_of(log: str, mount: tuple[float, float, float] | None) -> list[LogCase]:

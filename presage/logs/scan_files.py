@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from common.robot.ranges import ranges_for_localisation
 from presage.laser_scan import LaserScan
 from presage.logs.log import Log, Reading
 from presage.logs.opening import kind_of, open_log
+from presage.recordings.recorded_session import StampedRows
 from presage.recordings.selection import entries, robot_of
 from services.estimator.factory import ScannerGeometry
 from services.recorder.reader import Recording, read_recording
@@ -180,7 +180,7 @@ def _read_recording(path: Path) -> Scans:
     world = recording.world()
     scans: list[Scan] = []
     logged_ns: list[int] = []  # of each scan
-    odoms, truths = _PosesByStamp(), _PosesByStamp()
+    odoms, truths = StampedRows(), StampedRows()
     commands, goals = [], []  # of each scan
     command = goal = unknown = np.full(3, np.nan)
     for _, message, raw in entries(recording, robot_of(recording), SCAN, ODOM, TRUTH, CMD_VEL, GOAL):
@@ -190,9 +190,9 @@ def _read_recording(path: Path) -> Scans:
             commands.append(command)
             goals.append(goal)
         elif isinstance(message, Odom):
-            odoms.add(message, raw.logged_ns)
+            odoms.add(message.stamp_ns, raw.logged_ns, *message.pose.array())
         elif isinstance(message, Truth):
-            truths.add(message, raw.logged_ns)
+            truths.add(message.stamp_ns, raw.logged_ns, *message.pose.array())
         elif isinstance(message, CmdVel):
             command = message.twist.array()
         elif isinstance(message, Goal):
@@ -206,42 +206,18 @@ def _read_recording(path: Path) -> Scans:
     alike = [s for s in scans if len(s.ranges) == len(first.ranges) and s.mount == first.mount]
     if len(alike) != len(scans):
         raise UserError(f"{path}: the scanner changes during the recording; only one scanner per file is supported")
+    stamps_ns = np.array([s.stamp_ns for s in scans], np.int64)
     return Scans(
         replace(ScannerGeometry.of_scan(first), mount_assumed=mount_assumed(recording)),
         np.array([ranges_for_localisation(s.ranges) for s in scans]),
         seconds([s.stamp_ns for s in scans]),
-        odoms.of_scans(scans, logged_ns),
+        odoms.poses_at(stamps_ns, np.array(logged_ns)) if len(odoms) else None,
         None,
-        truths.of_scans(scans, logged_ns),
+        truths.poses_at(stamps_ns, np.array(logged_ns)) if len(truths) else None,
         world.name if world is not None else None,
         recording.metadata.get("log", {}).get("reference") or RECORDED_TRUTH,
         commands=np.array(commands),
         goals=np.array(goals),
-        stamps_ns=np.array([s.stamp_ns for s in scans], np.int64),
+        stamps_ns=stamps_ns,
         time_increment=first.time_increment,
     )
-
-
-class _PosesByStamp:
-    """Poses by the stamp of their message. After a restart of a simulation, the same stamps come again."""
-
-    def __init__(self) -> None:
-        self._poses: defaultdict[int, list[tuple[int, Array]]] = defaultdict(list)  # with the time of reception, ns
-
-    def add(self, message: Odom | Truth, logged_ns: int) -> None:
-        """Adds a message that was received at a time."""
-        self._poses[message.stamp_ns].append((logged_ns, message.pose.array()))
-
-    def of_scans(self, scans: list[Scan], logged_ns: list[int]) -> Array | None:
-        """For each scan the pose (N, 3) of the same stamp, of several the one received nearest in time; else NaN.
-
-        Returns None if there are no poses.
-        """
-        if not self._poses:
-            return None
-        found = np.full((len(scans), 3), np.nan)
-        for k, (scan, received_ns) in enumerate(zip(scans, logged_ns, strict=True)):
-            if poses := self._poses.get(scan.stamp_ns):
-                delays = [abs(pose_received_ns - received_ns) for pose_received_ns, _ in poses]
-                found[k] = poses[delays.index(min(delays))][1]
-        return found

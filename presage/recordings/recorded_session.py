@@ -75,6 +75,22 @@ class StampedRows:
         """Poses (N, 3)."""
         return self.rows[:, :3]
 
+    def poses_at(self, stamps_ns: Stamps, logged_ns: Stamps) -> Array:
+        """The poses (N, 3) at the stamps (N,) of messages that were received at ``logged_ns`` (N,); NaN if unknown.
+
+        A restarted simulation uses stamps again: among several poses with the same stamp, takes the one received
+        closest in time to the message.
+        """
+        result = np.full((len(stamps_ns), 3), np.nan)
+        order = np.lexsort((self.logged_ns, self.stamps_ns))
+        stamps, logged, poses = self.stamps_ns[order], self.logged_ns[order], self.poses[order]
+        first = np.searchsorted(stamps, stamps_ns, "left")
+        end = np.searchsorted(stamps, stamps_ns, "right")
+        for row, (a, b, received) in enumerate(zip(first, end, logged_ns, strict=True)):
+            if b > a:
+                result[row] = poses[a if b == a + 1 else a + np.argmin(np.abs(logged[a:b] - received))]
+        return result
+
 
 @dataclass
 class RecordedSession:
@@ -146,7 +162,7 @@ def gather_session(recording: Recording) -> RecordedSession:
     gatherer = _Gatherer(session)
     for _, message, raw in entries(recording, robot):
         gatherer.add(message, raw.logged_ns)
-    session.true_poses = _truth_at_beliefs(session.belief, session.truth)
+    session.true_poses = session.truth.poses_at(session.belief.stamps_ns, session.belief.logged_ns)
     known = np.flatnonzero(np.isfinite(session.true_poses[:, 0]))
     if session.estimator == "mapper" and len(known):
         # The mapper's map has a frame of its own. In it, the first belief is true by definition.
@@ -216,20 +232,3 @@ class _Gatherer:
             self.session.last_scan = self._waiting[scan.stamp_ns] = scan
             if len(self._waiting) > MAX_WAITING_SCANS:
                 del self._waiting[next(iter(self._waiting))]
-
-
-def _truth_at_beliefs(belief: StampedRows, truth: StampedRows) -> Array:
-    """The true pose at the stamp of each belief (N, 3); NaN if there is none.
-
-    A restarted simulation uses stamps again: among several poses with the same stamp, takes the one received closest in
-    time to the belief.
-    """
-    result = np.full((len(belief), 3), np.nan)
-    order = np.lexsort((truth.logged_ns, truth.stamps_ns))
-    stamps, logged, poses = truth.stamps_ns[order], truth.logged_ns[order], truth.poses[order]
-    first = np.searchsorted(stamps, belief.stamps_ns, "left")
-    end = np.searchsorted(stamps, belief.stamps_ns, "right")
-    for row, (a, b, belief_logged) in enumerate(zip(first, end, belief.logged_ns, strict=True)):
-        if b > a:
-            result[row] = poses[a if b == a + 1 else a + np.argmin(np.abs(logged[a:b] - belief_logged))]
-    return result

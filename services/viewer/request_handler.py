@@ -220,7 +220,7 @@ class RequestHandler:
             reply = query(robot, WORLD, Request(), WorldReply)
             if reply.ok or "estimator" not in services:
                 return reply
-        if "estimator" not in services:
+        elif "estimator" not in services:
             return None
         world = query(robot, MODEL, ModelRequest(), ModelReply).world
         return None if world is None else WorldReply(world=world)

@@ -89,14 +89,19 @@ def trace_beams(phi: Floats, h: float, x: Array, y: Array, ux: Array, uy: Array,
 
 @jit
 def aim(
-    ox: float, oy: float, h: float, lasers: Array, angles: Array, first: int, end: int
+    ox: float, oy: float, h: float, lasers: Array, angles: Array, first: int, passed: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Starts (x, y) and directions (ux, uy) in grid coordinates of beams ``first`` to ``end`` of all lasers."""
-    x, y, ux, uy = np.empty(end - first), np.empty(end - first), np.empty(end - first), np.empty(end - first)
-    for n in range(end - first):
+    """Starts (x, y) and directions (ux, uy) in grid coordinates of some beams of all lasers, from the ``first`` on.
+
+    Each beam starts where it has ``passed`` (n,) m.
+    """
+    count = len(passed)
+    x, y, ux, uy = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
+    for n in range(count):
         k, b = divmod(first + n, len(angles))
-        x[n], y[n] = (lasers[k, 0] - ox) / h, (lasers[k, 1] - oy) / h
         ux[n], uy[n] = math.cos(lasers[k, 2] + angles[b]), math.sin(lasers[k, 2] + angles[b])
+        x[n] = (lasers[k, 0] + passed[n] * ux[n] - ox) / h
+        y[n] = (lasers[k, 1] + passed[n] * uy[n] - oy) / h
     return x, y, ux, uy
 
 
@@ -123,10 +128,11 @@ def trace(
     flat_edge, flat_facing = edge.reshape(-1), facing.reshape(-1)
     for first in range(0, len(flat_ranges), BEAMS_AT_ONCE):
         part = slice(first, min(first + BEAMS_AT_ONCE, len(flat_ranges)))
-        x, y, ux, uy = aim(ox, oy, h, lasers, angles, part.start, part.stop)
+        x, y, ux, uy = aim(ox, oy, h, lasers, angles, first, np.zeros(part.stop - first))
         trace_beams(phi, h, x, y, ux, uy, flat_ranges[part], flat_dip[part])
         for n in range(len(x)):
-            r, beam = flat_ranges[first + n], first + n
+            beam = first + n
+            r = flat_ranges[beam]
             flat_jacobian[beam, :] = 0.0
             flat_edge[beam], flat_facing[beam] = 0.0, 0.0
             if r == np.inf:
@@ -151,12 +157,8 @@ def trace_behind(
     flat_ranges, flat_behind = ranges.reshape(-1), behind.reshape(-1)
     for first in range(0, len(flat_ranges), BEAMS_AT_ONCE):
         part = slice(first, min(first + BEAMS_AT_ONCE, len(flat_ranges)))
-        x, y, ux, uy = aim(ox, oy, h, lasers, angles, part.start, part.stop)
         inside = flat_ranges[part] + 0.5 * h  # +inf is outside the grid: behind nothing there is nothing
-        for n in range(len(x)):
-            k = (first + n) // len(angles)
-            x[n] = (lasers[k, 0] + inside[n] * ux[n] - ox) / h
-            y[n] = (lasers[k, 1] + inside[n] * uy[n] - oy) / h
+        x, y, ux, uy = aim(ox, oy, h, lasers, angles, first, inside)
         trace_beams(phi, h, x, y, ux, uy, flat_behind[part], np.empty(len(x)))
         flat_behind[part] += inside
 
@@ -168,7 +170,7 @@ def mark_crossed(
     """Marks the nodes (ny, nx) that beams at ``angles`` (B,) from lasers (N, 3) pass."""
     ny, nx = phi.shape
     for k in range(lasers.shape[0]):
-        x, y, ux, uy = aim(ox, oy, h, lasers[k : k + 1], angles, 0, len(angles))
+        x, y, ux, uy = aim(ox, oy, h, lasers[k : k + 1], angles, 0, np.zeros(len(angles)))
         ends = np.empty(len(angles))
         trace_beams(phi, h, x, y, ux, uy, ends, np.empty(len(angles)))
         for b in range(angles.shape[0]):

@@ -191,8 +191,8 @@ def update_hypothesis(
 
     The scan's information reduces the noise covariance. The model's errors are alike from scan to scan, so their
     standard deviations are averaged instead of their variances, weighted by each scan's information. ``unobserved`` is
-    true if neither the scan nor the local map shows the motion along some direction. The scale
-    errors of odometry are not estimated, but their covariance with the pose shrinks.
+    true if neither the scan nor the local map shows the motion along some direction. The scale errors of odometry are
+    not estimated, but their covariance with the pose shrinks.
     """
     inverse = np.linalg.inv(fused.information)
     prior_information = fused.information - evidence.curvature[k]

@@ -77,7 +77,6 @@ function takeHello(hello) {
   const first = !store.connected;
   const moved = store.hello && store.hello.robot !== hello.robot;
   if (moved) store.clear();
-  if (moved && !first) wanted = hello.robot; // chosen here, or by a recording that was opened or closed
   if (first) wantedUntil = performance.now() + DISCOVERY_TIME; // a viewer that just started does not know all robots yet
   if (first) Object.assign(store, { player: null, servicesKnown: false });
   store.hello = hello;
@@ -87,8 +86,8 @@ function takeHello(hello) {
   $("robot").value = hello.robot ?? "";
   $("robot").parentElement.hidden = names.length < 1;
   $("robot").disabled = names.length < 2;
-  wanted ??= hello.robot;
-  if (performance.now() > wantedUntil) wanted = hello.robot;
+  // A robot that was chosen here, or by a recording that was opened or closed.
+  if (!wanted || (moved && !first) || performance.now() > wantedUntil) wanted = hello.robot;
   if (wanted !== hello.robot && names.includes(wanted)) actions.watch(wanted);
   if (first && hello.control) actions.recordStatus();
   $("joystick").hidden = !hello.control || !matchMedia("(pointer: coarse)").matches;

@@ -46,6 +46,7 @@ export class Store {
     return this.services.filter((one) => one.state === "late");
   }
 
+  /** Rows of the running services and those that are missing; a real robot has neither a simulator nor misses one. */
   takeServices(services, missing) {
     Object.assign(this, { services, missing, servicesKnown: true });
     const among = (rows) => rows.some((one) => one.name === "simulator");
