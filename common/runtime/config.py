@@ -52,8 +52,8 @@ class ServiceSettings(BaseSettings):
     )
     service: ClassVar[str] = "service"
     program: ClassVar[str] = ""  # shown in --help; if empty, python -m services.NAME
-    # Fields that are set only by PRESAGE_<SERVICE>_<FIELD> and the service's section of the file, not by
-    # PRESAGE_<FIELD> and the file's top level.
+    # Each field is set by PRESAGE_<SERVICE>_<FIELD> and in the service's section of the file. These are set only there,
+    # the others also for all services, by PRESAGE_<FIELD> and at the top level of the file.
     private: ClassVar[frozenset[str]] = frozenset()
 
     robot: Annotated[
@@ -130,7 +130,7 @@ class ServiceSettings(BaseSettings):
         shared = EnvSettingsSource(settings_cls, env_ignore_empty=True)()
         own = EnvSettingsSource(settings_cls, env_prefix=f"PRESAGE_{cls.service.upper()}_", env_ignore_empty=True)()
         environment = {k: v for k, v in shared.items() if k not in cls.private}
-        environment |= {k: v for k, v in own.items() if k in cls.private}
+        environment |= own
         file = InitSettingsSource(settings_cls, _file_values.get({}))
         return init_settings, InitSettingsSource(settings_cls, environment), file
 

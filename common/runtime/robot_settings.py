@@ -17,22 +17,9 @@ ANGLE_BOUNDS_PATTERN = rf"{NUMBER_PATTERN}:{NUMBER_PATTERN}"
 MAX_STOPPING_TIME_S = 10.0  # beyond this, the scanner sees obstacles too late to brake for them
 
 
-class RobotSettings(ServiceSettings):
-    """A round base and its limits. Controller, simulator and bridge have to get the same values."""
+class MotionLimitSettings(ServiceSettings):
+    """Limits of the robot's motion."""
 
-    drive: Annotated[
-        Literal["holonomic", "differential"],
-        Field(description="drive of the robot: holonomic moves in any direction, differential along its heading"),
-    ] = "holonomic"
-    radius: Annotated[
-        float,
-        Field(
-            gt=0,
-            le=5,
-            allow_inf_nan=False,
-            description="radius of the robot in m, from base_link to its farthest corner; kept free of walls",
-        ),
-    ] = 0.27
     max_speed: Annotated[
         float,
         Field(gt=0, le=10, allow_inf_nan=False, description="maximum speed of commands, m/s of the robot's centre"),
@@ -54,6 +41,24 @@ class RobotSettings(ServiceSettings):
         float,
         Field(gt=0, le=100, allow_inf_nan=False, description="maximum angular acceleration and braking, rad/s²"),
     ] = 3.0
+
+
+class RobotSettings(MotionLimitSettings):
+    """A round base and its limits. Controller, simulator and bridge have to get the same values."""
+
+    drive: Annotated[
+        Literal["holonomic", "differential"],
+        Field(description="drive of the robot: holonomic moves in any direction, differential along its heading"),
+    ] = "holonomic"
+    radius: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=5,
+            allow_inf_nan=False,
+            description="radius of the robot in m, from base_link to its farthest corner; kept free of walls",
+        ),
+    ] = 0.27
     dead_band: Annotated[
         float, Field(ge=0, le=1, allow_inf_nan=False, description="speed below which the base does not move, m/s")
     ] = 0.0

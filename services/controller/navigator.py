@@ -305,14 +305,17 @@ class Navigator:
         command, _ = self._command.limit(stamp_ns, np.zeros(3), self._scan_points)
         return Answer(command, self.status(stamp_ns))
 
+    @property
+    def waits_for_scan(self) -> bool:
+        """Whether every scan was answered: the simulation may be paused. Otherwise the estimator is late."""
+        return self._scan is not None and self._scan.stamp_ns == self._command.stamp_ns
+
     def stop_without_belief(self, stamp_ns: int, reason: str) -> Answer:
         """Returns the command to stop and its status, for when no belief came in time.
 
         The goal is kept, and resumed with the next belief.
         """
-        # If every scan was answered, the simulation may be paused; otherwise the estimator is late.
-        paused = self._scan is not None and self._scan.stamp_ns == self._command.stamp_ns
-        command = self._command.stop(stamp_ns, paused=paused)
+        command = self._command.stop(stamp_ns, paused=self.waits_for_scan)
         self.policy.interrupt()
         self.goal_state.lose_belief(reason)
         status = self.status(stamp_ns)

@@ -53,6 +53,7 @@ class EstimatorOptions:
     generative_model: GenerativeModel | None = None  # for precise: used instead of `model`
     likelihood: Likelihood | None = None  # for precise; defaults to the weights' calibration or the noise
     optimiser: Optimiser | None = None  # for precise; defaults to Gauss-Newton
+    motion: MotionNoise = MotionNoise()  # noqa: RUF009 - frozen; for precise, unless the weights are calibrated
 
     @functools.cached_property
     def loaded_world(self) -> World:
@@ -174,7 +175,10 @@ def _prepare_particle_filter(options: EstimatorOptions, world: World) -> Estimat
 def _prepare_precise(options: EstimatorOptions, world: World) -> EstimatorFactory:
     model, seeds, card = load_model(options, world)
     calibration = card.calibration if card else None
-    settings = calibration.settings() if calibration else PreciseSettings(inflation=card.inflation if card else 1.0)
+    if calibration:
+        settings = calibration.settings()
+    else:
+        settings = PreciseSettings(inflation=card.inflation if card else 1.0, motion=options.motion)
     measured = card is not None and (card.measured or card.calibration is not None)
     cell = 0.0 if measured or world.grid is None else world.grid.resolution
     bounds = (card.world if card else world).bounds

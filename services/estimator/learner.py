@@ -41,7 +41,7 @@ class Learner:
 
     def __init__(self, estimator: PreciseEstimator, geometry: ScannerGeometry) -> None:
         """The model of the ``estimator`` is the original one."""
-        self.keys = KeyScanCollector(geometry.angles, geometry.mount, geometry.range_max)
+        self.keys = KeyScanCollector(geometry.angles, geometry.mount, geometry.range_max, estimator.settings.motion)
         self._original, self._places = estimator.model, estimator.seeds.places
         self._pool = ThreadPoolExecutor(1, "learner")
         self._process: BaseProcess | None = None

@@ -66,6 +66,7 @@ from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.key_scans import MIN_KEY_SCANS
 from services.estimator.precise.learning.live_learning import mean_error
+from services.estimator.precise.motion_model import MotionNoise
 from services.estimator.prediction_query import answer_prediction
 from services.estimator.settings import EstimatorSettings
 from services.estimator.shared.interface import Observation, PoseEstimator, Posterior
@@ -89,6 +90,9 @@ def estimator_options(settings: EstimatorSettings) -> EstimatorOptions:
         seed=settings.seed,
         initial_pose=parse_initial_pose(settings.initial_pose, "--initial-pose") if settings.initial_pose else None,
         descent=Descent(alpha=settings.alpha, iterations=settings.iterations),
+        motion=MotionNoise.of_robot(
+            settings.max_speed, settings.max_turn, settings.acceleration, settings.turn_acceleration
+        ),
     )
 
 

@@ -9,13 +9,13 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from common.geometry.pose_text import POSE_PATTERN
-from common.runtime.config import ServiceSettings
+from common.runtime.robot_settings import MotionLimitSettings
 
 ROBOT_NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 _PATTERN = r"[A-Za-z0-9_.*?-]{1,64}"
 
 
-class EstimatorSettings(ServiceSettings):
+class EstimatorSettings(MotionLimitSettings):
     """Estimator: publishes for each scan a belief about the pose, and the scan it expected.
 
     Examples:

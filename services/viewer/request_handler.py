@@ -63,6 +63,8 @@ class RequestHandler:
         """Makes the visitor watch a robot, and sends the list of robots and the robot's world."""
         context = self.context
         context.hub.watch(visitor, robot)
+        if robot != context.playback.robot:
+            visitor.live_robot = robot
         self._hello(visitor)
         if robot in self._world_texts:
             visitor.queue_text(self._world_texts[robot], "world")
@@ -244,12 +246,12 @@ class RequestHandler:
                     hub.queue_text(playback.robot, "player", text)
 
     def _on_closed(self, reason: str) -> None:
-        """Shows the live robot again to visitors who watched the recording."""
+        """Shows visitors who watched the recording the robot again that they watched before."""
         playback, hub = self.context.playback, self.context.hub
         self.worlds.pop(playback.robot, None)
         self._world_texts.pop(playback.robot, None)
         for visitor in hub.watching(playback.robot):
-            self.show_robot(visitor, self.context.roster.robot)
+            self.show_robot(visitor, visitor.live_robot or self.context.roster.robot)
             visitor.queue_text(json.dumps({"type": "closed", "reason": reason}))
 
     async def _in_thread(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:

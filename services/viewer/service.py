@@ -18,7 +18,7 @@ from typing import ClassVar
 
 from common.bus.inbox import Sample
 from common.messages.definitions import Health, Status
-from common.messages.topics import SCAN, TOPICS, Topic
+from common.messages.topics import MAP, SCAN, Topic
 from common.messages.wire import DecodeError
 from common.runtime.service import Service
 from common.runtime.service_monitor import ServiceMonitor, start_command
@@ -186,6 +186,7 @@ class ViewerService(Service):
             self.hub.call_soon(partial(self.request_handler.robots_changed, frozenset(changed)))
         while self._ended_mappers:
             if (followed := self.robots.get(robot := self._ended_mappers.popleft())) is not None and followed.view.live:
+                followed.unread.pop(MAP, None)
                 followed.view.end_mapping()
                 self._send_changes(robot, followed.view)
         while self.hub.newcomers:
@@ -258,7 +259,7 @@ class ViewerService(Service):
         if robot not in self.robots:
             live = "replay" not in self.roster.services(robot)
             followed = self.robots[robot] = FollowedRobot(RobotView(robot, live=live), ServiceMonitor(robot))
-            for topic in TOPICS:
+            for topic in SHOWN_TOPICS:
                 # A replay publishes the messages of one step at once. All are kept, because the newest messages
                 # of different topics may have different stamps.
                 end = self.loop.bus.subscribe(topic, self.loop.inbox, keep_all=not live, robot=robot)

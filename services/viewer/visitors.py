@@ -26,6 +26,7 @@ class Visitor:
     ) -> None:
         """``send_text`` and ``send_bytes`` return when the connection has taken the data."""
         self.robot = ""
+        self.live_robot = ""  # that was watched before a recording
         self.sent = self.skipped = 0  # frames
         self._send_text, self._send_bytes = send_text, send_bytes
         self._texts: OrderedDict[object, str | bytes] = OrderedDict()

@@ -49,6 +49,19 @@ def test_error_over_that_without_distortion(make, prior):
     assert corrected < 1.3 * instantaneous < uncorrected
 
 
+@pytest.mark.parametrize("make", [precise, particle_filter])
+def test_replay_that_starts_again(make):
+    """The duration of the motion back to the start is unknown, so scans are not corrected for it."""
+    scene, path = Scene.of(ROOM, 271, 5), drive(60)
+    found = make(np.array(scene.scanner.mount))
+    found.restart(path[0], CERTAIN)
+    scans = observations(scene, path, "corrected", "odometry")
+    for each in scans:
+        found.update(each)
+    error = found.update(scans[0]).pose - path[0]
+    assert np.hypot(*error[:2]) < 0.2
+
+
 def test_jump_is_no_motion():
     """The first scan after a robot that stood is carried along a wall is not corrected for the jump."""
     world = load_world("corridor")

@@ -12,7 +12,8 @@ from common.messages.definitions import Belief, CmdVel, Goal, Odom, Pose, Predic
 from common.messages.requests import LocaliseRequest
 from common.messages.topics import CMD_VEL, GOAL, LOCALISE, ODOM, SCAN
 from common.robot.scanner import SCANNERS
-from services.estimator.service import EstimatorService
+from services.estimator.precise.motion_model import MotionNoise
+from services.estimator.service import EstimatorService, estimator_options
 from services.estimator.settings import EstimatorSettings
 
 SCANNER = SCANNERS["tim571"].with_beams(622)
@@ -197,6 +198,13 @@ def test_other_world_of_same_name(tmp_path, estimator):
     file.write_text("name: corridor\nboundary: [[0, 0], [14, 0], [14, 4.5], [0, 4.5]]\n")
     with pytest.raises(UserError, match="another world of the same name 'corridor'"):
         opened(world=str(file), estimator=estimator)
+
+
+def test_limits_of_the_robot():
+    """A faster robot is expected to move faster, a slower one may still be pushed."""
+    fast, slow = (EstimatorSettings(max_speed=speed, max_turn=2 * speed) for speed in (3.0, 0.3))
+    assert (estimator_options(fast).motion.speed, estimator_options(fast).motion.turn) == (3.0, 6.0)
+    assert estimator_options(slow).motion == MotionNoise()
 
 
 def test_missing_model(tmp_path):

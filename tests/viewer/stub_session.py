@@ -218,6 +218,7 @@ def services_message(scene: str) -> dict:
     rows = [
         {
             "name": name, "state": "alive", "alive": True, "age_s": 0.4, "uptime_s": 754.0, "note": "",
+            "idle": name == "recorder",
             "rates": [{**quiet, "topic": t, "published_hz": 15.0} for t in published[name]]
             + [{**quiet, "topic": t, "received_hz": 15.0, "dropped": 2 * (t == "scan")} for t in received[name]],
         }

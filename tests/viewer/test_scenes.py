@@ -54,7 +54,7 @@ PIXEL = """((copy) => {
 TWO_METRES_TO_GO = """((field) => {
     const i = field.distance.findLastIndex((d) => d > 1.9 && d < 2.1), { origin, resolution: cell, width } = field;
     return [origin.x + (i % width + 0.5) * cell, origin.y + (Math.floor(i / width) + 0.5) * cell];
-})(store.prior)"""
+})(store.fieldOfGoal)"""
 
 
 @pytest.fixture(scope="module")
@@ -133,13 +133,14 @@ def test_tools_on_a_phone(look):
 
 def test_plan_drawn_and_hidden(look):
     seen = look("planning", color_scheme="light")
-    seen.wait("store.prior && store.frame.path.length > 4 && store.frame.obstacles.length && store.frame.people.length")
+    seen.wait("store.fieldOfGoal && store.frame.path.length > 4")
+    seen.wait("store.frame.obstacles.length && store.frame.people.length")
     assert seen.see("view.shown.field") is True
     seen.page.keyboard.press(" ")  # nothing moves any more
     seen.wait("store.paused")
     place, person = seen.see(TWO_METRES_TO_GO), seen.see("[...store.frame.people.slice(0, 2)]")
-    plain = seen.see("[...store.prior.distance].filter(Number.isFinite).length")
-    assert 0 < plain < seen.see("store.prior.distance.length")
+    plain = seen.see("[...store.fieldOfGoal.distance].filter(Number.isFinite).length")
+    assert 0 < plain < seen.see("store.fieldOfGoal.distance.length")
     for layer, where in (("field", place), ("truth", person)):
         at = seen.see("view.camera.toScreen(arg[0], arg[1])", where)
         shown = seen.see(PIXEL, at)
@@ -218,6 +219,37 @@ def test_goals_by_drag(look):
     assert seen.see("view.gesture.selected") == "cylinder"
 
 
+def test_escape_during_a_drag(look):
+    seen = look("tracking")
+    seen.wait("store.world && store.frame")
+    seen.page.mouse.move(*seen.at(12.0, 1.5))
+    seen.page.mouse.down()
+    seen.page.mouse.move(*seen.at(12.0, 2.5), steps=4)
+    assert seen.see("view.gesture.goal") is not None
+    seen.page.keyboard.press("Escape")
+    seen.page.mouse.move(*seen.at(13.0, 2.5), steps=4)
+    seen.page.mouse.up()
+    seen.drag((11.0, 1.5), (11.0, 2.5))  # a later drag counts
+    assert "(11" in seen.toast("Going to")
+
+
+def test_recording_that_another_program_began(look):
+    seen = look("tracking")
+    seen.wait("store.services.length")
+    assert seen.page.locator("#record-label").inner_text() == "Record"
+    seen.see("presage.connection.request = () => Promise.resolve({ ok: true, recording: true })")
+    seen.see("(store.services.find((one) => one.name === 'recorder').idle = false, presage.actions.followRecorder())")
+    seen.wait("document.getElementById('record-label').textContent === 'Stop'")
+
+
+def test_controller_that_hangs(look):
+    seen = look("tracking")
+    seen.wait("store.frame?.status")
+    row = {"name": "controller", "state": "late", "alive": True, "note": "", "idle": False, "rates": []}
+    seen.see("(store.takeServices(arg, []), store.takeFrame(store.frame, performance.now()), 0)", [row])
+    assert seen.see("store.frame.status") is None
+
+
 def test_axis_labels(look):
     seen = look("tracking", **PHONE)
     seen.wait("store.world && store.frame")
@@ -289,13 +321,13 @@ def test_server_that_comes_back(browser, processes):
     first = processes.start("tests.viewer.stub_server", "--port", port)
     assert wait_until(lambda: accepts(int(port)), WAIT_TIMEOUT_S)
     seen = browser_tools.visit(browser, f"http://127.0.0.1:{port}/planning/")
-    seen.wait("store.arrivals.length > 5 && store.prior")
+    seen.wait("store.arrivals.length > 5 && store.fieldOfGoal")
     first.stop(signal.SIGKILL)
     seen.page.locator("#banner").wait_for(timeout=1000 * WAIT_TIMEOUT_S)
     assert "No connection" in seen.page.locator("#banner").inner_text()
     processes.start("tests.viewer.stub_server", "--port", port)
     seen.page.locator("#banner").wait_for(state="hidden", timeout=1000 * WAIT_TIMEOUT_S)
-    seen.wait("store.connected && store.prior && performance.now() - store.arrivals.at(-1) < 500")
+    seen.wait("store.connected && store.fieldOfGoal && performance.now() - store.arrivals.at(-1) < 500")
     seen.page.context.close()
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+from types import SimpleNamespace
 
 import pytest
 
+from services.viewer.request_handler import RequestHandler
 from services.viewer.visitors import MAX_QUEUED_TEXTS, Hub, TooSlowError, Visitor
 
 
@@ -147,3 +149,26 @@ def test_hub_without_a_loop():
     loop.close()
     hub.call_soon(lambda: called.append(3))
     assert called == [2]
+
+
+def test_robot_after_a_recording():
+    """A visitor who closes a recording watches the same robot as before."""
+
+    async def scenario(tasks):
+        hub, (visitor,), running = hub_with_visitors(FakeConnection())
+        tasks += running
+        handler = RequestHandler(
+            SimpleNamespace(
+                hub=hub,
+                playback=SimpleNamespace(robot="robot-replay"),
+                roster=SimpleNamespace(robot="robot", robots=lambda: ["robot", "truck"]),
+                control_allowed=True,
+                version="1",
+            )
+        )
+        for robot in ("truck", "robot-replay"):
+            handler.show_robot(visitor, robot)
+        handler._on_closed("")
+        assert visitor.robot == "truck"
+
+    run(scenario)

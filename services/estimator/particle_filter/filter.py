@@ -94,9 +94,11 @@ class ParticleFilter:
     def update(self, observation: Observation) -> Posterior:
         """Returns the posterior after one more scan."""
         period, odom = self._period(observation), self._odometry_since_last_scan(observation)
-        self._predict(observation, period, odom)
+        self._predict(observation, min(period, MAX_PERIOD_S), odom)
         self._anneal()
-        if self._velocity is None and odom is not None:
+        if self._is_earlier(observation):
+            self._velocity = self._tracked = None
+        elif self._velocity is None and odom is not None:
             self._velocity = odom / period
         corrected = correct_motion(observation, self._velocity, self.mount)
         s, sigma, beams = self.settings, self._sigma, self.settings.max_beams
@@ -121,7 +123,12 @@ class ParticleFilter:
         last = self._last
         if last is None or now.stamp is None or last.stamp is None or now.stamp <= last.stamp:
             return NOMINAL_PERIOD_S
-        return min(now.stamp - last.stamp, MAX_PERIOD_S)
+        return now.stamp - last.stamp
+
+    def _is_earlier(self, now: Observation) -> bool:
+        """Whether the stamp is earlier than that of the last scan, so that the duration of the motion is unknown."""
+        last = self._last
+        return last is not None and now.stamp is not None and last.stamp is not None and now.stamp < last.stamp
 
     def _odometry_since_last_scan(self, now: Observation) -> Array | None:
         if self._last is None or now.odom is None or self._last.odom is None:
@@ -234,8 +241,9 @@ class ParticleFilter:
     def _posterior(self, observation: Observation, found: tuple[Hypothesis, ...]) -> Posterior:
         pose = found[0].pose
         scan_fit = self.sensor.explain(pose, self.mount, observation)
-        self._recovery.add(scan_fit.fit)
-        self._health.add(scan_fit.fit)
+        if not np.isnan(scan_fit.fit):
+            self._recovery.add(scan_fit.fit)
+            self._health.add(scan_fit.fit)
         self._state = self._next_state(found)
         return Posterior(
             state=self._state,

@@ -29,7 +29,7 @@ class ScanFit(NamedTuple):
     accuracy: float  # nats, -ln p(o | pose)
     xi: Array  # (3,) minus the gradient of accuracy
     curvature: Array  # (3, 3) Gauss-Newton Hessian
-    fit: float  # mean likelihood of a beam relative to an exact one, in (0, 1]: about the share of beams explained
+    fit: float  # mean likelihood of a beam relative to an exact one, about the share of beams explained; or NaN
 
 
 class Sensor:
@@ -85,7 +85,7 @@ class Sensor:
             accuracy=float(-np.log(p).sum()),
             xi=-slope @ (pull * d),
             curvature=(slope * pull) @ slope.T,
-            fit=float(p.mean() / exact) if len(p) else 1.0,
+            fit=float(p.mean() / exact) if len(p) else np.nan,
         )
 
     def _beams(self, observation: Observation, max_beams: int | None) -> tuple[npt.NDArray[np.int_], Array, Array]:

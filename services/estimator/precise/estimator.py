@@ -158,7 +158,8 @@ class PreciseEstimator:
         self._local_pose = np.zeros(3)  # in the frame of the local map
         self._ignored_beams = np.zeros(0, np.bool_)  # (B,) no evidence, see `LocalMapScan.ignored`
         self._log_change = 0.0  # nats, log probability of the changes since the last scan
-        self._log_carried = -np.inf  # nats, evidence that the robot was carried away just before; unnormalised
+        # nats, evidence that the robot was carried between the last scan and this one, without that of this scan
+        self._log_carried = -np.inf
 
     def use_model(self, model: GenerativeModel, seeds: Seeds) -> None:
         """Replaces the model by one learned from real scans in the same frame; the belief stays."""
@@ -187,7 +188,8 @@ class PreciseEstimator:
             match = self._match_local_map(
                 match, self._predict_local_motion(period, odom, observation.command), predicted.covariance
             )
-        if observation.time_increment and any(each.is_near(match.poses[0]) for each in motions[0][:-1]):
+        is_expected = any(each.is_near(match.poses[0]) for each in motions[0][:-1])
+        if observation.time_increment and is_expected and not self._is_earlier(observation):
             # Only if the match is one of the predicted motions: otherwise the robot may have been carried to another
             # place, and may have stood still during the scan.
             match = self._correct_motion_again(match, observation, period)
@@ -206,7 +208,7 @@ class PreciseEstimator:
             return None
         if not self._may_be_elsewhere():
             self._search_interval = 1
-        elif self._is_search_due():
+        elif self._is_search_due(view):
             return None
         return self._finish_scan(view, observation)
 
@@ -262,10 +264,19 @@ class PreciseEstimator:
 
     def _velocity(self, hypothesis: TrackedHypothesis, observation: Observation) -> Array | None:
         """Velocity (3,) in base_link from the last poses or else from odometry, or None if it is unknown."""
+        if self._is_earlier(observation):
+            return None
         odom = self._odometry_since_last_scan(observation)
         if hypothesis.velocity is not None or odom is None:
             return hypothesis.velocity
         return odom / self._period(observation.stamp)
+
+    def _is_earlier(self, observation: Observation) -> bool:
+        """Whether the stamp is earlier than that of the last scan, as when a replay starts again.
+
+        Then the duration of the motion in between is unknown.
+        """
+        return observation.stamp is not None and self._stamp is not None and observation.stamp < self._stamp
 
     def _odometry_since_last_scan(self, observation: Observation) -> Array | None:
         if observation.odom is None or self._odom is None:
@@ -331,7 +342,8 @@ class PreciseEstimator:
         Returns ``match`` if the local map gives no motion, or if the scan fits the map far better at its pose.
         """
         view = match.view
-        starts = np.array([*(each.mean for each in motions), self._local_map.to_local(match.poses[0])])
+        # Not the widest motion, whose mean is that of another.
+        starts = np.array([*(each.mean for each in motions[:-1]), self._local_map.to_local(match.poses[0])])
         found = self._local_map.match(starts, view, motions[-1])
         if found is None:
             return match
@@ -361,16 +373,15 @@ class PreciseEstimator:
     ) -> TrackedHypothesis:
         """Fuses the k-th hypothesis with the scan.
 
-        An improbable motion, given those that were ``predicted``, is evidence for a kidnapping. Where the stamp is
-        earlier than that of the last scan, as when a replay starts again, the duration of the motion is unknown, and
-        this evidence is left out.
+        An improbable motion, given those that were ``predicted``, is evidence for a kidnapping. Where the duration of
+        the motion is unknown, this evidence is left out.
         """
         hypothesis, period = self.hypotheses[k], self._period(observation.stamp)
         candidates, pose, evidence = match.motions[k], match.poses[k], match.evidence
-        unobserved = match.unobserved[k]
+        explained, unobserved = float(match.explained[k]), match.unobserved[k]
         project_evidence(evidence, k, unobserved)
         # Where the map explains few beams, all of them may do so by chance, which is no information about the pose.
-        evidence.scale(k, _fraction_not_by_chance(float(match.explained[k])))
+        evidence.scale(k, _fraction_not_by_chance(explained))
         # A match with the local map gives the motion in the unobserved directions, too.
         unknown_motion = len(unobserved) > 0 and match.local_pose is None
         if unknown_motion and self._odometry_since_last_scan(observation) is None:
@@ -390,8 +401,8 @@ class PreciseEstimator:
         ]
         best = min(fused, key=lambda each: each.negative_log_evidence)
         updated = update_hypothesis(hypothesis, best, evidence, k, period, unobserved=unknown_motion)
-        if observation.stamp is not None and self._stamp is not None and observation.stamp < self._stamp:
-            return updated
+        if self._is_earlier(observation):
+            return replace(updated, velocity=None)
         return replace(updated, motion_cost=self._motion_cost(predicted, updated))
 
     def _find_alternatives(
@@ -455,17 +466,17 @@ class PreciseEstimator:
         # Alternatives found for this scan come last in `hypotheses`, and have no counterpart in `self.hypotheses`. They
         # differ by the motion, against which surfaces that were seen before may speak. They do not speak for it: among
         # similar surfaces, the search may have missed the right match.
-        cost_at_best, seen_against = hypotheses[0].motion_cost, np.zeros(len(hypotheses))
+        cost_at_best, cost_of_seen = hypotheses[0].motion_cost, np.zeros(len(hypotheses))
         if len(hypotheses) > len(self.hypotheses):
             of_seen = _log_at_poses(view, poses, appeared | small, before)[0] - log_likelihood
-            seen_against[len(self.hypotheses) :] = np.maximum(0.0, of_seen[0] - of_seen)[len(self.hypotheses) :]
+            cost_of_seen[len(self.hypotheses) :] = np.maximum(0.0, of_seen[0] - of_seen)[len(self.hypotheses) :]
         hypotheses = [
             replace(
                 hypothesis,
                 # A motion costs less where the pose is less certain; that does not speak for this hypothesis.
                 log_evidence=hypothesis.log_evidence
                 - max(0.0, hypothesis.motion_cost - cost_at_best)
-                - seen_against[k],
+                - cost_of_seen[k],
                 explained=evidence.explained[k],
                 scan_log_likelihood=log_likelihood[k] + log_change,
                 scan_surroundings=surroundings[k],
@@ -540,8 +551,10 @@ class PreciseEstimator:
         unknown = max([self._unknown_place.log_evidence, *(key.log_unknown for key in self._local_map.scans)])
         return bool(best.log_weight <= unknown - log_places)
 
-    def _is_search_due(self) -> bool:
+    def _is_search_due(self, view: View) -> bool:
         """Whether to search now: at growing intervals, and while not tracking also at each key scan."""
+        if not view.returned.any():  # as with a covered scanner: the search would find nothing
+            return False
         if not self._is_tracked() and self._is_key_scan_due():
             return True
         return self._scans_since_search >= self._search_interval

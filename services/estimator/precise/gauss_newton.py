@@ -29,7 +29,7 @@ MAX_STEP = np.array([0.5, 0.5, 0.3])  # m, m, rad: beyond this distance the line
 SETTLED_STEP = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: after a smaller step, a descent ends
 # Added in quadrature to every beam's standard deviation during a descent, so that the minimum is wide at first.
 COARSE_SIGMA_M, MEDIUM_SIGMA_M = 0.3, 0.1
-FOLLOWING_SCHEDULE_M = (0.05, 0.0, 0.0, 0.0, 0.0)  # its values, step by step, in a descent from near the minimum
+FOLLOWING_SCHEDULE_M = (0.05, 0.0, 0.0, 0.0, 0.0)  # at each step of a descent that starts near the minimum
 MAX_POLISHING_STEPS = 4
 # The errors of a map are counted as equal over this length of a surface, and as independent beyond (a guess).
 CORRELATION_LENGTH_M = 2.0

@@ -81,9 +81,9 @@ class ChangeRate:
 
     def log_probability(self, changes: int, period: float) -> float:
         """Log probability in nats of a number of changes within ``period`` s."""
-        shape, share = 0.5 + self.remembered, period / (CHANGE_MEMORY_S + period)
+        shape, success = 0.5 + self.remembered, period / (CHANGE_MEMORY_S + period)
         combinations = math.lgamma(shape + changes) - math.lgamma(shape) - math.lgamma(changes + 1)
-        return combinations + shape * math.log1p(-share) + changes * math.log(share)
+        return combinations + shape * math.log1p(-success) + changes * math.log(success)
 
     def learn(self, changes: int, period: float) -> None:
         """Learns from a number of changes within ``period`` s, and forgets earlier ones exponentially."""

@@ -54,6 +54,19 @@ class MotionNoise:
     standing: float = 1e-4  # m and rad per scan: motion of a robot that stands still
     unexpected: float = 0.02  # probability (a guess) that odometry is wrong, and of a motion that nothing foretells
 
+    @classmethod
+    def of_robot(cls, speed: float, turn: float, acceleration: float, turn_acceleration: float) -> MotionNoise:
+        """The noise for a robot with these limits.
+
+        For lower limits it is the default, because the robot may also be pushed, or driven by another program.
+        """
+        return cls(
+            acceleration=max(cls.acceleration, acceleration),
+            turn_acceleration=max(cls.turn_acceleration, turn_acceleration),
+            speed=max(cls.speed, speed),
+            turn=max(cls.turn, turn),
+        )
+
 
 @dataclass(frozen=True)
 class MotionCandidate:
@@ -94,22 +107,23 @@ def predict_motion(
     full_speed = np.array([noise.speed, noise.speed, noise.turn]) * period
     before = MotionCandidate(pose, covariance, 1.0, np.zeros((3, 3)) if slip_covariance is None else slip_covariance)
     likely = 1 - noise.unexpected
-    probability = likely if odom is None else likely * noise.unexpected  # of the motions that odometry does not give
+    # Of each motion that odometry does not give
+    probability_of_others = likely if odom is None else likely * noise.unexpected
     any_motion = noise.unexpected
     if command is not None or velocity is not None:
-        probability /= 2
+        probability_of_others /= 2
     elif odom is None:
-        probability = any_motion = 0.5  # nothing tells whether the robot stands
-    candidates = [_propagate(before, np.zeros(3), np.full(3, noise.standing), probability)]  # standing still
+        probability_of_others = any_motion = 0.5  # nothing tells whether the robot stands
+    candidates = [_propagate(before, np.zeros(3), np.full(3, noise.standing), probability_of_others)]  # standing still
     acceleration = np.array([noise.acceleration, noise.acceleration, noise.turn_acceleration])
     change = acceleration * period * max(period, SMOOTHING_TIME_S)
     if command is not None:
         change = change + noise.command_share * np.abs(command) * period
-        candidates.append(_propagate(before, command * period, change, probability))
+        candidates.append(_propagate(before, command * period, change, probability_of_others))
     elif velocity is not None:
         motion = limit_steps(velocity * period, MAX_MOTION_SIGMAS * full_speed)
         deviation = np.sqrt(change**2 + _velocity_variance(pose, covariance, period))
-        candidates.append(_propagate(before, motion, deviation, probability))
+        candidates.append(_propagate(before, motion, deviation, probability_of_others))
     if odom is not None:
         moved, turned = float(np.hypot(odom[0], odom[1])), abs(float(odom[2]))
         position = np.sqrt(noise.path_by_path * moved + noise.path_by_turn * turned) + noise.standing

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from common.robot.ranges import is_surface
 from services.estimator.precise.gauss_newton import CORRELATION_LENGTH_M
 from services.estimator.precise.noise import estimate_noise
 from services.estimator.precise.residuals import (
@@ -105,7 +106,7 @@ class Precision:
 
         Returns the ``configured`` likelihood with the noise learned so far.
         """
-        if not configured.relative and len(ranges) >= MIN_LEARNING_BEAMS:
+        if not configured.relative and np.count_nonzero(is_surface(ranges)) >= MIN_LEARNING_BEAMS:
             factor = estimate_noise(ranges[None], angles) / configured.sigma
             if 1 / MAX_NOISE_FACTOR < factor < MAX_NOISE_FACTOR:
                 self.noise_scans += 1

@@ -60,7 +60,8 @@ class ScanSurfaces:
         _split(ranges, angles, likelihood.sigma, likelihood.relative, log_density, starts, known_log_density)
         increment = abs(float(angles[-1] - angles[0])) / max(1, count - 1)
         surface = np.cumsum(starts)
-        small = np.bincount(surface)[surface] < MIN_BEAMS if count else starts
+        measured = ranges > -np.inf  # not NaN either
+        small = np.bincount(surface, measured)[surface] < MIN_BEAMS if count else starts
         edge_tolerance = np.zeros(count, np.int64)
         _mark_edges(ranges, starts, increment, edge_error, edge_tolerance)
         switch_probability = min(0.5, SWITCHES_PER_RAD * increment)

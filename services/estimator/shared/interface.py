@@ -17,7 +17,7 @@ State = Literal["localising", "tracking", "ambiguous", "lost"]
 class Observation:
     """One scan, and other information about the motion since the last scan."""
 
-    ranges: Array  # (B,) m; +inf: no return within range_max, -inf: not measured (common/robot/ranges.py)
+    ranges: Array  # (B,) m, not 0; +inf: no return within range_max, -inf: not measured (common/robot/ranges.py)
     angles: Array  # (B,) rad in laser
     range_max: float  # m
     stamp: float | None = None  # s, time of the measurement; None if unknown: scans then come at a nominal rate

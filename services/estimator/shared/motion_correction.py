@@ -33,7 +33,7 @@ def correct_motion(observation: Observation, velocity: Array | None, mount: Arra
 def pose_at_stamp(pose: Array, velocity: Array | None, period: float, observation: Observation) -> Array:
     """The pose (3,) at the stamp, from that in the middle of the sweep.
 
-    ``velocity`` (3,) is that since the scan before, ``period`` s ago, in base_link at that scan.
+    ``velocity`` (3,) is the mean since the scan before, ``period`` s ago, in base_link at that scan.
     """
     if velocity is None or not observation.time_increment:
         return pose

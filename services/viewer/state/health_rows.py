@@ -23,6 +23,7 @@ def _row(service: ServiceStatus) -> Row:
         "alive": service.state != "absent",
         "age_s": None if service.age is None else round(service.age, 1),
         "note": service.text[:500],
+        "idle": health is not None and health.idle,
         "rates": [] if health is None else [_rates(row) for row in health.topics],
         "uptime_s": None if health is None else round(health.uptime, 1),
     }

@@ -171,14 +171,14 @@ class RobotView:
         """Forgets the map, because its mapper has ended. From now on the truth is shown again."""
         if self.map is not None:
             self.map, self.map_changed = None, True
-            self._change_frame()
+            self._forget_truth()
 
     def _store_map(self, message: Map) -> None:
         if self.map is None:
-            self._change_frame()
+            self._forget_truth()
         self.map, self.map_changed = frames.map_as_json(message, self.robot), True
 
-    def _change_frame(self) -> None:
+    def _forget_truth(self) -> None:
         """Forgets what was measured with the truth: with a map, all that is shown is in another frame than without."""
         self._received.pop(TRUTH.name, None)
         self._truths.clear()

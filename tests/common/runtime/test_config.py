@@ -138,9 +138,10 @@ def test_binary_files(tmp_path):
 
 def test_environment_variables(load, monkeypatch):
     monkeypatch.setenv("PRESAGE_ALPHA", "x")
-    monkeypatch.setenv("PRESAGE_THING_SIZE", "7")  # only private fields have such names
-    assert load().size == 1
-    monkeypatch.setenv("PRESAGE_SIZE", "-1")
+    monkeypatch.setenv("PRESAGE_SIZE", "-1")  # for all services
+    monkeypatch.setenv("PRESAGE_THING_SIZE", "7")  # for this one
+    assert load().size == 7
+    monkeypatch.delenv("PRESAGE_THING_SIZE")
     with pytest.raises(UserError, match="PRESAGE_SIZE"):
         load()
 

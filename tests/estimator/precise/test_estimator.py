@@ -271,6 +271,16 @@ def test_empty_scans(value):
     assert np.abs(off(feed(made, scene, pose, 3, 5)[-1], pose)).max() < 0.02
 
 
+def test_covered_scanner():
+    """Scans that show nothing do not put off the search in the first scan that does."""
+    made, scene = estimator(ROOM)
+    pose = np.array([3.0, 1.5, 1.0])
+    feed(made, scene, pose, 3)
+    for k in range(3, 43):
+        made.update(Observation(np.full(BEAMS, -np.inf), scene.scanner.angles(), 25.0, k / 15))
+    assert [each.state for each in feed(made, scene, pose, 3, 43)][-1] == "tracking"
+
+
 @pytest.mark.parametrize("world", ["corridor", "maze", "office"])
 def test_shipped_fields(world):
     """Finds 10 of 10 poses to a few millimetres; nothing was tuned on these poses and this noise."""

@@ -62,6 +62,13 @@ def test_noise_is_no_error_of_the_map(noise, seed):
     assert learned(RayCaster(ROOM), noise, seed) < 0.15 * noise
 
 
+@pytest.mark.parametrize("value", [np.inf, -np.inf])
+def test_scans_without_returns_show_no_noise(value):
+    precision, exact = Precision(), Likelihood(sigma=0.01)  # a tenth of it is less than the least noise that is learned
+    assert precision.update_noise(exact, np.full(622, value), ANGLES) == exact
+    assert not precision.noise_scans
+
+
 @pytest.mark.parametrize(("noise", "maps"), [(0.01, 20), (0.02, 20), (0.04, 80)])
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=2)

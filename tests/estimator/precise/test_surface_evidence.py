@@ -224,6 +224,13 @@ def test_unused_beams():
     assert not found[0].weights[0, ~used].any()
 
 
+@pytest.mark.parametrize("unmeasured", [-np.inf, np.nan])
+def test_lone_beams_among_unmeasured_ones(unmeasured):
+    ranges = np.full(400, unmeasured)
+    ranges[[100, 103]] = 2.0, 3.0
+    assert surfaces_of(ranges).small[[100, 103]].all()
+
+
 def test_one_event_however_many_beams():
     """A column that the map lacks, or that was removed, costs about the same with three times as many beams."""
     bare = World(name="bare", boundary=SQUARE)

@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from common.errors import UserError
+from common.router.router import RouterSettings
 from common.runtime.config import load_section, load_settings
 from presage.learning.options import TrainSettings
 from presage.logs.options import LogSettings
@@ -16,6 +17,7 @@ from services.bridge_ros2.settings import BridgeRos2Settings
 from services.controller.settings import ControllerSettings
 from services.estimator.settings import EstimatorSettings
 from services.mapper.settings import MapperSettings
+from services.recorder.replaying.service import ReplaySettings
 from services.recorder.settings import RecorderSettings
 from services.simulator.settings import SimulatorSettings
 from services.viewer.settings import ViewerSettings
@@ -24,7 +26,7 @@ from tests.conftest import ROOT
 FILE = ROOT / "docs" / "settings.yaml"
 SERVICES = [
     SimulatorSettings, EstimatorSettings, ControllerSettings, MapperSettings, RecorderSettings, ViewerSettings,
-    BridgeRos2Settings,
+    BridgeRos2Settings, RouterSettings, ReplaySettings,
 ]  # fmt: skip
 
 

@@ -18,14 +18,15 @@ def test_rows():
     monitor.set_alive({"simulator"}, 100.4)
     simulator, estimator = rows_of(monitor, 100.5)
     assert estimator == {
-        "name": "estimator", "state": "alive", "alive": True, "age_s": 0.5, "note": "n", "uptime_s": 1.0,
+        "name": "estimator", "state": "alive", "alive": True, "age_s": 0.5, "note": "n", "uptime_s": 1.0, "idle": False,
         "rates": [
             {"topic": "scan", "published_hz": 0.0, "received_hz": 9.0, "dropped": 2, "undecodable": 0},
             {"topic": "belief", "published_hz": 8.0, "received_hz": 0.0, "dropped": 0, "undecodable": 1},
         ],
     }  # fmt: skip
     assert simulator == {
-        "name": "simulator", "state": "alive", "alive": True, "age_s": None, "note": "", "uptime_s": None, "rates": [],
+        "name": "simulator", "state": "alive", "alive": True, "age_s": None, "note": "", "uptime_s": None,
+        "idle": False, "rates": [],
     }  # fmt: skip
     simulator, estimator = rows_of(monitor, 110.0)
     assert (simulator["state"], estimator["state"], estimator["alive"]) == ("late", "absent", False)

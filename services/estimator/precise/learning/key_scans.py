@@ -17,6 +17,7 @@ from common.robot.motion_distortion import beam_times, correct_beams, evenly_spa
 from common.robot.scan_geometry import Sweep
 from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.precise.local_map import is_key_pose
+from services.estimator.precise.motion_model import MotionNoise
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -31,9 +32,9 @@ VERIFIED_AFTER_M = 5.0  # of driving: about a room
 # A version is learned from at least this many key scans, of which this many and this share are new.
 MIN_KEY_SCANS, MIN_NEW, MIN_NEW_SHARE = 50, 20, 0.1
 MAX_GAP_S = 1.0  # longest time without `tracking` after which the robot is still assumed to be where it was tracked
-# A pose jumps if it moves by more than this between two scans, beyond the speeds of any robot that is expected.
+# A pose jumps if it moves by more than this between two scans, beyond this multiple of the robot's full speed.
 JUMP_M, JUMP_RAD = 0.2, 0.2
-MAX_SPEED, MAX_TURN = 2.0, 3.0  # m/s, rad/s
+MAX_SPEED_FACTOR = 2.0
 
 
 @dataclass(frozen=True)
@@ -57,9 +58,13 @@ class KeyScanCollector:
     Its clock follows the stamps of the scans. Where these begin again, as after a reset of the simulator, it goes on.
     """
 
-    def __init__(self, angles: Array, mount: Array, range_max: float) -> None:
-        """``angles`` (B,) rad are those of the scanner's beams, ``mount`` (3,) is the laser in base_link."""
+    def __init__(self, angles: Array, mount: Array, range_max: float, motion: MotionNoise | None = None) -> None:
+        """``angles`` (B,) rad are those of the scanner's beams, ``mount`` (3,) is the laser in base_link.
+
+        ``motion`` states the full speeds of the robot.
+        """
         self.angles, self.mount, self.range_max = angles, np.asarray(mount, float), range_max
+        self._motion = motion or MotionNoise()
         self.verified: dict[tuple[int, int, int], KeyScan] = {}  # by cell
         self.verified_total = 0  # scans verified so far, including those that newer ones replaced
         self.dropped_total = 0  # scans dropped because their pose may be wrong
@@ -68,6 +73,7 @@ class KeyScanCollector:
         self._taken_total = 0
         self._size = PLACE_M
         self._path = 0.0  # m
+        self._path_end: Array | None = None  # (3,) pose up to which the path was added
         self._clock, self._clock_ahead = -np.inf, 0.0  # s; how far it is ahead of the stamps
         self._last: tuple[float, Array] | None = None  # stamp and pose of the last scan in `tracking`
         self._last_key: Array | None = None  # (3,) pose
@@ -90,12 +96,13 @@ class KeyScanCollector:
         if self._last is not None:
             period, step = stamp - self._last[0], se2.between(self._last[1], pose)
             distance = float(np.hypot(step[0], step[1]))
-            if distance > JUMP_M + MAX_SPEED * period or abs(step[2]) > JUMP_RAD + MAX_TURN * period:
+            most = MAX_SPEED_FACTOR * period * np.array([self._motion.speed, self._motion.turn])
+            if distance > JUMP_M + most[0] or abs(step[2]) > JUMP_RAD + most[1]:
                 self.forget_unverified()
             else:
-                self._path += distance
                 velocity = step / period
         self._last = stamp, pose
+        self._extend_path(pose)
         self._verify()
         is_due = self._last_key is None or is_key_pose(self._last_key, pose)
         if velocity is not None and _is_trusted(posterior) and is_due:
@@ -107,7 +114,15 @@ class KeyScanCollector:
         """Drops the scans since the pose was last verified, because it is not certain that the robot was there."""
         self.dropped_total += len(self._unverified)
         self._unverified.clear()
-        self._last = self._last_key = None
+        self._last = self._last_key = self._path_end = None
+
+    def _extend_path(self, pose: Array) -> None:
+        """Adds the way to ``pose`` (3,) in steps of key scans: noise makes the pose of a standing robot wander."""
+        if self._path_end is not None and not is_key_pose(self._path_end, pose):
+            return
+        if self._path_end is not None:
+            self._path += float(np.hypot(*(pose - self._path_end)[:2]))
+        self._path_end = pose
 
     def take_drive(self) -> ReferenceDrive | None:
         """Returns the verified key scans in order of time if enough of them are new since the last time, else None."""

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
 
 PRESET = "precise"
-MAX_DECODED_BYTES = 1 << 26  # of a field that was received; enough for 8 hectares
+MAX_DECODED_BYTES = 1 << 28  # of a field that was received; enough for 30 hectares
 Tensors = dict[str, np.ndarray[tuple[int, ...], np.dtype[np.generic]]]
 
 

@@ -45,7 +45,7 @@ export class Actions {
   }
 
   teleport(pose) {
-    return this.request("teleport", rounded(pose), `Carried to ${this.place(pose)}; the estimator is not informed`);
+    return this.request("teleport", rounded(pose), `Carried to ${this.place(pose)}; ${this.store.paused ? "shown with the next scan" : "the estimator is not informed"}`);
   }
 
   localise() {
@@ -80,7 +80,7 @@ export class Actions {
   }
 
   async reset() {
-    const reply = await this.request("reset", {}, "Simulation restarted");
+    const reply = await this.request("reset", {}, this.store.paused ? "Restarted; shown with the next scan" : "Simulation restarted");
     if (reply.ok) this.store.forget();
   }
 
@@ -94,6 +94,12 @@ export class Actions {
     else if (reply.ok && action !== "status") this.recording = action === "start";
     this.changed();
     return reply;
+  }
+
+  /** Asks the recorder for its state if its health shows another one: another visitor or program may have changed it. */
+  followRecorder() {
+    const recorder = this.store.services.find((one) => one.name === "recorder");
+    if (this.store.control && Boolean(recorder && !recorder.idle) !== this.recording) this.recordStatus();
   }
 
   /** Updates the state of the recorder without showing a message. */

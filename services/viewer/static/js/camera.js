@@ -1,6 +1,6 @@
 // Converts between metres and pixels; pans, zooms, fits, follows.
 
-const MIN = 2, MAX = 2000; // pixels per metre
+const MIN = 0.02, MAX = 2000; // pixels per metre
 
 export class Camera {
   constructor() {

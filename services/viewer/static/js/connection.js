@@ -72,7 +72,7 @@ export class Connection {
   }
 
   checkSilence() {
-    if (this.open && performance.now() - this.lastMessageAt > SILENCE_TIMEOUT) {
+    if (this.socket && performance.now() - this.lastMessageAt > SILENCE_TIMEOUT) {
       const socket = this.socket;
       this.reconnect();
       socket.close();

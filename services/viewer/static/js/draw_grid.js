@@ -1,7 +1,8 @@
 // Draws the free and the occupied cells of a ROS map, each as an image with one pixel per cell.
 
 const FREE = 0, OCCUPIED = 100;
-let cache = { cells: "", values: null, images: new Map() }; // of the map that was drawn last
+let decoding = ""; // the cells that are being decoded, or were last
+let cache = { values: null, images: new Map() }; // of the map that is shown, which stays until the next one is decoded
 
 /** Decodes cells: base64 of zlib of one byte per cell, row by row from the lower left. */
 async function unpack(cells) {
@@ -12,11 +13,11 @@ async function unpack(cells) {
 
 /** Image of the cells of one value in one colour; null until they are decoded, after which `ready` is called. */
 function imageOf(grid, value, colour, ready) {
-  if (cache.cells !== grid.cells) {
-    const fresh = { cells: grid.cells, values: null, images: new Map() };
-    cache = fresh;
+  if (decoding !== grid.cells) {
+    decoding = grid.cells;
     unpack(grid.cells).then((values) => {
-      fresh.values = values;
+      if (decoding !== grid.cells) return; // a newer map has come
+      cache = { grid, values, images: new Map() };
       ready();
     });
   }
@@ -24,7 +25,7 @@ function imageOf(grid, value, colour, ready) {
   const key = `${value} ${colour}`;
   if (!cache.images.has(key)) {
     if (cache.images.size > 8) cache.images.clear();
-    cache.images.set(key, painted(grid, cache.values, value, colour));
+    cache.images.set(key, painted(cache.grid, cache.values, value, colour));
   }
   return cache.images.get(key);
 }
@@ -43,7 +44,7 @@ function painted(grid, values, value, colour) {
 function draw(ctx, camera, grid, value, colour, ready) {
   const shown = imageOf(grid, value, colour, ready);
   if (!shown) return;
-  const [x, y, yaw] = grid.origin, size = grid.resolution * camera.scale; // pixels per cell
+  const { origin: [x, y, yaw], resolution } = cache.grid, size = resolution * camera.scale; // pixels per cell
   const along = Math.cos(yaw) * size, across = Math.sin(yaw) * size;
   ctx.save();
   ctx.transform(along, -across, -across, -along, ...camera.toScreen(x, y));

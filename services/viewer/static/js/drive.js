@@ -1,8 +1,9 @@
-// Manual driving by keys or joystick. Sends a command ten times per second of the robot's time: they expire after half of one.
+// Manual driving by keys or joystick.
 
 import { $ } from "./dom.js";
 
-const SEND_PERIOD = 100; // ms at real time; a simulation may be faster
+// ms; a command expires after 500 ms of the robot's time, and a simulation may run ten times as fast
+const SEND_PERIOD = 25;
 const KEYS = {
   w: [1, 0, 0], arrowup: [1, 0, 0], s: [-1, 0, 0], arrowdown: [-1, 0, 0],
   a: [0, 0, 1], arrowleft: [0, 0, 1], d: [0, 0, -1], arrowright: [0, 0, -1],
@@ -16,6 +17,7 @@ export class Drive {
     this.down = new Set();
     this.stick = null; // forward and turn, -1 to 1
     this.fast = false;
+    this.waiting = false; // for the reply to the last command
     addEventListener("blur", () => this.stop());
     document.addEventListener("visibilitychange", () => document.hidden && this.stop());
     this.startStick();
@@ -38,7 +40,7 @@ export class Drive {
 
   run() {
     if (this.timer || !this.allowed()) return;
-    this.timer = setInterval(() => this.send(), SEND_PERIOD / Math.max(1, Number($("speed").value)));
+    this.timer = setInterval(() => this.send(), SEND_PERIOD);
     this.send();
   }
 
@@ -57,7 +59,10 @@ export class Drive {
       this.stop();
       return;
     }
+    if (this.waiting) return; // commands that queue up would delay the stop
+    this.waiting = true;
     const reply = await this.actions.drive(this.twist());
+    this.waiting = false;
     if (!reply.ok && this.timer) {
       this.stop();
       this.actions.toast(reply.reason, false);
@@ -74,7 +79,7 @@ export class Drive {
       sum[2] += this.stick[1];
     }
     const [vx, vy, wz] = sum.map((value) => Math.max(-1, Math.min(1, value)) * share);
-    const backing = vx < 0 ? -1 : 1; // like a car: backwards, left stays left
+    const backing = vx < 0 ? -1 : 1; // the joystick steers like a car: backwards, left stays left
     return { vx: vx * speed, vy: this.store.robot?.drive === "differential" ? 0 : vy * speed, wz: (this.stick ? backing : 1) * wz * turn * 0.6 };
   }
 

@@ -7,7 +7,7 @@ const HELP = [
   ["W A S D, arrows", "drive; Q and E sideways, shift faster"], ["space", "pause or resume"], [".", "go forward by one scan, while paused"],
   ["G C O V", "goal, carry, obstacle, look"], ["X", "cancel the goal"], ["L", "forget the believed pose and search the whole map"], ["R", "start or stop recording"],
   ["T", "show or hide the true pose"], ["F", "follow the robot"], ["+ − 0", "zoom in, zoom out, show the whole world or floor"],
-  ["Del, [ ]", "remove or turn the selected obstacle"], ["Esc", "cancel"], ["?", "this help"],
+  ["Del, [ ]", "remove or turn the selected obstacle"], ["Esc", "abort the drag, deselect"], ["?", "this help"],
 ];
 
 export function startKeys({ store, view, modes, actions, drive, player, toolbar }) {
@@ -26,7 +26,7 @@ export function startKeys({ store, view, modes, actions, drive, player, toolbar 
     " ": () => (store.player ? player.toggle() : modes.canControl && toolbar.togglePause()),
     ".": () => (store.player ? player.request("step") : modes.canControl && toolbar.standing && actions.step()),
     g: () => modes.set("goal"), c: () => modes.set("carry"), o: () => modes.set("obstacle"), v: () => modes.set("look"),
-    x: ifAllowed(() => actions.cancel()), l: ifAllowed(() => actions.localise()), r: ifAllowed(() => actions.record(actions.recording ? "stop" : "start")),
+    x: ifAllowed(() => actions.cancel()), l: ifAllowed(() => !store.map && actions.localise()), r: ifAllowed(() => actions.record(actions.recording ? "stop" : "start")),
     t: () => view.show("truth", !view.shown.truth), f: () => view.follow(!view.camera.follow),
     "+": () => view.zoom(1.35), "=": () => view.zoom(1.35), "-": () => view.zoom(1 / 1.35), "0": () => view.fit(),
     delete: remove, backspace: remove, "[": turn(Math.PI / 12), "]": turn(-Math.PI / 12),
@@ -40,7 +40,7 @@ export function startKeys({ store, view, modes, actions, drive, player, toolbar 
     if (command || (modes.canControl && drive.press(event))) event.preventDefault();
   });
   addEventListener("keyup", (event) => drive.release(event));
-  for (const id of ["toolbar", "zoom"]) for (const kind of ["click", "change"]) $(id).addEventListener(kind, backToMap);
+  for (const kind of ["click", "change"]) document.addEventListener(kind, backToMap);
 }
 
 /** Moves the focus back to the map after a mouse click, so that space pauses instead of pressing the button again. */
@@ -53,5 +53,5 @@ function backToMap({ type, target }) {
 function typing({ target, key }) {
   if (!(target instanceof Element)) return false;
   if (target.matches("input:not([type=checkbox]), select, textarea")) return true;
-  return target.matches("button, a, input, .scroll") && (key === " " || key === "Enter" || (key.startsWith("Arrow") && target.matches(".scroll")));
+  return target.matches("button, a, input, summary, .scroll") && (key === " " || key === "Enter" || (key.startsWith("Arrow") && target.matches(".scroll")));
 }

@@ -89,7 +89,6 @@ function takeHello(hello) {
   // A robot that was chosen here, or by a recording that was opened or closed.
   if (!wanted || (moved && !first) || performance.now() > wantedUntil) wanted = hello.robot;
   if (wanted !== hello.robot && names.includes(wanted)) actions.watch(wanted);
-  if (first && hello.control) actions.recordStatus();
   $("joystick").hidden = !hello.control || !matchMedia("(pointer: coarse)").matches;
   view.rearrange();
   redraw();
@@ -121,6 +120,7 @@ function takeMap(message) {
 
 function takeServices({ services: rows, missing }) {
   store.takeServices(rows, missing ?? []);
+  actions.followRecorder();
   toolbar.draw();
   services.draw();
   draw();

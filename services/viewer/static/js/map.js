@@ -133,7 +133,7 @@ export class MapView {
     ctx.globalAlpha = store.connected ? 1 : 0.45;
     if (world) {
       ground.drawFloor(ctx, camera, world, colours, () => this.invalidate());
-      if (store.prior && shown.field) drawField(ctx, camera, store.prior, colours);
+      if (store.fieldOfGoal && shown.field) drawField(ctx, camera, store.fieldOfGoal, colours);
       ground.drawRulers(ctx, camera, world, colours);
     }
     const pose = frame ? scan.scannerPose(frame) : null;

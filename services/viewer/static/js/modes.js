@@ -73,12 +73,14 @@ export class Modes {
 
   begin(point) {
     if (this.name === "look" || !this.canControl) return "pan";
+    this.active = true;
     this.held = this.grabbable(point);
     if (this.held) this.select(this.held.name);
     return "";
   }
 
   drag(point, start) {
+    if (!this.active) return;
     const heading = Math.atan2(point.y - start.y, point.x - start.x);
     const pose = { x: start.x, y: start.y, yaw: heading };
     if (this.held) {
@@ -106,6 +108,7 @@ export class Modes {
   }
 
   end(point, start, clicked) {
+    if (!this.active) return;
     const { goal, carry } = this.gesture;
     this.gesture.goal = this.gesture.carry = null;
     if (this.held) {
@@ -123,6 +126,7 @@ export class Modes {
   cancel() {
     Object.assign(this.gesture, { goal: null, carry: null, plan: null, ghost: null });
     this.held = null;
+    this.active = false; // the rest of a drag does nothing
     this.view.invalidate();
   }
 

@@ -75,15 +75,15 @@ export class Services {
 
   /** The text in place of the map before there is a world. */
   sheet(missing) {
-    const all = missing.some((one) => one.name === "simulator");
+    const nothingRuns = missing.some((one) => one.name === "simulator");
     return h("div", { class: "sheet" },
-      h("h2", {}, all ? "Nothing is running yet" : "Waiting for the world"),
-      h("p", {}, all ? "The page works, but no robot is running. Start everything at once, in a terminal beside this one:"
+      h("h2", {}, nothingRuns ? "Nothing is running yet" : "Waiting for the world"),
+      h("p", {}, nothingRuns ? "The page works, but no robot is running. Start everything at once, in a terminal beside this one:"
         : this.store.simulated ? "The simulator is running but has not sent its world yet." : "The estimator has not sent its map yet."),
-      ...(all ? [this.start("presage up")] : []),
-      ...(missing.length ? [h("p", { class: "or" }, all ? "or one by one:" : "Also missing:")] : []),
+      ...(nothingRuns ? [this.start("presage up")] : []),
+      ...(missing.length ? [h("p", { class: "or" }, nothingRuns ? "or one by one:" : "Also missing:")] : []),
       ...missing.map((one) => h("div", {}, this.start(one.start))),
-      ...(all && this.store.control ? [h("p", { class: "or" }, "To look at a recording, none of them is needed: use Open, below.")] : []));
+      ...(nothingRuns && this.store.control ? [h("p", { class: "or" }, "To look at a recording, none of them is needed: use Open, below.")] : []));
   }
 
   notice(title, text, command) {

@@ -55,7 +55,7 @@ export class Store {
   }
 
   /** The distance field of the current goal; null if there is none. */
-  get prior() {
+  get fieldOfGoal() {
     const goal = this.frame?.status?.goal, { field } = this;
     const same = goal && field?.robot === this.frame.robot && Math.hypot(field.goal.x - goal.x, field.goal.y - goal.y) < 0.01;
     return same ? field : null;
@@ -78,7 +78,7 @@ export class Store {
     const before = this.frame;
     if (before && frame.robot !== before.robot) this.forget();
     if (!before?.truth?.stopped) this.stoppedAt = now;
-    if (this.missing.some((one) => one.name === "controller")) frame.status = null; // the last status is outdated
+    if ([...this.missing, ...this.stuck].some((one) => one.name === "controller")) frame.status = null; // it is outdated
     this.frame = frame;
     this.arrivals.push(now);
     while (now - this.arrivals[0] > 4000) this.arrivals.shift();

@@ -59,6 +59,7 @@ export class Toolbar {
     for (const button of document.querySelectorAll("[data-mode]")) button.disabled = !allowed && button.dataset.mode !== "look";
     $("open").disabled = !store.connected || !store.control;
     $("explore-group").hidden = $("save-map").hidden = !store.map;
+    $("localise").parentElement.hidden = Boolean(store.map); // the mapper finds the robot by itself
     $("explore").disabled = $("save-button").disabled = !allowed;
     $("explore").setAttribute("aria-pressed", String(this.exploring));
     setText($("explore-label"), this.exploring ? "Stop" : "Explore");

@@ -53,6 +53,14 @@ def test_verified_after_driving_on():
     assert drive.keys.dropped_total == 0
 
 
+def test_standing_robot_verifies_nothing():
+    """Noise makes its pose wander, but it does not drive."""
+    drive, rng = Drive().go(3.0), np.random.default_rng(0)
+    for _ in range(3000):
+        drive.scan(posterior([drive.x + 0.003 * rng.standard_normal(), 0.0, 0.0]))
+    assert not drive.keys.verified
+
+
 def test_corrected_poses():
     """The poses found in learning replace those of the same scans only, also where newer scans came since."""
     drive = Drive().go(8.0)
