@@ -72,10 +72,10 @@ demo: $(DEMO_STAMP) ## localise and drive in the corridor: every service, a live
 	$(BIN)/presage demo --open $(ARGS)
 
 test: install ## all tests
-	@# Three workers keep two cores busy, because tests of processes mostly wait. More than one thread each would slow the others.
+	@# Four workers keep two cores busy, because tests of processes mostly wait. More than one thread each would slow the others.
 	@# Hundreds of processes are started: with PYTHONDONTWRITEBYTECODE set, each would compile all modules again, and each worker
 	@# all tests.
-	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder $(ARGS)
+	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 bless: install ## show how the outputs of services differ from the stored references, and accept them
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.process_replay.bless $(ARGS)

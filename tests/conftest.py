@@ -72,16 +72,19 @@ def skip_without_package():
 
 
 def pytest_collection_modifyitems(items):
-    """Marks tests/system. Runs files that start processes first, those that need Docker before all others.
+    """Marks tests/system. Runs files that start processes, which mostly wait, in turn with files that compute.
 
-    They take longest and wait much, so that in the end short files without waits fill the gaps.
+    Files that need Docker take longest, and come first. The order is reversed, because the files of tests/common are
+    short, and fill the gaps at the end.
     """
     for item in items:
         if (ROOT / "tests" / "system") in item.path.parents:
             item.add_marker(pytest.mark.system)
     starting = {"processes", "module_processes", "router", "browser", "installed"}
-    waiting = {item.path for item in items if starting & set(item.fixturenames)}
-    items.sort(key=lambda item: (item.get_closest_marker("docker") is None, item.path not in waiting))
+    waiting = dict.fromkeys(item.path for item in items if starting & set(item.fixturenames))
+    computing = dict.fromkeys(item.path for item in items if item.path not in waiting)
+    place = {path: k / len(group) for group in (waiting, computing) for k, path in enumerate(reversed(group))}
+    items.sort(key=lambda item: (item.get_closest_marker("docker") is None, place[item.path], item.path in computing))
 
 
 @pytest.fixture(scope="session", autouse=True)
