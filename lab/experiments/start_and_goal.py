@@ -61,13 +61,15 @@ def draw_start_and_goal(
     )
 
 
-def least_time(distance: float, robot: Robot, close: float = ARRIVAL_DISTANCE) -> float:
+def least_time(distance: float, robot: Robot, close: float = ARRIVAL_DISTANCE, *, stop: bool = False) -> float:
     """Minimum time in s from standstill until a distance of ``distance`` m has shrunk to ``close`` m.
 
-    The robot accelerates, then drives at full speed; it need not stop at the end.
+    The robot accelerates, and drives at full speed. At the end it need not stand, unless ``stop`` is true.
     """
-    way, v, a = max(0.0, distance - close), robot.max_speed, robot.acceleration
-    return float(np.sqrt(2 * way / a)) if way < v**2 / (2 * a) else way / v + v / (2 * a)
+    way, v, a, ramps = max(0.0, distance - close), robot.max_speed, robot.acceleration, 2 if stop else 1
+    if way < ramps * v**2 / (2 * a):  # never at full speed
+        return float(np.sqrt(2 * ramps * way / a))
+    return way / v + ramps * v / (2 * a)
 
 
 def path_ratio(path: Array) -> float:

@@ -6,7 +6,7 @@ Definitions:
 - The path ratio is the driven length, plus the straight distance left to the goal, divided by the length of the
   shortest path with clearance (`shortest_path`). Stopping short of the goal therefore gains nothing.
 - The time ratio is the time from the first scan until the end of the drive, divided by a lower bound: at full speed
-  around the corners of the shortest path, without a turn or a stop.
+  around the corners of the shortest path, without a turn. `reached` means that the robot stands, so it must brake.
 - The distance left to the goal is that of the last true pose.
 """
 
@@ -48,7 +48,7 @@ def measure(trace: RunTrace, task: NavigationTask, world: World, robot: Robot) -
     path, seconds = trace.path(), _seconds(trace)
     distance_left = float(np.hypot(*(path[-1, :2] - np.array(task.goal))))
     shortest, driven = length(np.array(task.shortest)), length(path)
-    least = least_time(shortest, robot, GOAL_TOLERANCE_M)
+    least = least_time(shortest, robot, GOAL_TOLERANCE_M, stop=True)
     outcome = _outcome(trace, distance_left)
     return {
         "outcome": outcome,

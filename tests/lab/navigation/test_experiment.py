@@ -155,7 +155,7 @@ def test_measurements_of_a_drive():
     assert found["outcome"] == "reached"
     assert found["driven_m"] == pytest.approx(3.99)
     assert found["path_over_shortest"] == pytest.approx(1.0)  # stopping short saves nothing
-    assert found["time_over_bound"] == pytest.approx(0.4 / (4.0 - 0.02 + 0.5))
+    assert found["time_over_bound"] == pytest.approx(0.4 / (4.0 - 0.02 + 1.0))
     assert (found["contacts_moving"], found["contacts_standing"]) == (1, 1)
     first = {"s": 0.2, "x": 3.0, "y": 1.0, "yaw": 0.0, "speed": 0.0, "person": [3.0, 2.0]}
     assert found["contact_at"][0] == first

@@ -63,6 +63,8 @@ def test_least_time():
     assert least_time(12.8, robot) == pytest.approx(12.5)
     assert least_time(0.8 + 0.125, robot) == pytest.approx(0.5)  # never at full speed
     assert least_time(0.5, robot) == 0.0
+    assert least_time(12.8, robot, stop=True) == pytest.approx(13.0)
+    assert least_time(0.8 + 0.25, robot, stop=True) == pytest.approx(1.0)
 
 
 @given(st.lists(st.tuples(st.floats(-5, 5), st.floats(-5, 5)), min_size=2, max_size=20))
