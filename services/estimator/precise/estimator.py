@@ -420,7 +420,7 @@ class PreciseEstimator:
         certain = doubt <= 1 - self.settings.tracking_probability
         if certain or 1 - self._probability_of_being_near(best) > 0.5 * doubt:
             return []
-        motion = expected_motion(candidates)
+        motion = candidates[-1]  # the widest, as in the match: the expected motion may be wrong
         found = search_near([view], motion.mean, motion.covariance, self.seeds, self.settings, self._rng)
         at_best = before.log_evidence + _prior_of([motion]).energy(best.pose[None])[0]
         return [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -370,6 +371,25 @@ def test_lost_along_a_corridor():
         assert error < 3.5 * np.sqrt(np.linalg.eigvalsh(posterior.covariance[:2, :2])[-1])
     assert states[0] == "tracking"
     assert states[-1] != "tracking"
+
+
+def test_alternatives_along_a_corridor():
+    """Lost along a corridor, and turning, the robot comes to one of several equal pillars: each of them is possible."""
+    pillars = [{"box": {"center": (x, 0.2), "size": (0.4, 0.4)}} for x in np.arange(4.5, 60, 3.0)]
+    made, scene = estimator(World(name="pillars", boundary=HALL.boundary, obstacles=pillars), range_max=1.5)
+    turn = np.array([0.0, 0.0, 0.02])
+    here, other = np.array([[21.5, 1.0, 0.0], [24.5, 1.0, 0.0]])
+    made.restart(here, np.diag([1e-4] * 3))
+    feed(made, scene, here, 1)
+    before = replace(made.hypotheses[0], noise_covariance=np.diag([4.0, 1e-6, 1e-6]))
+    made.hypotheses = [before]
+    view = made._view(scene.observe(scene.clean((here + turn)[None])[0], 1 / 15))
+    motions = made._predict_motion(before, 1 / 15, None, None)  # standing still is expected
+    found = made._find_alternatives(view, replace(made.hypotheses[0], pose=here + turn), motions, motions)
+    assert not found  # the match did not make the pose more certain
+    best = replace(before, pose=here + turn, noise_covariance=1e-4 * np.eye(3))
+    found = made._find_alternatives(view, best, motions, motions)
+    assert min(np.abs(each.pose - other - turn).max() for each in found) < 0.01
 
 
 COUNT_COMPILED = """
