@@ -42,7 +42,7 @@ ROOMS = World(
 
 def test_demo_reaches_its_goal(process, tmp_path):
     out, file, config = tmp_path / "out", tmp_path / "demo.json", tmp_path / "lockstep.yaml"
-    config.write_text("simulator: {pace: lockstep}")
+    config.write_text("simulator: {pace: lockstep, beams: 311}")
     args = ("--config", str(config), "--out", str(out), "--json", str(file))
     running = process("presage.__main__", "demo", *args)
     assert wait_until(lambda: list(out.glob("*.mcap.active")) or not running.running, 60), running.output
@@ -81,7 +81,7 @@ def test_demo_reaches_its_goal(process, tmp_path):
 def test_demo_in_an_unknown_building(process, tmp_path):
     file, config, world = (tmp_path / name for name in ("demo.json", "lockstep.yaml", "rooms.yaml"))
     world.write_text(save_world(ROOMS))
-    config.write_text(f"world: {world}\nsimulator: {{pace: lockstep, beams: 207}}")
+    config.write_text(f"world: {world}\nsimulator: {{pace: lockstep, beams: 121}}")
     args = ("--config", str(config), "--out", str(tmp_path / "out"), "--json", str(file), "--quiet")
     running = process("presage.__main__", "demo", "--unknown", *args)
     assert running.wait(170) == 0, running.output

@@ -15,7 +15,7 @@ from pathlib import Path
 from common.processes import end_with_this_process
 from lab.fault_injection.hosts import Network, enter_own_namespaces
 
-GOAL = ["-m", "presage", "--connect", "tcp/10.77.0.1:7447", "goal", "15.5", "1.5", "--wait"]
+GOAL = ["-m", "presage", "--connect", "tcp/10.77.0.1:7447", "goal", "6.5", "1.5", "--wait"]
 
 
 def shell_blocks(page: str) -> list[str]:
