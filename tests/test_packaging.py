@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -20,6 +21,7 @@ from common.robot.scanner import SCANNERS
 ROOT = Path(__file__).resolve().parent.parent
 tomllib = pytest.importorskip("tomllib", reason="Python 3.10 cannot read pyproject.toml")
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+PACKAGES = PYPROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]
 
 
 def names(requirements):
@@ -39,6 +41,18 @@ def test_images_have_known_packages():
         assert names(each for each in group if isinstance(each, str)) <= REQUIRED
 
 
+def use_compiled_code(site):
+    """Saves compiling all loops again: numba takes the checkout's for sources of the same modification time."""
+    caches = {file.parent for package in PACKAGES for file in (ROOT / package).rglob("__pycache__/*.nbi")}
+    for cache in caches:
+        to = site / cache.relative_to(ROOT)
+        to.mkdir(exist_ok=True)
+        for compiled in cache.glob("*.nb[ic]"):
+            shutil.copy(compiled, to)
+        for source in cache.parent.glob("*.py"):
+            shutil.copystat(source, to.parent / source.name)
+
+
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory):
     """Runs Python outside the checkout with the wheel installed; the environment's packages are visible."""
@@ -50,6 +64,7 @@ def installed(tmp_path_factory):
     (wheel,) = folder.glob("presage-*.whl")
     install = [*pip, "install", "--quiet", "--no-deps", "--no-index", "--target", str(folder / "site"), str(wheel)]
     subprocess.run(install, check=True)
+    use_compiled_code(folder / "site")
 
     def run(*arguments):
         variables = {"PYTHONPATH": str(folder / "site"), "XDG_DATA_HOME": str(folder / "data")}
