@@ -41,7 +41,8 @@ class FrameCounter:
         self.frames = self.bytes = 0
         try:
             origin, where = Origin(f"http://127.0.0.1:{port}"), f"ws://127.0.0.1:{port}/ws"
-            self._socket: ClientConnection = connect(where, origin=origin, open_timeout=TIMEOUT_S)
+            # As a context manager, because later versions of websockets warn of any other use.
+            self._socket: ClientConnection = connect(where, origin=origin, open_timeout=TIMEOUT_S).__enter__()
         except (OSError, TimeoutError) as error:
             raise UserError(f"the viewer's socket at port {port} does not answer: {error}") from None
         self._socket.send(json.dumps({"id": 1, "do": "watch", "robot": ROBOT}))
