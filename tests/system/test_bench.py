@@ -8,19 +8,23 @@ import zlib
 import pytest
 
 from common.messages.topics import TRUTH
+from lab.benchmarks import cpu, latency, viewer
 from lab.benchmarks.recorder import _compare
 from services.recorder.files.message_counts import KeyCounts, as_metadata
 from services.recorder.files.writer import RecordingWriter
 
 
 @pytest.fixture
-def bench(process, tmp_path):
-    """A function that runs a benchmark and returns its numbers."""
+def bench(presage, monkeypatch, tmp_path):
+    """A function that runs a benchmark with a short warm-up and returns its numbers."""
+    monkeypatch.setattr(cpu, "WARM_UP_S", 1.0)
+    monkeypatch.setattr(viewer, "WARM_UP_S", 0.5)
+    monkeypatch.setattr(latency, "WARM_UP_SCANS", 3)
 
     def run(*args):
         numbers = tmp_path / "numbers.json"
-        running = process("presage.__main__", "bench", *args, "--json", str(numbers))
-        assert running.wait(150) == 0, running.output
+        status, output = presage("bench", *args, "--json", str(numbers))
+        assert status == 0, output
         return json.loads(numbers.read_text())
 
     return run
@@ -41,7 +45,7 @@ def test_viewer(bench):
 
 
 def test_cpu(bench):
-    numbers = bench("cpu", "--seconds", "3")
+    numbers = bench("cpu", "--seconds", "1")
     assert numbers["beliefs_hz"] > 0
     assert 0 < numbers["cpu_share"]["estimator"] < numbers["cpu_share"]["on_the_robot"]
     assert all(megabytes > 10 for megabytes in numbers["memory_mb"].values())
