@@ -33,7 +33,7 @@ def particle_filter(mount):
 
 def rms(make, kind, prior):
     """RMS of the position error in m along a curve at up to 1 m/s and 1 rad/s."""
-    scene, path = Scene.of(ROOM, 271, 5), drive(60)
+    scene, path = Scene.of(ROOM, 271, 5), drive(45)
     found = make(np.array(scene.scanner.mount))
     found.restart(path[0], CERTAIN)
     poses = np.array([found.update(each).pose for each in observations(scene, path, kind, prior)])

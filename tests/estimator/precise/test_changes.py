@@ -119,9 +119,8 @@ def test_standing_robot():
     assert found[-1].probability == pytest.approx(found[0].probability, abs=1e-3)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_changed_furniture(seed):
-    made, scene = estimator(OFFICE, moved(OFFICE, FURNITURE, seed))
+def test_changed_furniture():
+    made, scene = estimator(OFFICE, moved(OFFICE, FURNITURE, 1))
     x = np.linspace(1.5, 16.0, 220)
     path = np.column_stack([x, np.full(len(x), CORRIDOR_Y), 0.6 * np.sin(x)])
     made.restart(path[0], CLOSE)
@@ -226,7 +225,7 @@ def driven():
 @pytest.mark.parametrize("kidnapped", [False, True])
 def test_unlearned_room(driven, kidnapped):
     made, scene, path = copy.deepcopy(driven)
-    then = np.tile([2.0, 1.5, 2.0], (20, 1)) if kidnapped else path[::-1]
+    then = np.tile([2.0, 1.5, 2.0], (20, 1)) if kidnapped else path[::-1][:100]
     found = drive(made, scene, then, len(path))
     assert np.hypot(*(found[-1].pose - then[-1])[:2]) < 0.02
     # In a plain hall, one place seen after a kidnapping is not quite enough for the state tracking.
@@ -342,7 +341,7 @@ def test_map_error_of_the_first_scan():
     """In most places, the first scan shows that the map is 1 % larger; at a few the pose absorbs the difference."""
     made, scene = estimator(scaled_map(OFFICE, 1.01), OFFICE)
     errors = []
-    for x in np.linspace(2.0, 14.0, 25):
+    for x in np.linspace(2.0, 14.0, 15):
         truth = np.array([x, CORRIDOR_Y, 0.3])
         made.restart(truth * [1.01, 1.01, 1.0], CLOSE / 4)
         found = drive(made, scene, truth[None])[0]
@@ -367,7 +366,7 @@ def test_surfaces_in_the_cells_of_a_grid():
     scene = Scene.of(HALL, BEAMS, 3)
     make = prepare_factory(EstimatorOptions(noisy_grid(scene), "precise", "exact"))
     errors, normalised = [], []
-    for truth in scene.poses(30):
+    for truth in scene.poses(15):
         made = make(ScannerGeometry.of(scene.scanner))
         made.restart(truth, CLOSE)
         found = drive(made, scene, truth[None])[0]

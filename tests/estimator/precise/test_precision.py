@@ -69,9 +69,9 @@ def test_scans_without_returns_show_no_noise(value):
     assert not precision.noise_scans
 
 
-@pytest.mark.parametrize(("noise", "maps"), [(0.01, 20), (0.02, 20), (0.04, 80)])
+@pytest.mark.parametrize(("noise", "maps"), [(0.02, 20), (0.04, 80)])
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=2)
+@settings(max_examples=1)
 def test_error_of_the_map(noise, maps, seed):
     """On average over maps, it is underestimated by at most 40 %, even if the noise is four times as large.
 
@@ -91,9 +91,9 @@ def room(deviation, rng):
 
 
 def learned_in_small_rooms(deviation, cell=0.0, beams=400, noise=0.01):
-    """The map's error in m, as learned on average over 40 rooms from scans to which the pose was fitted."""
+    """The map's error in m, as learned on average over 20 rooms from scans to which the pose was fitted."""
     angles, variances = np.linspace(-np.pi, np.pi, beams, endpoint=False), []
-    for seed in range(40):
+    for seed in range(20):
         rng, precision = np.random.default_rng(seed), Precision.before_first_scan(cell)
         true, in_map = room(0.0, rng), RayCaster(room(deviation, rng))
         for pose in true.sample_poses(20, rng, 0.5):
