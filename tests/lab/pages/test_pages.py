@@ -19,3 +19,8 @@ def test_tables(page):
     text = page.read_text(encoding="utf-8")
     command = f"presage experiment --out docs/experiments tables --page {page.relative_to(ROOT)}"
     assert fill_tables(text, ROOT / "docs" / "experiments") == text, f"run: {command}"
+
+
+def test_pages_with_tables():
+    names = ("experiments", "real_logs", "navigation", "results", "integrity", "mapping", "refinement", "exploration")
+    assert {"README.md", *(f"{name}.md" for name in names)} <= {page.name for page in PAGES}
