@@ -98,13 +98,13 @@ def test_obstacle_stop_among_walking_people(make, kind):
     """The robot drives at 1 m/s among ten people, turning on the spot when stopped."""
     simulation, rng = make("office", people=10, seed=1, robot=Robot(drive=kind)), np.random.default_rng(0)
     turn, driven = 0.0, 0.0
-    for _ in range(15 * 15):
+    for _ in range(10 * 15):
         (truth,) = drive(simulation, Twist(vx=1.0, wz=turn), 1 / 15)
         assert not truth.contact
         driven += truth.twist.vx / 15
         held = truth.stopped and truth.twist.vx < 0.05
         turn = (turn or float(rng.choice([-1.5, 1.5]))) if held else 0.0
-    assert driven > 4
+    assert driven > 2.7
 
 
 def test_teleport_onto_a_person_moves_them(make):

@@ -201,7 +201,7 @@ def test_unknown_and_missing_fields():
     assert Scan.decode(encoded_with(a_scan(), scan_time=..., time_increment=..., mount=..., seq=...)) == a_scan()
 
 
-@settings(max_examples=2000)
+@settings(max_examples=600)
 @given(st.sampled_from(CLASSES), st.binary(max_size=200))
 def test_random_bytes(cls, payload):
     with contextlib.suppress(DecodeError):
@@ -220,7 +220,7 @@ values = st.recursive(
 )
 
 
-@settings(max_examples=800)
+@settings(max_examples=300)
 @given(all_messages(), st.data())
 def test_one_field_replaced_by_any_value(message, data):
     fields = msgpack.unpackb(message.encode())
@@ -233,7 +233,7 @@ def test_one_field_replaced_by_any_value(message, data):
     type(message).decode(again.encode())  # what was accepted is a whole message
 
 
-@settings(max_examples=800)
+@settings(max_examples=300)
 @given(all_messages(), st.data())
 def test_truncated_or_changed_bytes(message, data):
     payload = bytearray(message.encode())

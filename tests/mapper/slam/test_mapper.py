@@ -43,7 +43,7 @@ def mapped(drive):
 
 @pytest.mark.parametrize("with_odometry", [True, False])
 def test_live_map_is_that_of_the_log(with_odometry):
-    truth = Scene.of(OFFICE, 300, 5).path(40)
+    truth = Scene.of(OFFICE, 300, 5).path(30)
     drive = driven(OFFICE, truth)
     if with_odometry:
         drive = replace(drive, odom=odometry(truth))
