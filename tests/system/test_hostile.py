@@ -18,7 +18,7 @@ from tests.common.samples import message_of
 from tests.conftest import WAIT_TIMEOUT_S
 
 SERVICES = ("simulator", "estimator", "controller", "recorder")
-EXAMPLES = 80  # per key
+EXAMPLES = 40  # per key
 SUBSCRIBED_TOPICS = {
     "simulator": ["cmd_vel"],
     "estimator": ["scan", "goal"],
