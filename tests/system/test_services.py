@@ -45,10 +45,8 @@ def test_help_and_effective_settings(process):
 
 
 def test_clean_end_alone(process, bus, tmp_path):
-    started = {
-        name: process(name, *(("--directory", str(tmp_path)) if name == "recorder" else ()), fresh=True)
-        for name in SERVICES
-    }
+    started = {name: process(name, fresh=name == "estimator") for name in SERVICES if name != "recorder"}
+    started["recorder"] = process("recorder", "--directory", str(tmp_path), fresh=True)
     assert wait_until(lambda: SERVICES.keys() <= bus.alive(), WAIT_TIMEOUT_S)
     for name, number in SERVICES.items():
         assert started[name].stop(number) == 0, started[name].output
@@ -91,7 +89,7 @@ def test_death_and_restart(process, bus):
     next_message(bus, TRUTH, moving)
 
     running["simulator"].kill()
-    next_message(bus, STATUS, lambda status: "no belief" in status.reason)
+    next_message(bus, STATUS, lambda status: "no scan" in status.reason)
     process("simulator")
     next_message(bus, CMD_VEL)
     assert running["estimator"].running
