@@ -3,16 +3,28 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from common.errors import UserError
+from lab.benchmarks import training
 from lab.benchmarks.training import bench_training, table
+from presage.learning import train_precise
 
 
-def test_trains_a_shipped_model_with_another_seed(tmp_path: Path):
+def test_trains_a_shipped_model_with_another_seed(tmp_path: Path, presage, monkeypatch):
+    def in_this_process(command, **_):
+        assert command[:3] == [sys.executable, "-m", "presage"]
+        status, output = presage(*command[3:])
+        return subprocess.CompletedProcess(command, status, output, output)
+
+    monkeypatch.setattr(training.subprocess, "run", in_this_process)
+    for samples in ("CALIBRATION_SAMPLES", "TEST_SAMPLES"):
+        monkeypatch.setattr(train_precise, samples, 40)
     result = tmp_path / "training.json"
     assert bench_training("maze-precise", 1, 40, tmp_path / "out", result, Console(quiet=True)) == 0
     (row,) = json.loads(result.read_text())["rows"]
