@@ -69,9 +69,9 @@ def test_search_with_many_beams(monkeypatch):
 
 def test_error_and_bound():
     made, scene = estimator(ROOM)
-    outcome = tasks.standing(made, scene, 20, iter)
+    outcome = tasks.standing(made, scene, 12, iter)
     one, many = outcome["from nothing, 1 scan"], outcome["standing, 20 scans"]
-    assert one.found >= 19  # some of the poses see bare walls only, which fit as well after half a turn
+    assert one.found >= 11  # some of the poses see bare walls only, which fit as well after half a turn
     rms = [np.sqrt(np.mean(np.square(np.array(o.errors)[:, :2]).sum(1))) for o in (one, many)]
     limit = [np.sqrt(np.mean(np.square(o.bounds))) for o in (one, many)]
     assert 0.7 * limit[0] < rms[0] < 1.4 * limit[0]  # less would be an error of the test
@@ -79,29 +79,29 @@ def test_error_and_bound():
 
 
 def test_covariance():
-    """NEES of 100 scans: mean of chi squared with 3 degrees of freedom, 99.9 % band."""
+    """NEES of 50 scans: mean of chi squared with 3 degrees of freedom, 99.9 % band."""
     made, scene = estimator(ROOM)
     outcome = tasks.TaskOutcome()
-    for pose in scene.poses(100):
+    for pose in scene.poses(50):
         made.restart(pose, np.diag([0.05**2] * 3))  # far wider than the covariance of a scan
         outcome.add(feed(made, scene, pose, 1)[0], pose, None)
-    assert len(outcome.nees) >= 99
-    assert np.mean(outcome.nees) == pytest.approx(3, abs=3.3 * np.sqrt(6 / 100))
+    assert len(outcome.nees) >= 49
+    assert np.mean(outcome.nees) == pytest.approx(3, abs=3.3 * np.sqrt(6 / 50))
 
 
 @pytest.mark.parametrize("odometry", [False, True])
 def test_tracking(odometry):
     made, scene = estimator(ROOM)
-    (outcome,) = tasks.tracking(made, scene, 20.0, iter, odometry=odometry).values()
-    assert outcome.found == outcome.total == 300
+    (outcome,) = tasks.tracking(made, scene, 10.0, iter, odometry=odometry).values()
+    assert outcome.found == outcome.total == 150
     rms = np.sqrt(np.mean(np.square(np.array(outcome.errors)[:, :2]).sum(1)))
     assert rms < 1.3 * np.sqrt(np.mean(np.square(outcome.bounds)))
 
 
 def test_kidnapping():
     made, scene = estimator(load_world("maze"))  # unlike the empty room, it has no two similar places
-    outcome = tasks.kidnapped(made, scene, 15, iter)
-    assert outcome["kidnapped, 1 scan"].found == 15
+    outcome = tasks.kidnapped(made, scene, 8, iter)
+    assert outcome["kidnapped, 1 scan"].found == 8
     assert outcome["kidnapped, 3 scans"].wrong == 0
     assert made._change_rate.remembered < 1  # nothing around the robot has changed
 
@@ -133,13 +133,11 @@ def test_standing_in_a_featureless_hall():
 def test_driving_in_a_featureless_hall(learned):
     """Without odometry and features the error along the walls grows, but remains within the stated covariance."""
     start, speed, scans = np.array([27.0, 0.9, 0.1]), 0.8, 75
-    field = None
-    for seed in (0, 3):
+    for seed in (0,) if learned else (0, 3):
         made, scene = estimator(HALL, 360, seed=seed)
         if learned:
             geometry = ScannerGeometry(scene.scanner.angles()[::4], np.array(scene.scanner.mount), 25.0)
-            field = field or quick_field(HALL, geometry, np.random.default_rng(0), 3000)
-            made.model = field
+            made.model = quick_field(HALL, geometry, np.random.default_rng(0), 3000)
         made.restart(start, np.diag([1e-4, 1e-4, 1e-4]))
         for k in range(scans):
             pose = start + np.array([speed / 15 * k, 0, 0])
