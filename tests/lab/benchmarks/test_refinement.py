@@ -32,6 +32,6 @@ def test_walls_of_the_true_world_are_right():
 
 def test_drive_has_the_length_that_was_asked_for():
     building = make_building(3)
-    path = drive_for(Scene.of(building.world, 50, 1), building, 150.0)
-    assert path.shape == (750, 3)
+    path = drive_for(Scene.of(building.world, 50, 1), building, 600.0)
+    assert path.shape == (3000, 3)
     assert np.hypot(*np.diff(path[:, :2], axis=0).T).max() < 0.5

@@ -87,9 +87,9 @@ def test_trials_that_would_count_twice_or_not_at_all(changes, message, tmp_path)
 
 def test_log_with_a_learned_model(tmp_path):
     log = tmp_path / "x.npz"
-    real_drive.save(log, real_drive.drive(170))
+    real_drive.save(log, real_drive.drive(240))
     logs = tuple(LogCase(str(log), (0.0, 0.0, 0.0), False, odometry) for odometry in (False, True))
     assert bench_integrity(IntegrityPlan(0, 1, (), ("precise",), logs=logs), tmp_path, 1, Console(quiet=True)) == 0
     assert len(list((tmp_path / "models").glob("*.safetensors"))) == 1
     scores = json.loads((tmp_path / "integrity.json").read_text())["summary"]["precise"]
-    assert scores["x-second-odometry"]["correct"]["count"] > 70
+    assert scores["x-second-odometry"]["correct"]["count"] > 100

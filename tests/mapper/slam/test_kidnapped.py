@@ -53,7 +53,7 @@ def test_scans_elsewhere_do_not_change_the_map(place):
 
 
 def test_place_is_found_again():
-    truth, _ = carried(40, second=14)
+    truth, _ = carried(40)
     drive = driven(OFFICE, truth)
     poses = build_trajectory(drive).poses
     known = np.isfinite(poses).all(axis=1)
