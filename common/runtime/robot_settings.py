@@ -66,7 +66,7 @@ class RobotSettings(MotionLimitSettings):
         float, Field(ge=0, le=1, allow_inf_nan=False, description="turn rate below which the base does not turn, rad/s")
     ] = 0.0
     latency: Annotated[
-        float, Field(ge=0, le=0.5, allow_inf_nan=False, description="time from a command to its effect, s")
+        float, Field(ge=0, le=0.3, allow_inf_nan=False, description="time from a command to its effect, s")
     ] = 0.0
 
     def build_robot(self) -> Robot:
@@ -83,6 +83,13 @@ class RobotSettings(MotionLimitSettings):
                     f"{speed_option} {speed:g} {unit} with {acceleration_option} {acceleration:g} {unit}²: the robot "
                     f"would take {speed / acceleration:.0f} s to stop, more than {MAX_STOPPING_TIME_S:g} s; "
                     f"lower {speed_option} or raise {acceleration_option}"
+                )
+        for band_name, speed_name in (("dead_band", "max_speed"), ("turn_dead_band", "max_turn")):
+            band, speed = getattr(self, band_name), getattr(self, speed_name)
+            if band >= speed:
+                raise UserError(
+                    f"--{band_name.replace('_', '-')} {band:g} with --{speed_name.replace('_', '-')} {speed:g}: the "
+                    "robot would never move; raise the latter, or lower the former"
                 )
         return Robot(
             drive=self.drive,

@@ -85,11 +85,12 @@ def limit_velocity(
     Returns the limited twist and whether it was changed. This is an admissible velocity in the sense of the dynamic
     window approach (Fox, Burgard, Thrun 1997). The footprint is round, so turning on the spot is always allowed, and so
     is moving away: a point counts only while the robot approaches it. ``current`` (3,) is the robot's present velocity
-    and defaults to ``twist``; ``hold`` is the time in s from the scan until the next command. Returns zeros if even
-    stopping at once comes too near to a point.
+    and defaults to ``twist``; ``hold`` is the time in s from the scan until the next command, to which the robot's
+    latency is added. Returns zeros if even stopping at once comes too near to a point.
     """
     if not np.isfinite(twist).all():
         return np.zeros(3), True
+    hold += robot.latency
     allowed = np.array([*(twist[:2] * _straight_scale(twist, points, robot, hold)), twist[2]])
     if current is None and twist[2] == 0:
         return allowed, bool((allowed != twist).any())

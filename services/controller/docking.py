@@ -19,7 +19,7 @@ import numpy as np
 
 from common.geometry import se2
 from common.messages.definitions import GOAL_TOLERANCE_M
-from services.controller.policies.motion_model import braking_speed, turn_rate
+from services.controller.policies.motion_model import STEP_S, braking_speed, turn_rate
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -88,8 +88,8 @@ class Docking:
         along, across, turn = self.errors(pose)
         return bool(np.hypot(along, across) <= self.tolerance and abs(turn) <= (self.yaw_tolerance or np.inf))
 
-    def velocity(self, pose: Array) -> Array | None:
-        """Velocity (3,) in base_link for the pose (3,) at which the command takes effect.
+    def velocity(self, pose: Array, hold: float = STEP_S) -> Array | None:
+        """Velocity (3,) in base_link for the pose (3,) at which the command takes effect, and holds for ``hold`` s.
 
         Returns None in phase DRIVE.
         """
@@ -98,13 +98,14 @@ class Docking:
             self.phase = DockingPhase.ALIGN
         if self.phase is DockingPhase.ALIGN:
             if abs(turn) > MAX_ALIGN_ERROR_RAD:
-                return np.array([0.0, 0.0, turn_rate(turn, self.robot)])
+                return np.array([0.0, 0.0, turn_rate(turn, self.robot, hold)])
             self.phase = DockingPhase.LINE
         if not -MAX_LATERAL_ERROR_M < along < LINE_LENGTH_M + MAX_LATERAL_ERROR_M or abs(across) > MAX_LATERAL_ERROR_M:
             self.phase = DockingPhase.DRIVE
         if self.phase is DockingPhase.DRIVE:
             return None
-        final_turn = turn_rate(turn, self.robot) if abs(turn) > TARGET_SHARE * (self.yaw_tolerance or np.inf) else 0.0
+        is_off = abs(turn) > TARGET_SHARE * (self.yaw_tolerance or np.inf)
+        final_turn = turn_rate(turn, self.robot, hold) if is_off else 0.0
         if self.robot.drive == "holonomic":
             velocity = self._holonomic_velocity(along, across)
             return np.array([*se2.rotate(self.direction - pose[2], velocity), final_turn])

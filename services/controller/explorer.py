@@ -11,8 +11,8 @@
 | RETURNING | the robot has arrived, and no viewpoint was worth a visit | FINISHED |
 | RETURNING | the way back stays refused, and the robot does not move | FAILED |
 
-A viewpoint is given up if it is refused, or if the robot does not move `STALLED_M` in `STALLED_NS`; the way back only
-if both hold.
+A viewpoint is given up if it is refused, or if the robot does not move `STALLED_M` or turn `STALLED_RAD` in
+`STALLED_NS`; the way back only if both hold.
 
 A goal of a user pauses the exploration until `PAUSE_NS` after that goal was reached or refused. Cancelling a goal ends
 the exploration.
@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from common.geometry import se2
 from common.messages.definitions import Exploration, Goal, Pose, Status
 from services.controller.goal_state import Phase
 from services.controller.policies.recovery import MAX_GAP_NS
@@ -38,8 +39,8 @@ if TYPE_CHECKING:
     from services.controller.policies.exploration import ExplorationState, FieldOfView, NoPath, Viewpoint
 
 PAUSE_NS = 2_000_000_000  # how long the robot stands at a goal of a user before it goes on exploring
-STALLED_NS = 8_000_000_000  # after this time without a motion of `STALLED_M`, the goal counts as unreachable
-STALLED_M = 0.2
+STALLED_NS = 8_000_000_000  # after this time without a motion of `STALLED_M` or a turn, the goal counts as unreachable
+STALLED_M, STALLED_RAD = 0.2, 0.5
 VIEWPOINT_TOLERANCE_M = 0.1
 MAX_SPEED_FACTOR = 1.5  # a belief that moves faster than the robot can, by this factor, has jumped with the map
 RETURN_TOLERANCE_M = 0.01  # of the goal at the start, so that the robot stands within 2 cm of it
@@ -151,11 +152,12 @@ class Explorer:
         return not self.paused
 
     def _record_motion(self, stamp_ns: int) -> None:
-        """Stores when the robot last moved by `STALLED_M`, or was last driven by hand or without a belief."""
+        """Stores when the robot last moved or turned, or was last driven by hand or without a belief."""
         place, since_ns = self._last_moved
         gap = not 0 <= stamp_ns - self._last_update_ns <= MAX_GAP_NS
         self._last_update_ns = stamp_ns
-        if np.hypot(*(self._pose - place)[:2]) > STALLED_M or since_ns == 0 or gap:
+        motion = se2.between(place, self._pose)
+        if np.hypot(*motion[:2]) > STALLED_M or abs(motion[2]) > STALLED_RAD or since_ns == 0 or gap:
             self._last_moved = self._pose, stamp_ns
 
     def _update_return(self, state: GoalState, *, stalled: bool) -> bool:

@@ -21,7 +21,7 @@ from services.controller.lifts import LiftRide, plan_ride
 from services.controller.manual_drive import ManualDrive
 from services.controller.policies.decision import Decision, Policy
 from services.controller.policies.goal_check import wall_refusal
-from services.controller.policies.motion_model import delay_until_effect, is_moving, turn_rate
+from services.controller.policies.motion_model import STEP_S, delay_until_effect, is_moving, turn_rate
 from services.controller.policies.paper_action import ActionParameters
 from services.controller.policies.straight_line import StraightLinePolicy
 from services.controller.velocity_command import VelocityCommand
@@ -364,7 +364,7 @@ class Navigator:
                 return velocity
         elif distance <= goal.tolerance:
             self.policy.interrupt()
-            turn = self._turn_to_goal_heading(pose, goal)
+            turn = self._turn_to_goal_heading(se2.compose(pose, self._motion_until_effect(belief.stamp_ns)), goal)
             if turn is None:
                 # Only once the robot stands: one that turns while it brakes may leave the tolerance again.
                 if self._has_stood(belief.stamp_ns, 0.0):
@@ -400,7 +400,7 @@ class Navigator:
 
     def _docking_velocity(self, docking: Docking, belief: Belief, pose: Array, goal: Goal) -> Array | None:
         """Velocity (3,) in base_link on the line to the goal; None while the policy drives to the line."""
-        velocity = docking.velocity(se2.compose(pose, self._motion_until_effect(belief.stamp_ns)))
+        velocity = docking.velocity(se2.compose(pose, self._motion_until_effect(belief.stamp_ns)), self._command_period)
         if velocity is None:
             return None
         self.policy.interrupt()
@@ -408,6 +408,11 @@ class Navigator:
         if not velocity.any() and self._has_stood(belief.stamp_ns, STANDING_TIME_S) and docking.arrived(pose):
             self.goal_state.reach(_arrival(belief, goal))
         return velocity
+
+    @property
+    def _command_period(self) -> float:
+        """Time in s for which a command holds: until the next scan."""
+        return max(STEP_S, self._scan.scan_time) if self._scan is not None else STEP_S
 
     def _motion_until_effect(self, stamp_ns: int) -> Array:
         """Motion (3,) in base_link from a stamp until a command with that stamp takes effect."""
@@ -424,13 +429,16 @@ class Navigator:
             self._docking.interrupt()
 
     def _turn_to_goal_heading(self, pose: Array, goal: Goal) -> Array | None:
-        """Velocity (3,) of a turn towards the goal's heading; None if any heading will do, or it is reached."""
+        """Velocity (3,) of a turn towards the goal's heading; None if any heading will do, or it is reached.
+
+        ``pose`` (3,) is that at which the command takes effect.
+        """
         if goal.yaw_tolerance is None:
             return None
         error = float(se2.wrap(goal.pose.yaw - pose[2]))
         if abs(error) <= goal.yaw_tolerance:
             return None
-        return np.array([0.0, 0.0, turn_rate(error, self.robot)])
+        return np.array([0.0, 0.0, turn_rate(error, self.robot, self._command_period)])
 
 
 def _arrival(belief: Belief, goal: Goal) -> str:

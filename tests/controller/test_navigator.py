@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from common.geometry import se2
+from common.geometry.shapes import Obstacle
 from common.robot.robot import Robot
+from common.robot.scanner import SCANNERS
 from services.controller.navigator import Navigator
 from services.controller.policies.planner import GeodesicPolicy
 from tests.controller.driving import PERIOD_NS, PERIOD_S, belief, box, drive, goal, path_length, room, scan, session
@@ -48,6 +51,41 @@ def test_latency_of_several_scans(kind):
         assert (statuses[-1].state, contacts) == ("reached", 0)
         scans.append(len(poses))
     assert scans[1] < scans[0] + 20  # the latency at the start, at the end, and of the turn
+
+
+@pytest.mark.parametrize(("latency", "scanner"), [(0.1, "tim571"), (0.3, "tim571"), (0.0, "rplidar-a1")])
+def test_heading_at_the_goal_with_late_or_rare_commands(latency, scanner):
+    to = goal(2.0, 1.5, yaw=2.0, yaw_tolerance=np.deg2rad(2))
+    robot = Robot(latency=latency)
+    poses, statuses, _ = drive(room(5, 3), robot, (1.0, 1.5, 0.0), to, 300, scanner=SCANNERS[scanner].with_beams(135))
+    assert statuses[-1].state == "reached"
+    assert abs(se2.wrap(poses[-1, 2] - 2.0)) < np.deg2rad(2.5)
+
+
+def test_corridor_that_is_longer_than_the_range():
+    """The robot drives through the middle, from which it does not see where it is along the corridor."""
+    scanner = SCANNERS["rplidar-a1"]
+    _, statuses, _ = drive(room(30, 2), Robot(), (2.0, 1.0, 0.0), goal(28.0, 1.0), 220, scanner=scanner)
+    assert statuses[-1].state == "reached"
+
+
+def test_fast_robot_and_a_person():
+    """It has nearly stopped when a person who approaches at 1 m/s is near."""
+    walked = []
+
+    def person(x):
+        return {"name": "person", "circle": {"center": (x, 2.5), "radius": 0.25}}
+
+    def walk(simulation):
+        walked.append(max(20.0 - simulation.steps * PERIOD_S, simulation.physics.pose()[0] + 0.7))
+        simulation.change_obstacle("move", "person", Obstacle.model_validate(person(walked[-1])))
+
+    hall, robot = room(30, 5, person(20.0)), Robot(max_speed=2.0, acceleration=1.0)
+    poses, _, _ = drive(hall, robot, (2.0, 2.5, 0.0), goal(28.0, 2.5), 110, known=room(30, 5), change=walk)
+    speed = np.hypot(*np.diff(poses[:, :2], axis=0).T) / PERIOD_S
+    near = int(np.argmax(np.hypot(np.array(walked) - poses[:, 0], 2.5 - poses[:, 1]) < 0.8))
+    assert speed[:near].max() > 1.5
+    assert 0.0 < speed[near - 1] < 0.2
 
 
 def test_stamps_of_commands():

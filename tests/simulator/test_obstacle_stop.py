@@ -58,6 +58,16 @@ def test_no_contact_at_1_m_s(make, world):
     assert stopped > POSES / 2
 
 
+@pytest.mark.parametrize("latency", [0.1, 0.3])
+def test_late_commands(make, latency):
+    simulation = make("corridor", robot=Robot(latency=latency))
+    simulation.teleport(np.array([14.5, 1.5, 0.0]))
+    truths = drive(simulation, FORWARD, 6.0)
+    assert not contacts(truths)
+    assert max(map(speed, truths)) > 0.9
+    assert speed(truths[-1]) < 0.05
+
+
 def test_random_commands_among_furniture(make):
     simulation, rng = make("office"), np.random.default_rng(0)
     for _ in range(15):

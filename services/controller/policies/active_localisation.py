@@ -112,7 +112,9 @@ class VisitedPlaces:
 class StallTimer:
     """Measures for how long the robot has made no progress."""
 
-    def __init__(self) -> None:
+    def __init__(self, max_speed: float = np.inf) -> None:
+        """``max_speed`` is the robot's, in m/s; a slow one needs to move less."""
+        self._progress_m = min(PROGRESS_M, 0.5 * max_speed * STALLED_NS * 1e-9)
         self._pose = np.zeros(3)  # in the present base_link, where the robot last made progress
         self._progress_ns: int | None = None  # stamp of the last progress; None before the first one
         self._stamp_ns = 0
@@ -120,7 +122,7 @@ class StallTimer:
     def move(self, stamp_ns: int, motion: Array) -> None:
         """Processes the motion (3,) since the stamp before."""
         self._stamp_ns, self._pose = stamp_ns, se2.between(motion, self._pose)
-        moved = np.hypot(*self._pose[:2]) > PROGRESS_M or abs(self._pose[2]) > PROGRESS_RAD
+        moved = np.hypot(*self._pose[:2]) > self._progress_m or abs(self._pose[2]) > PROGRESS_RAD
         if moved or self._progress_ns is None:
             self.restart()
 
@@ -166,7 +168,7 @@ class ActiveLocaliser:
 
     def reset(self) -> None:
         """Forgets everything. Call it when the pose is known, or the goal has changed."""
-        self._visited, self._stall_timer = VisitedPlaces(), StallTimer()
+        self._visited, self._stall_timer = VisitedPlaces(), StallTimer(self.robot.max_speed)
         self._requested: tuple[int, CandidatePaths] | None = None  # stamp in ns and paths of the last request
         self._prediction_failure = ""  # why the last request was not answered
         self._place: tuple[Array, dict[str, float]] | None = None  # (3,) in base_link, and its expected free energy

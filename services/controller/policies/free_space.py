@@ -55,6 +55,15 @@ class Grid:
         row = np.minimum(np.maximum(position[..., 1], 0), rows - 1)  # np.clip is slow on small arrays
         return np.asarray(row * columns + np.minimum(np.maximum(position[..., 0], 0), columns - 1))
 
+    def cells_near(self, point: Array, within: float) -> npt.NDArray[np.intp]:
+        """Flat indices (N,) of the cells of a square around a point (2,) m, with all whose centres are ``within`` m."""
+        rows, columns = self.shape
+        lowest = np.floor((np.asarray(point) - within - self.origin) / self.resolution).astype(int)
+        highest = np.floor((np.asarray(point) + within - self.origin) / self.resolution).astype(int)
+        column = np.arange(max(lowest[0], 0), min(highest[0], columns - 1) + 1)
+        row = np.arange(max(lowest[1], 0), min(highest[1], rows - 1) + 1)
+        return np.asarray((row[:, None] * columns + column).ravel())
+
     def inside(self, points: Array) -> npt.NDArray[np.bool_]:
         """Whether each point (N, 2) m lies on the grid; (N,) bool."""
         position = (np.asarray(points) - self.origin) / self.resolution

@@ -29,7 +29,7 @@ WALL_GAP_M = 0.03  # minimum distance between footprint and wall; the obstacle s
 WALL_COST_RANGE_M = 0.35  # range of clearances beyond the minimum within which a metre costs more
 MAX_WALL_COST = 1.0  # additional cost of a metre at the minimum clearance
 UNKNOWN_COST = 30.0  # additional cost of a metre where nothing is known: a path through it is the last resort
-LOOKAHEAD_RANGE_M = 3.0  # length of the path within which the lookahead point is chosen
+LOOKAHEAD_RANGE_M = 3.0  # length of the path within which the lookahead point is chosen, for slow robots
 MAX_LOOKAHEAD_CANDIDATES = 12  # points of the path that are tried, evenly spaced
 MAX_LINE_COST_RATIO = 1.02  # cost of the straight line to the lookahead point, relative to the path on the grid
 # Half of the 16 neighbours as (rows, columns); the other half are their opposites. A knight's move passes over two more
@@ -107,10 +107,10 @@ class FreeSpaceGraph:
             and self.grid.inside(point)
         ):
             return here  # no other cell's centre is nearer to a point inside this cell
-        free = clearance >= self.min_clearance
+        cells = np.arange(self.grid.cells) if np.isinf(within) else self.grid.cells_near(point, within)
+        cells = cells[clearance[cells] >= self.min_clearance]
         if component is not None:
-            free &= self.component == component
-        cells = np.flatnonzero(free)
+            cells = cells[self.component[cells] == component]
         if not len(cells):
             return None
         distance = np.hypot(*(self._centres[cells] - point).T)
@@ -169,10 +169,13 @@ class CostField:
         centres = self.graph.grid.centres(np.array(cells))
         return np.concatenate([np.atleast_2d(point), centres[1:-1], self.goal[None]])
 
-    def lookahead_point(self, point: Array, path: Array) -> Array:
-        """The lookahead point (2,) m on ``path`` of a robot at ``point``: the farthest on a free straight line."""
+    def lookahead_point(self, point: Array, path: Array, within: float = 0.0) -> Array:
+        """The lookahead point (2,) m on ``path`` of a robot at ``point``: the farthest on a free straight line.
+
+        It is chosen on the next `LOOKAHEAD_RANGE_M` of the path, or ``within`` m if that is more.
+        """
         distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
-        near = np.flatnonzero(distance[1:] <= LOOKAHEAD_RANGE_M) + 1
+        near = np.flatnonzero(distance[1:] <= max(LOOKAHEAD_RANGE_M, within)) + 1
         tried = np.array([1])
         if len(near):
             tried = near[np.unique(np.linspace(0, len(near) - 1, MAX_LOOKAHEAD_CANDIDATES).astype(int))]
@@ -194,12 +197,11 @@ class CostField:
         cell = int(grid.cell_of(np.asarray(point)))
         if np.isfinite(self.cost.ravel()[cell]):
             return cell
-        reachable = np.flatnonzero(np.isfinite(self.cost.ravel()))
-        distance = np.hypot(*(grid.centres(reachable) - point).T)
-        near = distance <= self.graph.min_clearance + 2 * grid.resolution
-        if not near.any():
-            return None
-        return int(reachable[near][np.argmin(distance[near] + self.cost.ravel()[reachable[near]] * 1e-3)])
+        within = self.graph.min_clearance + 2 * grid.resolution
+        near = grid.cells_near(point, within)
+        distance, cost = np.hypot(*(grid.centres(near) - point).T), self.cost.ravel()[near]
+        total = np.where(distance <= within, distance + cost * 1e-3, np.inf)
+        return int(near[np.argmin(total)]) if np.isfinite(total).any() else None
 
 
 def cost_near_walls(clearance: Array, min_clearance: float) -> Array:

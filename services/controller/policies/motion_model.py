@@ -102,6 +102,11 @@ def max_braking_time(robot: Robot) -> float:
     return max(robot.max_speed / robot.acceleration, robot.max_turn / robot.turn_acceleration)
 
 
+def stopping_distance(robot: Robot) -> float:
+    """Distance in m that a motion at maximum speed covers until the robot stands."""
+    return robot.max_speed * HOLD_S + robot.max_speed**2 / (2 * robot.acceleration)
+
+
 def braking_speed(distance: float, robot: Robot, hold: float = HOLD_S) -> float:
     """Speed in m/s that, held for ``hold`` s and then braked, covers ``distance`` m: v hold + v^2 / 2a = distance."""
     a = robot.acceleration

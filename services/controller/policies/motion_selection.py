@@ -29,8 +29,9 @@ FIELD_OF_VIEW_MARGIN_RAD, FIELD_OF_VIEW_DIVISOR = np.pi / 4, 3
 # Cost in m of a change of velocity by 1 m/s, so that the choice does not alternate between motions of equal merit.
 CHANGE_COST_S = 0.02
 WALKING_SPEED = 1.0  # m/s at which moving obstacles are assumed to approach
-LINE_SAMPLES = (np.arange(6) + 0.5) / 6  # shares of the line to the lookahead point at which the ambiguity is looked up
-MOTION_STRIDE = 5  # the ambiguity is looked up at every fifth pose of a motion
+# Fractions of the line to the lookahead point at which the ambiguity is looked up. With fewer, the errors of its
+# integral would exceed the differences between motions.
+LINE_SAMPLES = (np.arange(12) + 0.5) / 12
 HINDERED_M = 0.05  # a status text is shown if walls and obstacles make the way longer by this much
 GAP_TOLERANCE_M = 1e-3  # for rounding errors
 
@@ -41,7 +42,7 @@ class Surroundings:
 
     wall_distance: Callable[[Array], Array]  # (..., 2) m -> (...,) m to the nearest mapped wall; inf without a map
     points: Array  # (K, 2) m, obstacles that are not in the map
-    moving: Array  # (K,) bool, points that may approach
+    moving: npt.NDArray[np.bool_]  # (K,) points that may approach
     min_wall_distance: float  # m from the robot's centre
     min_point_distance: float  # m from the robot's centre
 
@@ -123,18 +124,23 @@ class PoseBelief:
         """
         if self.scans is None:
             return np.zeros(len(motions)), np.zeros(len(motions))
-        ends, length = motions[:, -1, :2], path_lengths(motions)
+        ends, before, after = motions[:, -1, :2], motions[:, :-1, :2], motions[:, 1:, :2]
         line = ends[:, None] + LINE_SAMPLES[:, None] * (lookahead - ends)[:, None]
-        points = se2.transform(self.pose, np.concatenate([motions[:, ::MOTION_STRIDE, :2], line], axis=1))
-        line_length = np.hypot(*(lookahead - ends).T)
-        metres = np.full(points.shape[:2], 1.0)  # length of the part of the way that each point represents
-        metres[:, -len(LINE_SAMPLES) :] *= line_length[:, None] / len(LINE_SAMPLES)
-        metres[:, : -len(LINE_SAMPLES)] *= length[:, None] / (points.shape[1] - len(LINE_SAMPLES))
+        points = se2.transform(self.pose, np.concatenate([(before + after) / 2, line], axis=1))
+        line_length = np.hypot(*(lookahead - ends).T)[:, None]
+        # Length of the part of the way that each point represents
+        metres = np.concatenate(
+            [
+                np.linalg.norm(after - before, axis=-1),
+                np.repeat(line_length / len(LINE_SAMPLES), len(LINE_SAMPLES), axis=1),
+            ],
+            axis=1,
+        )
         ambiguity = np.sum(metres * self.scans.ambiguity_grid.interpolate(self.scans.ambiguity, points), axis=1)
         information = self.scans.information[self.scans.information_grid.cell_of(se2.transform(self.pose, ends))]
         information = information * seconds / motion_model.STEP_S
-        before = efe.remaining_entropy(self.covariance, np.zeros((3, 3)))
-        return ambiguity, before - efe.remaining_entropy(self.covariance, information)
+        present = efe.remaining_entropy(self.covariance, np.zeros((3, 3)))
+        return ambiguity, present - efe.remaining_entropy(self.covariance, information)
 
 
 @dataclass(frozen=True)

@@ -22,11 +22,12 @@ from services.controller.policies.goal_check import near_wall, wall_refusal
 from services.controller.policies.motion_model import (
     STEP_S,
     is_moving,
+    stopping_distance,
     turn_rate,
     turn_to_lookahead,
 )
 from services.controller.policies.motion_selection import PoseBelief, Surroundings, least_distance, select_motion
-from services.controller.policies.obstacles import TemporaryObstacles
+from services.controller.policies.obstacles import MAX_RANGE_M, TemporaryObstacles
 from services.controller.policies.recovery import BACKING_OFF, MAX_GAP_NS, STUCK_AFTER_NS, Recovery, back_off
 from services.controller.policies.scan_information import ScanInformation
 
@@ -45,7 +46,6 @@ REPLAN_PERIOD_FAR_NS = 1_500_000_000  # the same when obstacles change elsewhere
 BLIND_AHEAD = "the scanner does not see ahead, where a differential base drives: mount it facing ahead"
 MIN_PROGRESS_M = 0.02  # near the goal, the robot counts as stuck if it moves by less than this
 MAX_COST_TO_GOAL_M = 100.0  # larger costs are clipped, also that of a goal to which no path leads
-OBSTACLE_RANGE_M = 3.0  # obstacles farther from the robot do not matter to its next second
 
 
 class GeodesicPolicy:
@@ -190,7 +190,8 @@ class GeodesicPolicy:
         assert self.field is not None  # noqa: S101 - there is a path
         if (stop := self._stop_beside_goal(stamp_ns, pose, self.field.goal, surroundings, path)) is not None:
             return stop
-        lookahead = se2.rotate(-pose[2], self.field.lookahead_point(pose[:2], path) - pose[:2])
+        lookahead = self.field.lookahead_point(pose[:2], path, stopping_distance(self.robot))
+        lookahead = se2.rotate(-pose[2], lookahead - pose[:2])
         known = PoseBelief(pose, _covariance(belief), self._information)
         selected = select_motion(velocity, lookahead, surroundings, self.robot, known)
         action = turn_to_lookahead(
@@ -247,7 +248,7 @@ class GeodesicPolicy:
         self._last_progress = None  # near the goal, the robot is not stuck while its pose is not known
         if self.epistemic or belief.state != "ambiguous":
             points = safety.scan_points(self._scan)
-            points = points[np.hypot(*points.T) < OBSTACLE_RANGE_M]
+            points = points[np.hypot(*points.T) < MAX_RANGE_M]
             return self.localiser.decide(belief, self._scan, points, velocity, self._field_of_view)
         decision = self.decide(belief, velocity, motion_until_effect)
         decision.reason = decision.reason or f"the belief is {belief.state}: assuming its best hypothesis"
@@ -298,15 +299,13 @@ class GeodesicPolicy:
         return bool(distance.min() < self.graph.min_clearance + WALL_COST_RANGE_M)
 
     def _surroundings(self, pose: Array, points: Array, moving: npt.NDArray[np.bool_]) -> Surroundings:
-        near = np.hypot(*(points - pose[:2]).T) < OBSTACLE_RANGE_M
-
         def wall_distance(positions: Array) -> Array:
             return self.free.clearance_at(se2.transform(pose, positions))
 
         return Surroundings(
             wall_distance,
-            se2.rotate(-pose[2], points[near] - pose[:2]),
-            moving[near],
+            se2.rotate(-pose[2], points - pose[:2]),
+            moving,
             self.graph.min_clearance,
             self.robot.radius + OBSTACLE_GAP_M,
             field_of_view=self._field_of_view,

@@ -45,6 +45,13 @@ def test_invalid_limits_are_named(field, value):
         load_settings(ControllerSettings, [f"--{field.replace('_', '-')}={value}"])
 
 
+def test_dead_band_above_the_maximum_speed():
+    with pytest.raises(UserError, match=r"--dead-band 0.1 with --max-speed 0.1: the robot would never move"):
+        RobotSettings(dead_band=0.1, max_speed=0.1).build_robot()
+    with pytest.raises(UserError, match="--turn-dead-band"):
+        RobotSettings(turn_dead_band=0.5, max_turn=0.4).build_robot()
+
+
 def test_slowly_stopping_robots():
     with pytest.raises(UserError, match=r"--max-speed 1 m/s with --acceleration 0.01 m/s²: .* 100 s to stop"):
         RobotSettings(acceleration=0.01).build_robot()

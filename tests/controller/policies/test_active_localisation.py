@@ -49,6 +49,13 @@ def test_time_for_progress():
     assert not timer.expired
 
 
+def test_slow_robot_makes_progress():
+    timer = StallTimer(max_speed=0.05)
+    for k in range(100):
+        timer.move(k * 100_000_000, np.array([0.005, 0.0, 0.0]))
+        assert not timer.expired
+
+
 def test_the_present_place_costs_as_much_as_its_path():
     """It is 2 m away, behind a wall around which the path is much longer."""
     poses, world = np.array([[3.5, 1.0, 0.0], [8.0, 1.0, 0.0]]), room(10, 6, box(4.5, 2.0, 0.2, 4.0))

@@ -158,3 +158,12 @@ def test_rooms_without_a_door():
     assert left != right
     assert not graph.cost_field(b).reaches(a)
     assert graph.grid.centres([graph.nearest_free(b, component=left)])[0][0] < 5
+
+
+@given(x=st.floats(-2, 6), y=st.floats(-2, 5), within=st.floats(0, 2))
+def test_cells_near_a_point(x, y, within):
+    grid = Grid((-1.0, 0.5), 0.25, (12, 20))
+    found = grid.cells_near(np.array([x, y]), within)
+    near = np.flatnonzero(np.hypot(*(grid.centres() - [x, y]).T) <= within)
+    assert set(near.tolist()) <= set(found.tolist())
+    assert len(set(found.tolist())) == len(found) <= (2 * within / 0.25 + 2) ** 2
