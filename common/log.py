@@ -23,7 +23,7 @@ _original_stderr: list[TextIO] = []  # the stream in use since stderr was redire
 
 
 def begin_logging(service: str, argv: Sequence[str] | None = None) -> None:
-    """Sets up JSON logging before the settings are read, if they ask for it, so that errors in them are JSON too."""
+    """Sets up JSON logging before the settings are read, if requested there, so that errors in them are JSON too."""
     arguments = sys.argv[1:] if argv is None else argv
     enabled = os.environ.get("PRESAGE_LOG_JSON", "").lower() in {"1", "true", "yes", "on", "t", "y"}
     if "--no-log-json" not in arguments and ("--log-json" in arguments or enabled):
@@ -64,7 +64,7 @@ def set_up_logging(level: str = "info", *, as_json: bool = False, service: str =
         logger_factory=structlog.stdlib.LoggerFactory(),
         wrapper_class=structlog.stdlib.BoundLogger,
     )
-    handler = logging.StreamHandler(_json_stream() if as_json else sys.stderr)
+    handler = logging.StreamHandler(_redirect_stderr() if as_json else sys.stderr)
     handler.setFormatter(
         structlog.stdlib.ProcessorFormatter(
             foreign_pre_chain=[*shared, structlog.stdlib.add_logger_name] if as_json else shared,
@@ -94,8 +94,8 @@ def _as_json(event: Any, **options: Any) -> str:
         return json.dumps(plain, allow_nan=False)
 
 
-def _json_stream() -> TextIO:
-    """The original stderr; the first call redirects file descriptors, warnings and exceptions into the log."""
+def _redirect_stderr() -> TextIO:
+    """Returns the original stderr; the first call redirects file descriptors, warnings and exceptions into the log."""
     if not _original_stderr:
         _original_stderr.append(capture(_log_line))
         logging.raiseExceptions = False  # otherwise errors in writing to stderr would themselves be logged to stderr
@@ -120,17 +120,15 @@ def logger(service: str) -> Logger:
 
 
 class LogRateLimiter:
-    """Allows one log line a second for each subject, and counts those that it suppressed."""
+    """Allows one log line a second for each subject."""
 
     def __init__(self) -> None:
         self._last: dict[str, float] = {}
-        self.suppressed: dict[str, int] = {}
 
     def __call__(self, subject: str) -> bool:
         """Whether to log a line about ``subject`` now."""
         now = time.monotonic()
         if now - self._last.get(subject, -1.0) < 1.0:
-            self.suppressed[subject] = self.suppressed.get(subject, 0) + 1
             return False
         if len(self._last) > 1000:  # invented keys must not fill memory
             self._last.clear()

@@ -25,7 +25,7 @@ class Instance:
     @classmethod
     def parse(cls, name: str) -> Instance | None:
         """Parses an instance name; returns None if ``name`` is not one."""
-        match = re.fullmatch(r"([0-9a-f]{12})~(.+)~(\d+)~([0-9a-f]*)", name)
+        match = re.fullmatch(r"([0-9a-f]{12})~(.+)~(\d+)~([0-9a-f]{1,8})", name)
         return cls(int(match[1], 16), match[2], int(match[3]), match[4]) if match else None
 
     @property

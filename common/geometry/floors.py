@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
 
 FloorName = Annotated[str, Field(min_length=1, max_length=100, pattern=NAME_PATTERN, coerce_numbers_to_str=True)]
+# Place in m of a lift on each floor at which it stops, in the floor's frame
 Lift = Annotated[dict[FloorName, Point], Field(min_length=2, max_length=100)]
-# its place in m on each floor that it stops at, in the floor's frame
 
 
 class Floor(WorldPart):
@@ -39,7 +39,7 @@ class Floor(WorldPart):
         return bounds_of(self.boundary)
 
     def contains(self, place: npt.ArrayLike) -> bool:
-        """Whether a point (2,) or pose (3,) in map is on this floor."""
+        """Whether a point (2,) or pose (3,) in map is within this floor's bounding box."""
         x0, y0, x1, y1 = self.bounds
         x, y = np.asarray(place, float)[:2]
         return bool(x0 <= x <= x1 and y0 <= y <= y1)
@@ -64,7 +64,7 @@ class Floor(WorldPart):
 
 
 def floor_at(floors: Iterable[Floor], place: npt.ArrayLike) -> Floor | None:
-    """The floor on which a point (2,) or pose (3,) in map is; None between floors, and without any."""
+    """The floor whose bounding box contains a point (2,) or pose (3,) in map, or None."""
     return next((floor for floor in floors if floor.contains(place)), None)
 
 

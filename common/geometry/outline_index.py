@@ -30,8 +30,8 @@ class OutlineIndex:
 
     segments: Array  # (S, 4) x0, y0, x1, y1 in m
     circles: Array  # (C, 3) x, y, radius in m
-    # Cell (i, j), with k = columns * i + j, has members[starts[k] : starts[k + 1]]: numbers of segments, from S on of
-    # circles.
+    # Cell (i, j), with k = columns * i + j, has members[starts[k] : starts[k + 1]]: s < S is segment s, otherwise
+    # circle s - S.
     starts: npt.NDArray[np.int64]  # (rows * columns + 1,)
     members: npt.NDArray[np.int64]
     shape: tuple[int, int]  # rows, columns
@@ -46,7 +46,8 @@ class OutlineIndex:
         low = points.min(axis=0) - MARGIN_M
         extent = points.max(axis=0) + MARGIN_M - low
         count = len(segments) + len(circles) + 1
-        size = max(math.sqrt(extent.prod() / count), float(extent.max()) / count)  # m, edge length of a cell
+        # m, edge length of a cell; the second term limits the number of cells of a long, thin world
+        size = max(math.sqrt(extent.prod() / count), float(extent.max()) / count)
         frame = (float(low[0]), float(low[1]), size)
         columns, rows = (int(n) for n in np.ceil(extent / size))
         # Two passes over the outlines: the first one counts the members of each cell, the second one lists them.

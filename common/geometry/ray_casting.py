@@ -51,7 +51,7 @@ def _cast_rays(
     world: World, people: Array, poses: npt.ArrayLike, angles: npt.ArrayLike, *, derivatives: bool
 ) -> tuple[Array, Array]:
     # Copied, because numba compiles again for arrays that are read-only or not contiguous.
-    poses, angles = np.array(poses, float).reshape(-1, 3), np.array(angles, float).ravel()
+    poses, angles = np.array(poses, float, order="C").reshape(-1, 3), np.array(angles, float, order="C").ravel()
     shape = (len(poses), len(angles))
     ranges, jacobian = np.empty(shape), np.zeros((*(shape if derivatives else (0, 0)), 3))
     _cast(world.outline_index.arrays, np.array(people, float), *_cells_of(world.grid), poses, angles, ranges, jacobian)
@@ -103,9 +103,9 @@ def _cast(
             ux, uy = math.cos(heading), math.sin(heading)
             r, nx, ny = _nearest_outline(outlines, x, y, ux, uy)
             for s in range(people.shape[0]):
-                person = _distance_to_circle(people, s, x, y, ux, uy)
-                if person < r:
-                    r, nx, ny = person, *_circle_normal(people, s, x, y, ux, uy, person)
+                distance = _distance_to_circle(people, s, x, y, ux, uy)
+                if distance < r:
+                    r, nx, ny = distance, *_circle_normal(people, s, x, y, ux, uy, distance)
             if occupied.size:
                 heading -= frame[2]
                 hit, hx, hy = _nearest_cell(
@@ -140,12 +140,12 @@ def _nearest_outline(outlines: IndexArrays, x: float, y: float, ux: float, uy: f
                 r = _distance_to_segment(segments, s, x, y, ux, uy)
             else:
                 r = _distance_to_circle(circles, s - segments.shape[0], x, y, ux, uy)
-            # At a corner, the first of the outlines that meet there, whichever cell lists it first.
+            # Of outlines that meet at a corner, the one with the lowest index is taken, whichever cell lists it first.
             if r < nearest or (r == nearest and s < which):
                 nearest, which = r, s
         to_x, to_y = _distance_to_edge(px, ux, column, 0), _distance_to_edge(py, uy, row, 0)
         t = min(to_x, to_y)
-        if nearest <= t * size:  # farther ones may be hidden by an outline of the next cell
+        if nearest <= t * size:  # the hit is inside this cell, so no later cell has a nearer one
             break
         if to_x <= to_y:
             column += 1 if ux > 0 else -1
@@ -168,8 +168,8 @@ def _distance_to_segment(segments: Array, s: int, x: float, y: float, ux: float,
     det = ux * ey - uy * ex
     if det == 0.0:
         return np.inf
-    r, share = (ax * ey - ay * ex) / det, (ax * uy - ay * ux) / det
-    return r if r >= 0.0 and 0.0 <= share <= 1.0 else np.inf
+    r, along = (ax * ey - ay * ex) / det, (ax * uy - ay * ux) / det
+    return r if r >= 0.0 and 0.0 <= along <= 1.0 else np.inf
 
 
 @jit
@@ -233,7 +233,7 @@ def _nearest_cell(
 
 @jit
 def _cross_grid(x: float, y: float, ux: float, uy: float, columns: int, rows: int) -> tuple[float, float]:
-    """Distances at which a ray enters (0 inside) and leaves the grid; the second is not larger if the ray misses it."""
+    """Distances at which a ray enters (0 inside) and leaves the grid; if it misses, the second is at most the first."""
     first, last = 0.0, np.inf
     for start, along, size in ((x, ux, columns), (y, uy, rows)):
         if along == 0.0:

@@ -17,7 +17,7 @@ def wrap(angle: npt.ArrayLike) -> Array:
 
 
 def compose(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
-    """Pose in the parent of ``a`` of a frame with pose ``b`` in the frame ``a``; shapes (..., 3) broadcast."""
+    """Pose ``b``, given in frame ``a``, expressed in the parent frame of ``a``; shapes (..., 3) broadcast."""
     a, b = np.asarray(a, float), np.asarray(b, float)
     cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
     x = a[..., 0] + cos * b[..., 0] - sin * b[..., 1]
@@ -62,7 +62,7 @@ def compose_jacobians(a: npt.ArrayLike, b: npt.ArrayLike) -> tuple[Array, Array]
 
 
 def displacement_jacobian(offsets: Array, directions: Array) -> Array:
-    """Derivatives (K, 3) of points that a pose carries, along unit vectors ``directions`` (K, 2), by its x, y and yaw.
+    """Derivatives (K, 3) by a pose's x, y, yaw of points fixed to it, along unit vectors ``directions`` (K, 2).
 
     ``offsets`` (K, 2) m are the points relative to the position of the pose; both in the parent frame.
     """
@@ -91,9 +91,9 @@ def transform(pose: npt.ArrayLike, points: npt.ArrayLike) -> Array:
 
 
 def alignment(poses: Array, targets: Array) -> Array:
-    """Pose (3,) of the frame of ``poses`` from which their positions (N, 2) are nearest to those of ``targets``.
+    """Rigid transform (3,) that brings the positions of ``poses`` (N, 3) closest to those of ``targets``.
 
-    Least squares of the distances, in closed form (Horn 1987 in the plane); headings do not count.
+    Least squares of the distances, in closed form (Horn 1987 in the plane); headings are ignored.
     """
     mean, target_mean = poses[:, :2].mean(axis=0), targets[:, :2].mean(axis=0)
     a, b = poses[:, :2] - mean, targets[:, :2] - target_mean

@@ -45,7 +45,7 @@ class Topic:
 
 @dataclass(frozen=True)
 class Query:
-    """One queryable: a service that replies to requests."""
+    """One row of the table of requests: its messages, the service that replies, and the roles that may send it."""
 
     name: str
     request: type[r.Request]
@@ -278,5 +278,8 @@ def topic_of(key: str) -> Topic | None:
 
 
 def expected_rate(topic: Topic, scan_time: float) -> float:
-    """Rate of a topic in Hz for a scanner with a period of ``scan_time`` s, or the table's 15 Hz if that is 0."""
+    """Rate of a topic in Hz. Topics with the nominal rate of scans have that of a scanner with this ``scan_time`` in s.
+
+    If that is 0, it is not known, and the nominal rate is returned.
+    """
     return 1 / scan_time if scan_time > 0 and topic.rate == SCAN.rate else topic.rate

@@ -30,9 +30,9 @@ def sweep_time(beams: int, time_increment: float) -> float:
 
 
 def correct_beams(ranges: Array, angles: Array, poses: Array, mount: Array) -> tuple[Array, Array]:
-    """Ranges (B,) in m and angles (B,) in rad of the same surface points, seen from the laser's pose at the stamp.
+    """Ranges (B,) in m and angles (B,) in rad of the same surface points, seen from the laser's pose at one time.
 
-    ``poses`` (B, 3) are those of base_link when each beam was measured, in base_link at the stamp; ``mount`` (3,) is
+    ``poses`` (B, 3) are those of base_link when each beam was measured, in base_link at that time; ``mount`` (3,) is
     the pose of the laser in base_link. Beams without a distance (inf, 0) keep their range. The corrected angles are not
     evenly spaced.
     """
@@ -49,7 +49,8 @@ def correct_beams(ranges: Array, angles: Array, poses: Array, mount: Array) -> t
 def correct_scan(scan: Scan, velocity: Array) -> Scan:
     """The scan as if all beams had been measured at its stamp, for a robot moving with ``velocity`` (3,) in base_link.
 
-    Its ``time_increment`` is kept, because it states how long the scan took.
+    The pose after t s is approximated by t times the velocity. ``time_increment`` is kept, because it states how long
+    the scan took.
     """
     if not scan.time_increment or not velocity.any():
         return scan
@@ -61,8 +62,9 @@ def correct_scan(scan: Scan, velocity: Array) -> Scan:
 def evenly_spaced(ranges: Array, angles: Array, sweep: Sweep, not_measured: float = NOT_MEASURED) -> Array:
     """Ranges (B,) in m of the beams of ``sweep``, from ranges (K,) at other angles (K,) in rad.
 
-    Each beam gets the shortest of the ranges nearest to its direction, or ``not_measured`` if there are none. So
-    directions are exact to half the angle between beams, which is enough to avoid obstacles and to draw maps.
+    Each range goes to the beam nearest to its direction, and a beam gets the shortest of its ranges, or
+    ``not_measured``. So directions are exact to half the angle between beams, which is enough to avoid obstacles and
+    to draw maps.
     """
     beam = sweep.beams_at(angles)
     used = (beam >= 0) & (ranges != not_measured)

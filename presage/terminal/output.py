@@ -15,7 +15,7 @@ from common.versions import commit, versions
 
 
 def check_file(file: Path | None, option: str) -> None:
-    """Raises UserError if ``file`` cannot be written; the check changes nothing on disk."""
+    """Raises UserError if ``file`` cannot be written; a file that the check creates is deleted again."""
     if file is None or (file.exists() and not file.is_file() and not file.is_dir()):
         return  # do not open a pipe or device for a check: closing it would end its reader
     existed = file.exists()
@@ -69,5 +69,5 @@ def provenance(seed: int | None = None) -> dict[str, Any]:
 
 
 def printable(text: str) -> str:
-    """Removes control characters, which could change the state of the terminal, from text received on the bus."""
+    """Text received on the bus with "?" for control characters, which could change the state of the terminal."""
     return "".join(c if c.isprintable() else "?" for c in text)

@@ -94,7 +94,7 @@ class VelocityCommand:
         return CmdVel(stamp_ns=stamp_ns, twist=Twist())
 
     def resume(self, stamp_ns: int) -> bool:
-        """Restores the velocity from before a pause, if the stamps show that no simulated time has passed.
+        """Restores the velocity from before a pause, if the last command is not older than `Robot.command_age`.
 
         Returns whether it was restored.
         """

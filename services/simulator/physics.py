@@ -59,7 +59,7 @@ class Physics(Protocol):
 
 
 def choose_engine(wanted: Literal["auto", "pybullet", "kinematic"]) -> Engine:
-    """The engine to use: pybullet if it is installed, unless another is wanted. Raises UserError if it is missing."""
+    """The engine to use; auto is pybullet if it is installed, else kinematic. Raises UserError if it is missing."""
     if wanted == "kinematic":
         return wanted
     installed = find_spec("pybullet") is not None

@@ -9,7 +9,7 @@ from common.bus.instances import Instance, Instances, SourceSelector, describe_i
 
 names = st.builds(
     Instance, st.integers(0, 2**48 - 1), st.text(min_size=1, max_size=80), st.integers(1, 2**22),
-    st.text("0123456789abcdef", max_size=32),
+    st.text("0123456789abcdef", min_size=1, max_size=32),
 )  # fmt: skip
 
 

@@ -65,7 +65,7 @@ def path_of(folder: Path, world: str) -> Path:
 
 
 def save(path: Path, model: FieldModel, places: Array, card: FieldCard) -> None:
-    """Writes the field, the seeds of a search at ``places`` (S, 2) m, and the card, atomically.
+    """Writes the field, the seeds of a search at ``places`` (S, 2) m, and the card; each file atomically.
 
     The field is stored in half precision, whose resolution is finest near zero, at surfaces.
     """
@@ -77,7 +77,7 @@ def save(path: Path, model: FieldModel, places: Array, card: FieldCard) -> None:
 
 
 def write(path: Path, model: FieldModel, seeds: Seeds, card: FieldCard) -> None:
-    """Writes a field whose solid parts are marked, the seeds of a search and the card, atomically."""
+    """Writes a field whose solid parts are marked, the seeds of a search and the card; each file atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(".partial")
     data = safetensors.numpy.save({**_tensors(model, seeds.places), "panoramas_in_bytes": seeds.panoramas})
@@ -134,7 +134,7 @@ def _check_arrays(tensors: Tensors) -> None:
     ):
         raise ValueError("an array does not have the shape that a field needs")
     if not all(np.isfinite(a).all() for a in (phi, scales, places)):
-        raise ValueError("the file contains numbers that are not finite")
+        raise ValueError("an array contains NaN or infinity")
     if "seen" in tensors:
         cells, origin = tensors["seen"], tensors.get("seen_origin", np.zeros(0))
         if cells.ndim != 2 or origin.shape != (2,) or not np.isfinite(origin.astype(float)).all():
