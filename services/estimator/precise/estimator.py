@@ -195,8 +195,9 @@ class PreciseEstimator:
             match = self._correct_motion_again(match, observation, period)
         # Fusion of match and motion prior
         view = match.view
-        hypotheses = [self._fuse(k, match, motions[k], observation) for k in range(len(match.poses))]
-        hypotheses += self._find_alternatives(view, hypotheses[0], match.motions[0], motions[0])
+        fused = [self._fuse(k, match, motions[k], observation) for k in range(len(match.poses))]
+        hypotheses = [hypothesis for hypothesis, _ in fused]
+        hypotheses += self._find_alternatives(view, *fused[0], motions[0])
         is_motion_sudden = -hypotheses[0].motion_cost < np.log(SUDDEN_CHANGE_PROBABILITY)
         # Weights, also of the unknown place
         self._weigh_hypotheses(view, hypotheses, match.local_pose, period)
@@ -370,8 +371,8 @@ class PreciseEstimator:
 
     def _fuse(
         self, k: int, match: ScanMatch, predicted: list[MotionCandidate], observation: Observation
-    ) -> TrackedHypothesis:
-        """Fuses the k-th hypothesis with the scan.
+    ) -> tuple[TrackedHypothesis, MotionCandidate]:
+        """Fuses the k-th hypothesis with the scan. Also returns the motion that the scan selected.
 
         An improbable motion, given those that were ``predicted``, is evidence for a kidnapping. Where the duration of
         the motion is unknown, this evidence is left out.
@@ -402,13 +403,13 @@ class PreciseEstimator:
         best = min(fused, key=lambda each: each.negative_log_evidence)
         updated = update_hypothesis(hypothesis, best, evidence, k, period, unobserved=unknown_motion)
         if self._is_earlier(observation):
-            return replace(updated, velocity=None)
-        return replace(updated, motion_cost=self._motion_cost(predicted, updated))
+            return replace(updated, velocity=None), best.candidate
+        return replace(updated, motion_cost=self._motion_cost(predicted, updated)), best.candidate
 
     def _find_alternatives(
-        self, view: View, best: TrackedHypothesis, candidates: list[MotionCandidate], predicted: list[MotionCandidate]
+        self, view: View, best: TrackedHypothesis, motion: MotionCandidate, predicted: list[MotionCandidate]
     ) -> list[TrackedHypothesis]:
-        """Other hypotheses within the motion prior that fit the scan, if it made the ``best`` one far more certain.
+        """Other hypotheses that fit the scan after the same ``motion``, if it made the ``best`` one far more certain.
 
         The pose was uncertain before this scan, and a descent from one pose finds only the nearest match. An
         alternative loses evidence if its motion is less probable than that of the best match, and gains none if it is
@@ -420,7 +421,6 @@ class PreciseEstimator:
         certain = doubt <= 1 - self.settings.tracking_probability
         if certain or 1 - self._probability_of_being_near(best) > 0.5 * doubt:
             return []
-        motion = candidates[-1]  # the widest, as in the match: the expected motion may be wrong
         found = search_near([view], motion.mean, motion.covariance, self.seeds, self.settings, self._rng)
         at_best = before.log_evidence + _prior_of([motion]).energy(best.pose[None])[0]
         return [

@@ -383,10 +383,11 @@ def test_alternatives_along_a_corridor():
     made.hypotheses = [before]
     view = made._view(scene.observe(scene.clean((here + turn)[None])[0], 1 / 15))
     motions = made._predict_motion(before, 1 / 15, None, None)  # standing still is expected
-    found = made._find_alternatives(view, replace(made.hypotheses[0], pose=here + turn), motions, motions)
-    assert not found  # the match did not make the pose more certain
-    best = replace(before, pose=here + turn, noise_covariance=1e-4 * np.eye(3))
-    found = made._find_alternatives(view, best, motions, motions)
+    match = made._match_map(view, [motions], 1 / 15, with_odometry=False)
+    best, motion = made._fuse(0, match, motions, scene.observe(scene.clean((here + turn)[None])[0], 1 / 15))
+    assert np.abs(best.pose - here - turn).max() < 0.01
+    assert not made._find_alternatives(view, before, motion, motions)  # the match did not make the pose more certain
+    found = made._find_alternatives(view, best, motion, motions)
     assert min(np.abs(each.pose - other - turn).max() for each in found) < 0.01
 
 
