@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -50,6 +51,7 @@ def train(
         Path | None,
         typer.Option("--out", "-o", help="Folder for the weights. Defaults to the folder the services read."),
     ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace weights of another world of the same name.")] = False,
     config: Config = None,
 ) -> None:
     """Train the generative model of a world, or of a recorded drive.
@@ -87,7 +89,8 @@ def train(
             reading = load_section(LogSettings, config, "log", mount=mount).reading()
             recipe = Recipe(tuning.resolution or 0.05, seed=seed)
             train_from_drive(
-                TrainDriveOptions(drive, world, folder, samples or 2000, recipe, tuning.share, reading), console
+                TrainDriveOptions(drive, world, folder, samples or 2000, recipe, tuning.share, reading, force=force),
+                console,
             )
             return
         simulator = arguments(config=config, scanner=scanner, mount=mount, beams=beams)
@@ -97,7 +100,9 @@ def train(
         if preset == "precise":
             recipe = Recipe(tuning.resolution or 0.04, seed=seed)
             precise.train_precise(
-                precise.TrainPreciseOptions(world, chosen, tuple(simulator), folder, samples, recipe), link, console
+                precise.TrainPreciseOptions(world, chosen, tuple(simulator), folder, samples, recipe, force),
+                link,
+                console,
             )
         else:
             from presage.learning import train_paper as paper  # imports torch, which need not be installed
@@ -111,7 +116,7 @@ def train(
     # Without --scanner, `presage up` would simulate the default one; without --model, it looks in the default folder.
     estimator = "" if preset == "precise" else preset
     use = ["presage", "up", *arguments(world=world, estimator=estimator, model=out, scanner=scanner, config=config)]
-    console.print("use it with:", *use, highlight=False, soft_wrap=True)
+    console.print("use it with:", shlex.join(use), highlight=False, soft_wrap=True)
 
 
 @app.command("map", rich_help_panel="Learn", short_help="Build a ROS map from a drive.")
@@ -150,7 +155,8 @@ def map_(
     A cell is occupied if beams of at least two scans ended in it, and of at least 60 % of the scans that observed it.
     It is free if a beam passed through it, otherwise unknown.
 
-    Examples: `presage map run.mcap -o here.yaml`, then `presage up --world here.yaml`;
+    Examples: `presage map run.mcap -o here.yaml`, then `presage up --no-simulator --world here.yaml` with the robot, or
+    `presage up --world here.yaml --model exact` in simulation;
     `presage map run.mcap --refine rough.yaml -o fine.yaml`;
     `presage map fr079.npz --mount 0,0,0 --poses reference --half first --no-learn -o first_half.yaml`, then
     `presage experiment real --log fr079.npz --mount 0,0,0 --world first_half.yaml`.

@@ -53,6 +53,7 @@ class TrainDriveOptions:
     # If the drive refines a map, scans are simulated by its former model if there is one, else in the map.
     rough: World | None = None
     former: Path | None = None  # weights of the former model
+    force: bool = False  # replace the weights of another world of the same name
 
 
 def train_from_drive(options: TrainDriveOptions, console: Console) -> Path:
@@ -74,7 +75,7 @@ def train_on_drive(options: TrainDriveOptions, drive: ReferenceDrive, console: C
         )
     world = load_world(options.world) if options.world else rectangle(drive, options.log)
     path = weights.path_of(options.out, world.name)
-    weights.refuse_to_overwrite(path, world)
+    weights.refuse_to_overwrite(path, world, force=options.force)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     start = time.monotonic()
     with Progress(*columns, console=console) as bar:

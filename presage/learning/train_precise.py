@@ -47,6 +47,7 @@ class TrainPreciseOptions:
     out: Path = field(default_factory=training_folder)
     samples: int | None = None  # defaults to `default_samples`
     recipe: Recipe = Recipe()  # noqa: RUF009 - frozen
+    force: bool = False  # replace the weights of another world of the same name
 
 
 def default_samples(world: World) -> int:
@@ -61,7 +62,7 @@ def train_precise(options: TrainPreciseOptions, link: Link, console: Console) ->
     """
     world, scanner = load_world(options.world), options.scanner
     path = weights.path_of(options.out, world.name)
-    weights.refuse_to_overwrite(path, world)
+    weights.refuse_to_overwrite(path, world, force=options.force)
     rng = np.random.default_rng(options.recipe.seed)
     counts = {"train": options.samples or default_samples(world), "held out": CALIBRATION_SAMPLES + TEST_SAMPLES}
     poses = {name: world.sample_poses(count, rng, Robot().radius) for name, count in counts.items()}

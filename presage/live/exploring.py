@@ -23,6 +23,7 @@ def explore(link: Link, console: Console) -> int:
         messages = LatestMessages(bus, STATUS)
         if not bus.wait_matching(GOAL, ANSWER_TIMEOUT_S):
             raise UserError("no controller is running: start one with `presage up --mapping`")
+        messages.wait_for(Status, lambda _: True, ANSWER_TIMEOUT_S)  # else the controller may not receive goals yet
         request = Goal(stamp_ns=0, seq=time.time_ns(), pose=Pose(x=0.0, y=0.0), explore=True)
         try:
             bus.put(GOAL, request.encode())

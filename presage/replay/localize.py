@@ -88,7 +88,7 @@ class LocalizeOptions:
     ) -> LocalizeOptions:
         """Checks the options of the command line; raises UserError if a value is unknown."""
         if mode not in ("global", "track"):
-            raise UserError(f"no mode {mode!r}: choose global or track")
+            raise UserError(f"no mode {mode!r}: choose global, track or single")
         if frame not in ("base_link", "laser"):
             raise UserError(f"no frame {frame!r}: choose base_link or laser")
         if out is not None and out.suffix not in (".csv", ".json", ".tum"):
@@ -326,11 +326,13 @@ def _summarise(scans: Scans, rows: list[dict[str, Any]], in_file: int, console: 
     truth = scans.truth[: len(rows)]
     truth = se2.compose(truth, scans.geometry.mount) if laser else truth
     poses = np.array([[row["x"], row["y"], row["yaw"]] for row in rows])
-    known = np.isfinite(truth).all(axis=1)
-    poses, truth = poses[known], truth[known]
+    tracking = np.array([row["state"] == "tracking" for row in rows])
+    used = np.isfinite(truth).all(axis=1) & (tracking if tracking.any() else True)
+    poses, truth = poses[used], truth[used]
     if not len(poses):
         return
-    console.print(f"against {scans.truth_is}: {_errors(poses, truth)}")
+    which = "tracking scans" if tracking.any() else "all scans"
+    console.print(f"{which} against {scans.truth_is}: {_errors(poses, truth)}")
     frame = se2.alignment(truth, poses)
     if len(poses) > 1:
         console.print(

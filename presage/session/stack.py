@@ -21,7 +21,7 @@ from common.bus.bus import Bus, Link
 from common.bus.security import Credentials
 from common.errors import UserError
 from common.processes import end_with_this_process
-from presage.interrupts import ignoring_interrupts
+from presage.interrupts import deferring_interrupts, ignoring_interrupts
 from presage.session.ports import accepts_connections, check_port, free_port
 
 COLOURS = {"router": 37, "simulator": 36, "estimator": 35, "mapper": 35, "controller": 33, "recorder": 32, "viewer": 34}
@@ -186,23 +186,24 @@ class Stack:
             "PYTHONUNBUFFERED": "1",
             **self.child_environment(name),
         }
-        child = subprocess.Popen(  # noqa: S603 - our own modules
-            self.command(name, args),
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            errors="replace",
-            start_new_session=True,  # so that Ctrl-C does not reach the children: they are ended in order
-            preexec_fn=end_with_this_process(self.orphan_signal),  # noqa: PLW1509 - no threads in the child yet
-        )
-        process = ServiceProcess(
-            name, child, threading.Thread(target=lambda: self._forward_output(process), daemon=True)
-        )
-        process.args = args
-        process.reader.start()
-        self.processes[name] = process
+        with deferring_interrupts():  # so that a child is known as soon as it runs
+            child = subprocess.Popen(  # noqa: S603 - our own modules
+                self.command(name, args),
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                errors="replace",
+                start_new_session=True,  # so that Ctrl-C does not reach the children: they are ended in order
+                preexec_fn=end_with_this_process(self.orphan_signal),  # noqa: PLW1509 - no threads in the child yet
+            )
+            process = ServiceProcess(
+                name, child, threading.Thread(target=lambda: self._forward_output(process), daemon=True)
+            )
+            process.args = args
+            process.reader.start()
+            self.processes[name] = process
 
     def _forward_output(self, process: ServiceProcess) -> None:
         """Prints the child's output to standard error, each line with the child's name in front."""

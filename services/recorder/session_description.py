@@ -137,7 +137,7 @@ class DescriptionCollector:
             delay, attempts = self._query(service, query), 0
         except UserError as error:
             delay, attempts = RETRY_DELAY_S if attempts + 1 < MAX_ATTEMPTS else None, attempts + 1
-            if not self._stopping.is_set():
+            if not self._stopping.is_set() and delay is None:
                 self._log.warning("a service did not describe itself", service=service, reason=str(error))
         if delay is not None:
             self._scheduled[service, query.name] = (time.monotonic() + delay, attempts)

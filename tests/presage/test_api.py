@@ -111,6 +111,8 @@ def test_mount_argument_replaces_the_scans(world, ranges):
         (lambda e, r: presage.Estimator("nowhere"), "no world 'nowhere'"),
         (lambda e, r: presage.Estimator("corridor", "kalman"), "no estimator 'kalman'"),
         (lambda e, r: presage.Estimator("corridor", model="best"), "no model 'best'"),
+        (lambda e, r: presage.Estimator("corridor", sigma=0), "sigma: give the noise of the scanner in m"),
+        (lambda e, r: presage.Estimator("corridor", "particle-filter", optimiser=3), "for preset precise only"),
         (lambda e, r: presage.Estimator("corridor", initial_pose=(400, 0, 0)), "off the map"),
         (lambda e, r: e.update(r[:50]), r"ranges of shape \(50,\), but scanner tim571 has 200 beams"),
         (lambda e, r: e.update(presage.LaserScan(r, SCANNER.angles(), 25.0)), "the scanner, its mount or its noise"),

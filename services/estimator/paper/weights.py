@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -72,7 +73,7 @@ def available(folder: Path, world: str, preset: str) -> dict[int, Path]:
 
 def train_command(world: str, preset: str, scanner: str = "tim571", beams: int | None = None) -> str:
     """The command that trains missing weights."""
-    return f"presage train --world {world} --preset {preset} --scanner {scanner}" + (
+    return f"presage train --world {shlex.quote(world)} --preset {preset} --scanner {scanner}" + (
         f" --beams {beams}" if beams else ""
     )
 

@@ -175,7 +175,7 @@ def test_alternatives_are_in_the_same_surroundings():
     unmapped = np.array([0.0, 0.0, 1.0])
     made.hypotheses = [replace(before, noise_covariance=0.1 * np.eye(3), surroundings=unmapped)]
     motion = MotionCandidate(before.pose, 0.1 * np.eye(3), 1.0)
-    found = made._find_alternatives(view, before, [motion], [motion])
+    found = made._find_alternatives(view, before, motion, [motion])
     assert found
     assert all(np.array_equal(each.surroundings, unmapped) for each in found)
 

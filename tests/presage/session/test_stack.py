@@ -7,7 +7,7 @@ import signal
 
 import pytest
 
-from presage.interrupts import interruptible
+from presage.interrupts import deferring_interrupts, interruptible
 
 
 @pytest.fixture
@@ -39,3 +39,17 @@ def test_signals(number, before, ends):
         ended = True
     assert ended == ends
     assert signal.getsignal(number) == before
+
+
+@pytest.mark.usefixtures("restored")
+def test_interrupts_while_a_process_starts():
+    """They end the command, but not before the process is known."""
+    steps = []
+    try:
+        with interruptible(), deferring_interrupts():
+            os.kill(os.getpid(), signal.SIGINT)
+            steps.append("process started")
+        steps.append("command continued")
+    except KeyboardInterrupt:
+        steps.append("interrupted")
+    assert steps == ["process started", "interrupted"]

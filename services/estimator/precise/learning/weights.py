@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import zlib
 from dataclasses import replace
 from pathlib import Path
@@ -190,8 +191,8 @@ def _seen(tensors: Tensors) -> SeenCells | None:
 
 def train_command(world: str, folder: Path = SHIPPED) -> str:
     """The command that trains the field of a world."""
-    out = "" if folder in (SHIPPED, training_folder()) else f" --out {folder}"
-    return f"presage train --world {world} --preset {PRESET}{out}"
+    out = "" if folder in (SHIPPED, training_folder()) else f" --out {shlex.quote(str(folder))}"
+    return f"presage train --world {shlex.quote(world)} --preset {PRESET}{out}"
 
 
 def find(folder: Path, world: World, world_argument: str) -> Path:
@@ -208,22 +209,25 @@ def find(folder: Path, world: World, world_argument: str) -> Path:
         )
     if not same_walls(_load_card(path).world, world):
         raise UserError(
-            f"{path} was trained in another world of the same name {world.name!r}: its walls differ. Rename your "
-            f"world, or train it again with: {train_command(world_argument, folder)}"
+            f"{path} was trained in another world of the same name {world.name!r}: its walls differ. If you have "
+            f"changed the world, train it again with: {train_command(world_argument, folder)} --force; otherwise "
+            "rename your world"
         )
     return path
 
 
-def refuse_to_overwrite(path: Path, world: World) -> None:
-    """Raises UserError if ``path`` holds the field of another world with the same name."""
+def refuse_to_overwrite(path: Path, world: World, *, force: bool = False) -> None:
+    """Raises UserError if ``path`` holds the field of another world with the same name, unless ``force`` is true."""
+    if force:
+        return
     try:
         card = _load_card(path)
     except UserError:
         return
     if not same_walls(card.world, world):
         raise UserError(
-            f"{path} belongs to another world of the same name {world.name!r}. Rename your world, or write to another "
-            "folder with --out"
+            f"{path} belongs to another world of the same name {world.name!r}. Replace it with --force if you have "
+            "changed the world, otherwise rename your world, or write to another folder with --out"
         )
 
 

@@ -141,5 +141,9 @@ def test_other_walls(model, tmp_path):
     other = World(name="room", boundary=ROOM.boundary, obstacles=ROOM.obstacles[:1])
     with pytest.raises(UserError, match="another world of the same name 'room'"):
         weights.find(tmp_path, other, "mine.yaml")
+    path = weights.path_of(tmp_path, "room")
+    with pytest.raises(UserError, match="Replace it with --force if you have changed the world"):
+        weights.refuse_to_overwrite(path, other)
+    weights.refuse_to_overwrite(path, other, force=True)
     with pytest.raises(UserError, match=f"presage train --world mine.yaml --preset precise --out {tmp_path}"):
         weights.find(tmp_path, World(name="hall", boundary=ROOM.boundary), "mine.yaml")
