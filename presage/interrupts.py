@@ -40,7 +40,7 @@ def interruptible() -> Iterator[None]:
 
 @contextmanager
 def deferring_interrupts() -> Iterator[None]:
-    """Raises KeyboardInterrupt only at the end of the block if one of `INTERRUPTS` came in it.
+    """Handles `INTERRUPTS` that come in the block only at its end, as they would be without it.
 
     Needed around the start of a process: an exception that a signal raises while Python forks is lost. In other threads
     than the main one, which receive no signals, it does nothing.
@@ -60,7 +60,7 @@ def deferring_interrupts() -> Iterator[None]:
         for number, handler in previous.items():
             signal.signal(number, handler)
     if received:
-        raise KeyboardInterrupt
+        signal.raise_signal(received[0])
 
 
 @contextmanager
