@@ -229,5 +229,5 @@ def test_mapping(compose):
     project.do("up", "--detach", "--no-deps", "estimator", "controller", PRESAGE_CONTROLLER_ARGS="", **saved)
     for service in ("estimator", "controller"):
         project.becomes(service, "healthy")
-    project.do("run", "--rm", "--no-deps", "goal", "presage", "goal", "0.7", "0", "--wait")
+    project.do("run", "--rm", "--no-deps", "goal", "presage", "goal", "0.9", "0", "--wait")
     project.down()
