@@ -66,10 +66,6 @@ class Estimator:
             descent: parameters of preset "paper".
 
         """
-        if sigma is not None and not 0 < sigma < np.inf:
-            raise UserError(f"sigma: give the noise of the scanner in m, greater than 0, not {sigma}")
-        if preset != "precise" and (likelihood is not None or optimiser is not None):
-            raise UserError(f"likelihood and optimiser are for preset precise only, not {preset}")
         options = EstimatorOptions(
             world if isinstance(world, World) else str(world),
             preset,

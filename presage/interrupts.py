@@ -5,13 +5,24 @@ from __future__ import annotations
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 
 INTERRUPTS = [signal.SIGINT, signal.SIGTERM]
 if sys.platform != "win32":
     INTERRUPTS.append(signal.SIGHUP)
+
+
+@contextmanager
+def _handled_by(handler: Callable[[int, FrameType | None], object] | int, numbers: Sequence[int]) -> Iterator[None]:
+    """Handles the signals ``numbers`` by ``handler`` in the block."""
+    previous = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, before in previous.items():
+            signal.signal(number, before)
 
 
 @contextmanager
@@ -25,17 +36,13 @@ def interruptible() -> Iterator[None]:
     def interrupt(_signal: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    handled = [
+    numbers = [
         number
         for number in INTERRUPTS
         if number in {signal.SIGINT, signal.SIGTERM} or signal.getsignal(number) != signal.SIG_IGN
     ]
-    previous = {s: signal.signal(s, interrupt) for s in handled}
-    try:
+    with _handled_by(interrupt, numbers):
         yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 @contextmanager
@@ -49,16 +56,9 @@ def deferring_interrupts() -> Iterator[None]:
         yield
         return
     received: list[int] = []
-    previous = {
-        s: signal.signal(s, lambda number, _frame: received.append(number))
-        for s in INTERRUPTS
-        if signal.getsignal(s) != signal.SIG_IGN
-    }
-    try:
+    numbers = [number for number in INTERRUPTS if signal.getsignal(number) != signal.SIG_IGN]
+    with _handled_by(lambda number, _frame: received.append(number), numbers):
         yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
     if received:
         signal.raise_signal(received[0])
 
@@ -66,11 +66,5 @@ def deferring_interrupts() -> Iterator[None]:
 @contextmanager
 def ignoring_interrupts() -> Iterator[None]:
     """Ignores `INTERRUPTS` in the block, so that a second Ctrl-C does not interrupt the cleanup."""
-    previous: dict[int, Callable[[int, FrameType | None], object] | int | None] = {
-        s: signal.signal(s, signal.SIG_IGN) for s in INTERRUPTS
-    }
-    try:
+    with _handled_by(signal.SIG_IGN, INTERRUPTS):
         yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)

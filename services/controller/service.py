@@ -279,12 +279,10 @@ class ControllerService(Service):
             self._process(self._wait.belief)
             return
         self._wait = NoBelief()
-        missing = (
-            "scan for {:g} s: is the simulation paused, or the scanner silent?"
-            if self.navigator.waits_for_scan
-            else "belief for {:g} s: is the estimator running?"
-        )
-        reason = "no " + missing.format(self.settings.belief_timeout)
+        missing, question = "belief", "is the estimator running?"
+        if self.navigator.waits_for_scan:
+            missing, question = "scan", "is the simulation paused, or the scanner silent?"
+        reason = f"no {missing} for {self.settings.belief_timeout:g} s: {question}"
         # A robot that stands may well wait for a search of the whole map, as after `presage relocalise`.
         if self._last_answer is not None and self._last_answer.command.twist.array().any():
             self.log.warning("stopping the robot", reason=reason)

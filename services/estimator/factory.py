@@ -144,6 +144,10 @@ def prepare_factory(options: EstimatorOptions) -> EstimatorFactory:
     """
     if options.estimator not in get_args(EstimatorPreset):
         raise UserError(f"no estimator {options.estimator!r}: choose one of {', '.join(get_args(EstimatorPreset))}")
+    if options.sigma is not None and not 0 < options.sigma < np.inf:
+        raise UserError(f"sigma: give the noise of the scanner in m, greater than 0, not {options.sigma}")
+    if options.estimator != "precise" and (options.likelihood is not None or options.optimiser is not None):
+        raise UserError(f"likelihood and optimiser are for preset precise only, not {options.estimator}")
     world = options.loaded_world
     check_start(options.initial_pose, world)
     if options.estimator == "paper":

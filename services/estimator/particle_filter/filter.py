@@ -96,7 +96,7 @@ class ParticleFilter:
         period, odom = self._period(observation), self._odometry_since_last_scan(observation)
         self._predict(observation, min(period, MAX_PERIOD_S), odom)
         self._anneal()
-        if self._is_earlier(observation):
+        if self._last is not None and observation.is_earlier_than(self._last.stamp):
             self._velocity = self._tracked = None
         elif self._velocity is None and odom is not None:
             self._velocity = odom / period
@@ -124,11 +124,6 @@ class ParticleFilter:
         if last is None or now.stamp is None or last.stamp is None or now.stamp <= last.stamp:
             return NOMINAL_PERIOD_S
         return now.stamp - last.stamp
-
-    def _is_earlier(self, now: Observation) -> bool:
-        """Whether the stamp is earlier than that of the last scan, so that the duration of the motion is unknown."""
-        last = self._last
-        return last is not None and now.stamp is not None and last.stamp is not None and now.stamp < last.stamp
 
     def _odometry_since_last_scan(self, now: Observation) -> Array | None:
         if self._last is None or now.odom is None or self._last.odom is None:

@@ -188,8 +188,11 @@ class PreciseEstimator:
             match = self._match_local_map(
                 match, self._predict_local_motion(period, odom, observation.command), predicted.covariance
             )
-        is_expected = any(each.is_near(match.poses[0]) for each in motions[0][:-1])
-        if observation.time_increment and is_expected and not self._is_earlier(observation):
+        if (
+            observation.time_increment
+            and not observation.is_earlier_than(self._stamp)
+            and any(each.is_near(match.poses[0]) for each in motions[0][:-1])
+        ):
             # Only if the match is one of the predicted motions: otherwise the robot may have been carried to another
             # place, and may have stood still during the scan.
             match = self._correct_motion_again(match, observation, period)
@@ -265,19 +268,12 @@ class PreciseEstimator:
 
     def _velocity(self, hypothesis: TrackedHypothesis, observation: Observation) -> Array | None:
         """Velocity (3,) in base_link from the last poses or else from odometry, or None if it is unknown."""
-        if self._is_earlier(observation):
+        if observation.is_earlier_than(self._stamp):
             return None
         odom = self._odometry_since_last_scan(observation)
         if hypothesis.velocity is not None or odom is None:
             return hypothesis.velocity
         return odom / self._period(observation.stamp)
-
-    def _is_earlier(self, observation: Observation) -> bool:
-        """Whether the stamp is earlier than that of the last scan, as when a replay starts again.
-
-        Then the duration of the motion in between is unknown.
-        """
-        return observation.stamp is not None and self._stamp is not None and observation.stamp < self._stamp
 
     def _odometry_since_last_scan(self, observation: Observation) -> Array | None:
         if observation.odom is None or self._odom is None:
@@ -402,9 +398,11 @@ class PreciseEstimator:
         ]
         best = min(fused, key=lambda each: each.negative_log_evidence)
         updated = update_hypothesis(hypothesis, best, evidence, k, period, unobserved=unknown_motion)
-        if self._is_earlier(observation):
-            return replace(updated, velocity=None), best.candidate
-        return replace(updated, motion_cost=self._motion_cost(predicted, updated)), best.candidate
+        if observation.is_earlier_than(self._stamp):
+            updated = replace(updated, velocity=None)
+        else:
+            updated = replace(updated, motion_cost=self._motion_cost(predicted, updated))
+        return updated, best.candidate
 
     def _find_alternatives(
         self, view: View, best: TrackedHypothesis, motion: MotionCandidate, predicted: list[MotionCandidate]

@@ -26,6 +26,13 @@ class Observation:
     goal: Array | None = None  # (3,) preferred pose, base_link in map; used only by the paper's equation 3
     time_increment: float = field(default=0.0, kw_only=True)  # s between beams, as in a scan message
 
+    def is_earlier_than(self, stamp: float | None) -> bool:
+        """Whether this scan is earlier than the last one, which had the ``stamp`` in s, as when a replay starts again.
+
+        Then the duration of the motion in between is unknown.
+        """
+        return self.stamp is not None and stamp is not None and self.stamp < stamp
+
 
 def start_belief(pose: Array, covariance: Array) -> tuple[Array, Array]:
     """Mean (3,) and covariance (3, 3) of a belief near ``pose``: a pose (3,), or a position (2,) of unknown heading."""
