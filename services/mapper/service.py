@@ -138,7 +138,7 @@ class MapperService(Service):
             self.publish(MAP, map_message(self._belief.stamp_ns, mapper.map))
 
     def on_request(self, query: Query, request: Request) -> Reply:
-        """Saves the last published map."""
+        """Saves the map of the scans until now."""
         if not isinstance(request, SaveMapRequest):
             return super().on_request(query, request)
         if self.mapper is None:
@@ -160,7 +160,7 @@ def save_map(folder: Path, name: str, mapper: Mapper) -> Path:
         raise UserError(f"{existing} exists already: choose another name")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_grid(path.parent, name, mapper.map.grid)
+        write_grid(path.parent, name, mapper.draw())
         write_tum(path.with_suffix(".tum"), *mapper.trajectory())
     except OSError as error:
         for file in files:  # so that the name is free for the next attempt

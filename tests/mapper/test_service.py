@@ -110,6 +110,7 @@ def test_a_failed_save_leaves_the_name_free(tmp_path, monkeypatch):
     grid = OccupancyGrid.of(np.zeros((2, 2), np.uint8), 0.05, (0.0, 0.0, 0.0))
     mapper = SimpleNamespace(
         map=MapSnapshot(grid, np.zeros((1, 3)), np.zeros((0, 2), np.intp)),
+        draw=lambda: grid,
         trajectory=lambda: (np.zeros(1), np.zeros((1, 3))),
     )
     monkeypatch.setattr(service, "write_tum", Mock(side_effect=OSError(28, "No space left on device")))

@@ -217,11 +217,11 @@ def test_replaced_services(compose):
 
 def test_mapping(compose):
     """A building that only the simulator knows is mapped; the robot reaches goals meanwhile, and in the saved map."""
-    project = compose(PRESAGE_HIDE_WORLD="1", PRESAGE_CONTROLLER_ARGS="--world=")
+    project = compose(PRESAGE_WORLD="office", PRESAGE_HIDE_WORLD="1", PRESAGE_CONTROLLER_ARGS="--world=")
     project.do("up", "--detach", "router", "simulator", "controller", "mapper")
     for service in ("simulator", "controller", "mapper"):
         project.becomes(service, "healthy")
-    project.do("run", "--rm", "--no-deps", "goal", "presage", "goal", "1.2", "0", "--wait")
+    project.do("run", "--rm", "--no-deps", "goal", "presage", "goal", "2.5", "0", "--wait")
     project.do("run", "--rm", "--no-deps", "goal", "presage", "save-map", "floor")
     assert (project.folder / "floor.yaml").exists()
     project.do("stop", "mapper")
@@ -229,5 +229,5 @@ def test_mapping(compose):
     project.do("up", "--detach", "--no-deps", "estimator", "controller", PRESAGE_CONTROLLER_ARGS="", **saved)
     for service in ("estimator", "controller"):
         project.becomes(service, "healthy")
-    project.do("run", "--rm", "--no-deps", "goal", "presage", "goal", "0.9", "0", "--wait")
+    project.do("run", "--rm", "--no-deps", "goal", "presage", "goal", "1", "0", "--wait")
     project.down()

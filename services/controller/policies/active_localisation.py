@@ -11,7 +11,8 @@ place are not independent.
 
 With an unknown pose there is no path to the goal, and no scan can be predicted. The candidates are then straight lines
 to free places in the present scan, the cost is that of the line and of the turn towards it, and any scan is assumed to
-give the pose, times its novelty.
+give the pose, times its novelty, and times the probability that the map shows its place as free. So a robot in the map
+of a part of a building stays in this part.
 """
 
 from __future__ import annotations
@@ -323,7 +324,8 @@ class ActiveLocaliser:
         reason = f"the belief is {belief.state}: driving to where there is room, to see more"
         direction = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
         turn = np.abs(se2.wrap(bearing - surroundings.forward)) * self.robot.max_speed / self.robot.max_turn
-        gain = self._unknown_entropy * self._visited.novelty(np.maximum(length, 0.0)[:, None] * direction)
+        places = np.maximum(length, 0.0)[:, None] * direction
+        gain = self._unknown_entropy * self._visited.novelty(places) * self._probability_of_being_mapped(places, belief)
         zero = np.zeros(len(gain))
         energy = ExpectedFreeEnergy(NATS_PER_METRE * (length + turn), zero, zero, gain)
         best = int(np.argmin(energy.total))
@@ -332,6 +334,15 @@ class ActiveLocaliser:
         return self._approach(
             lookahead, surroundings, velocity, Decision(reason=reason, terms=energy.of(best, energy.total))
         )
+
+    def _probability_of_being_mapped(self, places: Array, belief: Belief) -> Array:
+        """Probability (M,) that the map shows the free places (M, 2) m in base_link as free.
+
+        Only if the pose of the belief is right can it be known that the map does not show them so.
+        """
+        in_map = se2.transform(belief.pose.array(), places)
+        outside = ~self.graph.grid.inside(in_map) | (self.graph.free.clearance_at(in_map) <= 0)
+        return np.asarray(1.0 - (belief.probability or 0.0) * outside)
 
     def _approach(self, lookahead: Array, surroundings: Surroundings, velocity: Array, decision: Decision) -> Decision:
         """The ``decision`` with a velocity towards the lookahead point (2,) m in base_link."""

@@ -39,6 +39,8 @@ from services.mapper.slam.submaps import PosedScans, Submap, compare_submaps
 
 KEY_DISTANCE_M, KEY_TURN_RAD = 0.4, 0.5  # a key scan is taken after a motion of either size since the last one
 KEY_RANGE_SHARE = 0.1  # in large rooms, the distance is this share of the median range instead
+# Between key scans, scans this far apart are kept for the grid: key scans alone leave gaps in walls that are far away.
+GRID_SCAN_DISTANCE_M, GRID_SCAN_TURN_RAD = 0.1, 0.1
 # A scan of which a smaller fraction matches sees something new. It becomes a key scan after this part of the distance.
 FAMILIAR_FRACTION, EARLY_KEY_PROGRESS = 0.7, 0.25
 SEARCH_WINDOW = np.array([0.3, 0.3, 0.4])  # m, m, rad to either side of the prior's mean
@@ -131,6 +133,8 @@ class FrontEnd:
         self._elements: list[Elements] = []
         self._ranges: list[Array] = []
         self._links: list[PoseLink] = []
+        # One entry for each scan that is kept for the grid: its number among all scans, and its ranges (B,) m.
+        self._grid_scans: list[tuple[int, npt.NDArray[np.float32]]] = []
         # The local map: the surfaces of the last key scans, and the scans themselves, to check what they saw through.
         self._surface: Surface
         self._local: Submap
@@ -192,6 +196,11 @@ class FrontEnd:
         poses = np.array([self.poses[key] for key in self.keys])
         pieces = np.array(self._key_pieces)
         return KeyScanGraph(poses, self._elements.copy(), self._ranges.copy(), self._links.copy(), pieces)
+
+    def grid_scans(self) -> tuple[npt.NDArray[np.int_], Array]:
+        """Returns the scans of which a grid is drawn: their numbers (M,) among all scans, and ranges (M, B) m."""
+        numbers, ranges = zip(*self._grid_scans, strict=True)
+        return np.array(numbers), np.array(ranges, float)
 
     def tracked_drive(self) -> TrackedDrive:
         """Returns the drive so far."""
@@ -293,6 +302,9 @@ class FrontEnd:
         piece = self._key_pieces[-1] + (1 if begins_piece else 0)
         scan_pose = ScanPose(found.pose, covariance, matched=True, piece=piece, linked=begins_piece)
         self._append(scan_pose)
+        off = np.abs(se2.between(self.poses[self._grid_scans[-1][0]], found.pose))
+        if begins_piece or np.hypot(*off[:2]) > GRID_SCAN_DISTANCE_M or off[2] > GRID_SCAN_TURN_RAD:
+            self._keep_for_grid(scan)
         if begins_piece or self._is_key_due(scan, early=not familiar):
             self._add_linked_key(scan, found.information)
         return scan_pose
@@ -325,6 +337,7 @@ class FrontEnd:
         piece = max(self._key_pieces, default=-1) + 1
         scan_pose = ScanPose(pose, np.diag(REGISTRATION_DEVIATION**2), matched=True, piece=piece)
         self._append(scan_pose)
+        self._keep_for_grid(scan)
         self._add_key(scan)
         return scan_pose
 
@@ -335,6 +348,10 @@ class FrontEnd:
     def _append(self, scan_pose: ScanPose) -> None:
         self.poses.append(scan_pose.pose)
         self.pieces.append(scan_pose.piece)
+
+    def _keep_for_grid(self, scan: _Scan) -> None:
+        """Keeps the last scan for the grid."""
+        self._grid_scans.append((len(self.poses) - 1, self._evenly_spaced(scan).astype(np.float32)))
 
     def _is_key_due(self, scan: _Scan, *, early: bool) -> bool:
         """Whether the last scan is so far from the last key scan that it has to become one, sooner if ``early``."""

@@ -96,13 +96,24 @@ class Mapper:
             if link.second >= len(snapshot.poses) and scans.pieces[link.first] in self._pieces:
                 self._pieces.add(int(scans.pieces[link.second]))
 
+    def draw(self) -> OccupancyGrid:
+        """The map of the scans until now, with more of them than `update` has time for: seconds after a long drive."""
+        numbers, ranges = self._front_end.grid_scans()
+        poses = self._poses()[numbers]
+        placed = np.isfinite(poses[:, 0])
+        return grid_of_scans(poses[placed], ranges[placed], self.laser, self.cell)
+
     def trajectory(self) -> tuple[Array, Array]:
         """Stamps (N,) in s and poses (N, 3) in map of all scans that are connected to the map."""
+        poses = self._poses()
+        placed = np.isfinite(poses[:, 0])
+        return np.array(self._front_end.stamps)[placed], poses[placed]
+
+    def _poses(self) -> Array:
+        """Poses (N, 3) in map of all scans; NaN where a scan is not connected to the map."""
         drive = self._front_end.tracked_drive()
         known = np.isin(drive.key_scans.pieces, list(self._pieces))
         poses = np.where(known[:, None], se2.compose(self._origin, drive.key_scans.poses), np.nan)
         if self.map is not None:
             poses[: len(self.map.poses)] = self.map.poses
-        poses = poses_of_all_scans(drive, poses)
-        placed = np.isfinite(poses[:, 0])
-        return np.array(self._front_end.stamps)[placed], poses[placed]
+        return poses_of_all_scans(drive, poses)

@@ -8,11 +8,16 @@ import pytest
 from common.messages.definitions import BeliefHypothesis, Pose
 from common.robot.robot import Robot
 from common.robot.scan_geometry import Sector
-from services.controller.policies.active_localisation import CHOICE_PERIOD_NS, ActiveLocaliser, StallTimer
+from services.controller.policies.active_localisation import (
+    CHOICE_PERIOD_NS,
+    INITIAL_WAIT_NS,
+    ActiveLocaliser,
+    StallTimer,
+)
 from services.controller.policies.free_space import FreeSpace
 from services.controller.policies.geodesic_field import FreeSpaceGraph
 from services.controller.policies.recovery import Recovery
-from tests.controller.driving import belief, box, room, scan
+from tests.controller.driving import SCANNER, belief, box, room, scan
 
 ROBOT = Robot()
 
@@ -96,3 +101,18 @@ def test_without_predictions_the_robot_asks_again_and_says_why_it_stands():
         assert decision.state == "lost"
         assert decision.reason.startswith("2 places are possible; standing without predicted scans")
         assert decision.reason.endswith("is the estimator running?")
+
+
+@pytest.mark.parametrize("probability", [None, 0.01, 0.99])
+def test_a_robot_that_probably_knows_its_place_stays_in_the_mapped_part_of_a_building(probability):
+    """The map ends 2 m in front of it, where the hall goes on for 12 m; behind it are 5 m that the map shows."""
+    pose, hall = np.array([8.0, 2.0, 0.0]), room(20, 4)
+    graph = FreeSpaceGraph(FreeSpace.of(room(10, 4)), ROBOT.radius)
+    localiser = ActiveLocaliser(ROBOT, graph, 0.33, Recovery(), may_turn=False)
+    all_round = SCANNER.model_copy(update={"fov": 6.2})
+    for stamp in (0, INITIAL_WAIT_NS):
+        uncertain = belief(stamp, pose, "localising").model_copy(update={"probability": probability})
+        seen = scan(stamp, pose, hall, all_round)
+        decision = localiser.decide(uncertain, seen, np.zeros((0, 2)), np.zeros(3), Sector(0.0, np.pi))
+    assert decision.state == "exploring"
+    assert decision.action[0] < 0 if probability == 0.99 else decision.action[0] > 0

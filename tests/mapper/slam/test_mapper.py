@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from common.geometry import se2
-from common.geometry.occupancy_grid import FREE
+from common.geometry.occupancy_grid import FREE, OCCUPIED
 from common.geometry.world import load_world
 from lab.accuracy.scenes import Scene
 from services.mapper.slam.mapper import Mapper
@@ -86,3 +86,14 @@ def test_first_scans_without_return(with_odometry, first_step):
     if with_odometry:
         error = se2.between(places[0].pose, places[-1].pose) - se2.between(truth[0], truth[-1])
         assert np.abs(error).max() < 0.01
+
+
+def test_a_drawn_map_has_fewer_gaps_than_that_of_the_key_scans():
+    truth = Scene.of(OFFICE, 300, 5).path(5)
+    mapper, _ = mapped(driven(OFFICE, truth))
+    drawn, of_key_scans = mapper.draw(), mapper.map.grid
+    occupied = np.argwhere(drawn.values == OCCUPIED)[:, ::-1]
+    assert len(occupied) > 1.3 * (of_key_scans.values == OCCUPIED).sum()
+    centres = drawn.to_map((occupied + 0.5) * drawn.resolution)
+    distance = np.abs(OFFICE.surface_distance(se2.transform(truth[0], centres)))
+    assert np.quantile(distance, 0.99) < 0.1
