@@ -31,7 +31,7 @@ def _draw_field(axes: Axes, model: FieldModel, name: str) -> None:
     field = model.field
     ny, nx = field.phi.shape
     x0, y0, h = *field.origin, field.resolution
-    phi = np.where(model.seen.nodes_of(field), field.phi, np.nan) if model.seen is not None else field.phi
+    phi = np.where(field.nodes_in(model.seen), field.phi, np.nan) if model.seen is not None else field.phi
     extent = (x0, x0 + h * (nx - 1), y0, y0 + h * (ny - 1))
     image = axes.imshow(phi, origin="lower", extent=extent, cmap="viridis", vmin=0)
     x, y = x0 + h * np.arange(nx), y0 + h * np.arange(ny)

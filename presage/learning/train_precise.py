@@ -31,6 +31,7 @@ from services.estimator.precise.learning.field_learning import (
 )
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.model_folder import training_folder
+from services.estimator.shared.seen_cells import SeenCells
 
 CALIBRATION_SAMPLES, TEST_SAMPLES = 250, 250  # scans without noise, for the standard deviations and the errors
 MIN_SAMPLES, SAMPLES_PER_M2 = 5000, 10  # training scans; the error depends on the number of beams that meet a surface
@@ -96,17 +97,17 @@ def learn_and_save(
     Those have no noise. Returns the model card.
     """
     start = time.monotonic()
-    model, errors = _train(options, poses, scans, bar)
+    model, errors = _train(options, world, poses, scans, bar)
     seconds = time.monotonic() - start
     visited = se2.compose(poses["train"], np.array(options.scanner.mount))[:, :2]
-    places = seed_places(model.field, visited)
+    places = seed_places(model.field, visited, model.seen)
     card = _card(options, world, len(poses["train"]), model, errors, seconds)
     weights.save(path, model, places, card)
     return card
 
 
 def _train(
-    options: TrainPreciseOptions, poses: dict[str, se2.Array], scans: dict[str, se2.Array], bar: Progress
+    options: TrainPreciseOptions, world: World, poses: dict[str, se2.Array], scans: dict[str, se2.Array], bar: Progress
 ) -> tuple[FieldModel, ModelErrors]:
     scanner = options.scanner
     mount, angles = np.array(scanner.mount), scanner.angles()
@@ -126,7 +127,7 @@ def _train(
     report("standard deviations", 1.0)
     count = CALIBRATION_SAMPLES
     scales = learn_scales(learned, poses["held out"][:count], mount, angles, scans["held out"][:count], 0.0)
-    model = FieldModel(learned, scales)
+    model = FieldModel(learned, scales, SeenCells.of_world(world))
     errors = evaluate_model(
         model,
         poses["held out"][count:],

@@ -645,8 +645,16 @@ class PreciseEstimator:
         carried = log_carried + log_likelihood - _log_reference(view, view.surfaces.small)
         evidence = np.array([each.log_evidence for each in found]) + np.maximum(stayed, carried)
         surroundings[carried >= stayed] = FIRST_SURROUNDINGS
+        # In base_link, the motion is the same at all hypotheses. A robot that was carried has moved in an unknown way.
+        velocity = self.hypotheses[0].velocity
         added = [
-            replace(hypothesis, log_evidence=evidence[k], scan_log_likelihood=0.0, scan_surroundings=surroundings[k])
+            replace(
+                hypothesis,
+                log_evidence=evidence[k],
+                scan_log_likelihood=0.0,
+                scan_surroundings=surroundings[k],
+                velocity=velocity if stayed[k] > carried[k] else None,
+            )
             for k, hypothesis in enumerate(found)
         ]
         best = int(np.argmax(evidence))

@@ -16,11 +16,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from services.estimator.precise.field_tracing import end_in_unseen_cells, mark_crossed, trace, trace_behind
+from services.estimator.precise.field_tracing import mark_crossed, trace, trace_behind
 from services.estimator.shared.generative_models import Expected
+from services.estimator.shared.seen_cells import SEEN_CELL_M
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
+    from services.estimator.shared.seen_cells import SeenCells
 
 Floats = npt.NDArray[np.float32]
 
@@ -31,7 +33,6 @@ DEPTH_EDGES = np.array([0.0, 0.25, 0.5, 0.75])
 FACING_EDGES = np.array([0.05, 0.1, 0.2, 0.5])
 SOLID_DIRECTIONS = 360  # of beams that find out what is solid
 SOLID_MARGIN_CELLS = 2  # a node this near to such a beam is free: the beams leave gaps
-SEEN_CELL_M = 0.2  # so large that neighbouring beams leave no gaps
 CLASSES = (len(DIP_EDGES) + 1, len(DEPTH_EDGES) + 1, len(FACING_EDGES) + 1)
 
 
@@ -99,37 +100,15 @@ class DistanceField:
         trace_behind(self.phi, *self.origin, self.resolution, lasers, angles, ranges, behind)
         return behind
 
-
-@dataclass(frozen=True)
-class SeenCells:
-    """Cells of a square grid that a beam of the training scans has passed; nothing is known about the other cells."""
-
-    cells: npt.NDArray[np.bool_]  # (ny, nx); cell (i, j) begins at origin + SEEN_CELL_M * (j, i)
-    origin: tuple[float, float]  # m in map
-
-    def nodes_of(self, field: DistanceField) -> npt.NDArray[np.bool_]:
-        """Mask (ny, nx) of the nodes of a field that lie in seen cells."""
-        ny, nx = field.phi.shape
+    def nodes_in(self, seen: SeenCells) -> npt.NDArray[np.bool_]:
+        """Mask (ny, nx) of the nodes that lie in seen cells."""
         i, j = (
-            np.clip(((start + field.resolution * np.arange(n) - own_start) / SEEN_CELL_M).astype(int), 0, m - 1)
-            for start, own_start, n, m in zip(
-                field.origin[::-1], self.origin[::-1], (ny, nx), self.cells.shape, strict=True
+            np.clip(((start + self.resolution * np.arange(n) - seen_start) / SEEN_CELL_M).astype(int), 0, m - 1)
+            for start, seen_start, n, m in zip(
+                self.origin[::-1], seen.origin[::-1], self.phi.shape, seen.cells.shape, strict=True
             )
         )
-        return self.cells[np.ix_(i, j)]
-
-    def contains(self, points: Array) -> npt.NDArray[np.bool_]:
-        """Mask (N,) of the points (N, 2) m in map that lie in seen cells."""
-        j, i = np.floor((points - self.origin) / SEEN_CELL_M).astype(int).T
-        inside = (i >= 0) & (j >= 0) & (i < self.cells.shape[0]) & (j < self.cells.shape[1])
-        found = np.zeros(len(points), np.bool_)
-        found[inside] = self.cells[i[inside], j[inside]]
-        return found
-
-    def limit(self, lasers: Array, angles: Array, ranges: Array, jacobian: Array, scale: Array) -> None:
-        """Ends beams (N, B) where they enter cells that were not seen, with an infinite scale there, in place."""
-        lasers, angles = np.asarray(lasers, float).reshape(-1, 3), np.asarray(angles, float)
-        end_in_unseen_cells(self.cells, *self.origin, SEEN_CELL_M, lasers, angles, SEEN_CELL_M, ranges, jacobian, scale)
+        return seen.cells[np.ix_(i, j)]
 
 
 @dataclass(frozen=True)

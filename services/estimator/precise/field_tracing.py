@@ -181,34 +181,3 @@ def mark_crossed(
                     break
                 crossed[row, column] = True
                 t += 0.7  # cells, so that no row or column is skipped
-
-
-@jit
-def end_in_unseen_cells(
-    seen: npt.NDArray[np.bool_],
-    ox: float,
-    oy: float,
-    h: float,
-    lasers: Array,
-    angles: Array,
-    allowed: float,
-    ranges: Array,
-    jacobian: Array,
-    scale: Array,
-) -> None:
-    """Ends each beam where it has passed more than ``allowed`` m of unseen cells, with infinite scale there."""
-    rows, columns = seen.shape
-    for k in range(lasers.shape[0]):
-        for b in range(angles.shape[0]):
-            ux, uy = math.cos(lasers[k, 2] + angles[b]), math.sin(lasers[k, 2] + angles[b])
-            unseen_length, t, step = 0.0, 0.0, 0.5 * h
-            while t < ranges[k, b]:
-                x, y = (lasers[k, 0] + t * ux - ox) / h, (lasers[k, 1] + t * uy - oy) / h
-                inside = x >= 0.0 and x < columns and y >= 0.0 and y < rows
-                if not inside or not seen[int(y), int(x)]:
-                    unseen_length += step
-                    if unseen_length > allowed:
-                        ranges[k, b], scale[k, b] = t, np.inf
-                        jacobian[k, b, :] = 0.0
-                        break
-                t += step

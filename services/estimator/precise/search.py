@@ -79,8 +79,8 @@ def search_near(
 def search_around(view: View, starts: Array, prior: Prior, extra_starts: Array) -> tuple[Array, Evidence]:
     """Descends from ``starts`` (N, 3), one per hypothesis, over a wider area than usual.
 
-    The first hypothesis also descends from ``extra_starts`` (K, 3). Returns one pose (N, 3) per hypothesis and the
-    evidence there.
+    The first hypothesis also descends from ``extra_starts`` (K, 3). Returns one pose (N, 3) per hypothesis, of those
+    found for the first the one with the most evidence by surfaces, and the evidence there.
     """
     count = len(starts)
     hypothesis = np.concatenate([np.arange(count), np.zeros(len(extra_starts), np.int64)])
@@ -88,8 +88,9 @@ def search_around(view: View, starts: Array, prior: Prior, extra_starts: Array) 
     repeated_prior = Prior(prior.mean[hypothesis], prior.information[hypothesis])
     poses, evidence = view.descend(starts, repeated_prior, (*NEAR_SCHEDULE_M, *FOLLOWING_SCHEDULE_M))
     of_first = np.flatnonzero(hypothesis == 0)
-    energy = evidence.accuracy[of_first] + repeated_prior.energy(poses)[of_first]
-    keep = np.array([of_first[np.argmin(energy)], *range(1, count)])
+    log_likelihood = view.surface_evidence(poses).log_likelihood
+    best = of_first[np.argmax((log_likelihood - repeated_prior.energy(poses))[of_first])]
+    keep = np.array([best, *range(1, count)])
     return poses[keep], evidence.part(keep)
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from common.geometry.ray_casting import cast_rays, cast_rays_with_jacobian
+from services.estimator.shared.seen_cells import SeenCells
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -62,7 +64,10 @@ class GenerativeModel(Protocol):
 
 @dataclass(frozen=True)
 class RayCaster:
-    """The exact model, which casts rays in the world: the limit of what learning can reach."""
+    """The exact model, which casts rays in the world: the limit of what learning can reach.
+
+    In an occupancy grid, nothing is known about what lies behind unknown cells.
+    """
 
     world: World
     offset: float = 0.0  # m, distance of the real surfaces behind those of the world, as in a map of cells
@@ -82,7 +87,10 @@ class RayCaster:
             hits = np.isfinite(further)
             derivatives[hits, 2] *= ranges[inside][hits] / np.maximum(further[hits], PASSED_M)
             jacobian[inside] = derivatives
-        return Expected(ranges, np.full(ranges.shape, EXACT_SCALE_M), jacobian).moved_back(self.offset)
+        expected = Expected(ranges, np.full(ranges.shape, EXACT_SCALE_M), jacobian).moved_back(self.offset)
+        if self._seen is not None:
+            self._seen.limit(lasers, angles, expected.ranges, expected.jacobian, expected.scale)
+        return expected
 
     def expect_behind(self, lasers: Array, angles: Array, ranges: Array) -> Array:
         """Ranges to the next surface; see GenerativeModel."""
@@ -95,6 +103,10 @@ class RayCaster:
         start += np.where(self._in_circle(rays), 0.0, cast_rays(self.world, rays, np.zeros(1))[:, 0] + PASSED_M)
         behind[pose, beam] = start + cast_rays(self.world, _advanced(lasers, angles, start), np.zeros(1))[:, 0]
         return behind
+
+    @cached_property
+    def _seen(self) -> SeenCells | None:
+        return SeenCells.of_world(self.world)
 
     def _in_circle(self, poses: Array) -> npt.NDArray[np.bool_]:
         """Mask (N,) of the poses (N, 3) in a circle, which rays from inside do not hit."""

@@ -424,3 +424,15 @@ for model in ("learned", "exact"):
 
 def test_no_scan_waits_for_compilation():
     subprocess.run([sys.executable, "-c", COUNT_COMPILED], check=True, timeout=WAIT_TIMEOUT_S)
+
+
+def test_a_search_does_not_forget_the_velocity():
+    """The robot goes on turning, so a hypothesis that the search found expects the same."""
+    made, scene = estimator(load_world("maze"))
+    poses = np.array([[1.5, 3.0, yaw] for yaw in np.arange(20) / 15])
+    for k, clean in enumerate(scene.clean(poses)):
+        made.update(scene.observe(clean, k / 15))
+    found = made._search_everywhere([made._scan[0]])
+    made.hypotheses = [replace(made.hypotheses[0], log_evidence=-1e3)]  # so that those that were found are better
+    made._add_hypotheses(found, made._scan[0])
+    assert made.hypotheses[0].velocity == pytest.approx([0, 0, 1], abs=0.2)

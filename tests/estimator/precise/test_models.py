@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.geometry import se2
+from common.geometry.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from common.geometry.world import World, load_world
 from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS
@@ -108,3 +109,26 @@ def test_surface_behind(model):
     assert (ranges[0, :2] < walls[:2] - 0.5).all()
     assert behind[0, :2] == pytest.approx(walls[:2], abs=2e-3)
     assert np.isinf(behind[0, 2:]).all()
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.4])
+def test_nothing_is_known_behind_the_unknown_cells_of_a_map(yaw):
+    """A door leads to a room of which the map shows only the far wall: its walls may be anywhere."""
+    values = np.full((60, 200), UNKNOWN, np.uint8)
+    values[5:55, 5:60] = FREE
+    values[[4, 55], 4:61] = values[4:56, [4]] = OCCUPIED
+    values[4:25, 60] = values[35:56, 60] = OCCUPIED  # with a door between, of 0.5 m
+    values[:, 190] = OCCUPIED
+    grid = OccupancyGrid.of(values, 0.05, (1.0, 2.0, yaw))
+    laser = np.array([*grid.to_map(np.array([1.5, 1.5])), yaw])
+    model = RayCaster(World(name="part", grid=grid))
+    at_wall, through_door = (model.expect(laser[None], np.array([angle])) for angle in (np.pi, 0.0))
+    assert at_wall.ranges[0, 0] == pytest.approx(1.25)
+    assert np.isfinite(at_wall.scale[0, 0])
+    assert 1.5 < through_door.ranges[0, 0] < 2.0
+    assert np.isinf(through_door.scale[0, 0])
+    assert not through_door.jacobian.any()
+    known = RayCaster(
+        World(name="all", grid=OccupancyGrid.of(np.where(values == UNKNOWN, FREE, values), 0.05, (0, 0, 0)))
+    )
+    assert known.expect(np.array([[1.5, 1.5, 0.0]]), np.zeros(1)).ranges[0, 0] == pytest.approx(8.0)

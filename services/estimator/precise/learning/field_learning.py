@@ -21,7 +21,7 @@ from scipy import ndimage
 
 from common.geometry.se2 import Array, compose
 from common.robot.stray_beams import has_neighbours
-from services.estimator.precise.field import CLASSES, SEEN_CELL_M, DistanceField, Floats, SeenCells
+from services.estimator.precise.field import CLASSES, DistanceField, Floats
 from services.estimator.precise.global_seeds import SEED_SPACING_M, thin_places
 from services.estimator.precise.learning.beam_cells import count_at_nodes, mark_seen_cells
 from services.estimator.precise.learning.surfaces import (
@@ -30,6 +30,7 @@ from services.estimator.precise.learning.surfaces import (
     are_mostly_passed,
     field_of_surfaces,
 )
+from services.estimator.shared.seen_cells import SEEN_CELL_M, SeenCells
 
 CARVED_DISTANCE_CELLS = 0.5  # minimum of phi at a node through which beams pass
 PASSING_CELLS = 0.25  # a beam passes a node within this distance
@@ -98,7 +99,7 @@ def reachable(field: DistanceField, visited: Array, seen: SeenCells | None = Non
     """
     free = field.phi > SEED_CLEARANCE_M
     if seen is not None:
-        free &= seen.nodes_of(field)
+        free &= field.nodes_in(seen)
     region, _ = ndimage.label(free)
     column, row = np.round((visited - field.origin) / field.resolution).astype(int).T
     i, j = np.nonzero(free & np.isin(region, region[row, column]))

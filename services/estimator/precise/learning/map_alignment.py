@@ -54,7 +54,7 @@ def with_offset(model: Model, key_scans: ReferenceDrive) -> Model:
     count = len(key_scans.poses)
     used_scans = key_scans.part(np.arange(0, count, 1 + count // OFFSET_SCANS))
     expected = model.expect(se2.compose(used_scans.poses, used_scans.mount), used_scans.angles)
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore"):
         behind = (used_scans.ranges - expected.ranges) / expected.slope
-        used = np.abs(behind) < MAX_ERROR_M
+        used = (np.abs(behind) < MAX_ERROR_M) & np.isfinite(expected.scale)
     return replace(model, offset=float(np.median(behind[used]))) if used.any() else model

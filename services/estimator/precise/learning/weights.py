@@ -15,11 +15,12 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from common.errors import UserError, first_fault
 from common.geometry.world import World
 from common.robot.scanner import Scanner
-from services.estimator.precise.field import CLASSES, DistanceField, FieldModel, SeenCells
+from services.estimator.precise.field import CLASSES, DistanceField, FieldModel
 from services.estimator.precise.global_seeds import RANKED_HEADINGS, Seeds
 from services.estimator.precise.learning.calibration import Calibration
 from services.estimator.shared.digest import check_digest, sha256
 from services.estimator.shared.model_folder import SHIPPED, training_folder
+from services.estimator.shared.seen_cells import SeenCells
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
