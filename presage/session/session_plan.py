@@ -12,6 +12,7 @@ from common.errors import UserError
 from common.geometry.world import World, load_world
 from common.runtime.config import load_settings
 from presage.terminal.options import arguments
+from presage.terminal.settings_file import check_variables
 from services.controller.settings import ControllerSettings
 from services.estimator.factory import check_options
 from services.estimator.service import estimator_options
@@ -48,6 +49,7 @@ def plan_session(
     While ``mapping``, no service but the simulator knows the world. Models are read, but nothing is compiled and no bus
     is used. Raises UserError for a mistake.
     """
+    check_variables()
     common = arguments(config=config)
     shared = [*common, *arguments(world=world)]
     simulator_args = [*shared, *arguments(drive=drive), *simulator]

@@ -1,13 +1,16 @@
-"""The settings file of `--config`."""
+"""Finds misspelt keys of the settings file of `--config`, and misspelt environment variables."""
 
 from __future__ import annotations
 
+import difflib
+import os
 from pathlib import Path
 
 from common.errors import UserError, similar_key
-from common.runtime.config import read_settings_file
+from common.runtime.config import ServiceSettings, read_settings_file
 
 COMMAND_SECTIONS = ("log", "train")
+MIN_SIMILARITY = 0.85  # of a variable to a setting, as `difflib` measures it
 
 
 def check_keys(path: Path | None) -> Path | None:
@@ -18,28 +21,7 @@ def check_keys(path: Path | None) -> Path | None:
     """
     if path is None or not path.is_file():
         return path
-    # Imported here because most commands run without a settings file.
-    from common.router.router import RouterSettings
-    from services.bridge_ros2.settings import BridgeRos2Settings
-    from services.controller.settings import ControllerSettings
-    from services.estimator.settings import EstimatorSettings
-    from services.mapper.settings import MapperSettings
-    from services.recorder.replaying.service import ReplaySettings
-    from services.recorder.settings import RecorderSettings
-    from services.simulator.settings import SimulatorSettings
-    from services.viewer.settings import ViewerSettings
-
-    services = (
-        RouterSettings,
-        SimulatorSettings,
-        EstimatorSettings,
-        ControllerSettings,
-        MapperSettings,
-        RecorderSettings,
-        ReplaySettings,
-        ViewerSettings,
-        BridgeRos2Settings,
-    )
+    services = _services()
     known = {*COMMAND_SECTIONS, *(cls.service for cls in services)}
     known.update(*(cls.model_fields.keys() - cls.private for cls in services))
     for key in read_settings_file(path):
@@ -50,3 +32,47 @@ def check_keys(path: Path | None) -> Path | None:
                 " (docs/settings.yaml lists all)"
             )
     return path
+
+
+def check_variables() -> None:
+    """Raises UserError if an environment variable is probably the misspelt name of a setting.
+
+    A service cannot tell it from a setting of another service, and would use the default, which may be a speed.
+    """
+    known: set[str] = set()
+    for cls in _services():
+        known.update(f"PRESAGE_{cls.service.upper()}_{name.upper()}" for name in cls.model_fields)
+        known.update(f"PRESAGE_{name.upper()}" for name in cls.model_fields.keys() - cls.private)
+    ends = {name.removeprefix("PRESAGE_"): name for name in sorted(known)}  # with the prefix, all would be similar
+    for name in sorted(os.environ.keys() - known):
+        if name.startswith("PRESAGE_"):
+            similar = difflib.get_close_matches(name.removeprefix("PRESAGE_"), ends, 1, MIN_SIMILARITY)
+            if similar:
+                raise UserError(
+                    f"{name}: there is no such setting; did you mean {ends[similar[0]]}? Else unset this variable"
+                )
+
+
+def _services() -> tuple[type[ServiceSettings], ...]:
+    # Imported here because most commands need none of them.
+    from common.router.router import RouterSettings
+    from services.bridge_ros2.settings import BridgeRos2Settings
+    from services.controller.settings import ControllerSettings
+    from services.estimator.settings import EstimatorSettings
+    from services.mapper.settings import MapperSettings
+    from services.recorder.replaying.service import ReplaySettings
+    from services.recorder.settings import RecorderSettings
+    from services.simulator.settings import SimulatorSettings
+    from services.viewer.settings import ViewerSettings
+
+    return (
+        RouterSettings,
+        SimulatorSettings,
+        EstimatorSettings,
+        ControllerSettings,
+        MapperSettings,
+        RecorderSettings,
+        ReplaySettings,
+        ViewerSettings,
+        BridgeRos2Settings,
+    )

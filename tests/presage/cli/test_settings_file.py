@@ -12,7 +12,7 @@ from common.router.router import RouterSettings
 from common.runtime.config import load_section, load_settings
 from presage.learning.options import TrainSettings
 from presage.logs.options import LogSettings
-from presage.terminal.settings_file import check_keys
+from presage.terminal.settings_file import check_keys, check_variables
 from services.bridge_ros2.settings import BridgeRos2Settings
 from services.controller.settings import ControllerSettings
 from services.estimator.settings import EstimatorSettings
@@ -62,3 +62,24 @@ def test_misspelt_keys(tmp_path, text, problem):
 def test_all_keys_are_known():
     assert check_keys(FILE) == FILE
     assert check_keys(None) is None
+
+
+@pytest.mark.parametrize(
+    ("variable", "meant"),
+    [
+        ("PRESAGE_MAX_SPED", "PRESAGE_MAX_SPEED"),
+        ("PRESAGE_CONTROLER_MAX_SPEED", "PRESAGE_CONTROLLER_MAX_SPEED"),
+        ("PRESAGE_ESTIMATOR_MODELL", "PRESAGE_ESTIMATOR_MODEL"),
+    ],
+)
+def test_misspelt_variables(monkeypatch, variable, meant):
+    monkeypatch.setenv(variable, "0.3")
+    with pytest.raises(UserError, match=f"{variable}: there is no such setting; did you mean {meant}?"):
+        check_variables()
+
+
+@pytest.mark.parametrize("file", ["docker-compose.yml", "Makefile", "docs/deployment.md"])
+def test_other_variables_are_not_taken_for_misspelt_ones(monkeypatch, file):
+    for name in re.findall(r"PRESAGE_[A-Z0-9_]*[A-Z0-9]", (ROOT / file).read_text()):
+        monkeypatch.setenv(name, "1")
+    check_variables()
