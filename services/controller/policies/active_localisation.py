@@ -170,7 +170,8 @@ class ActiveLocaliser:
     def reset(self) -> None:
         """Forgets everything. Call it when the pose is known, or the goal has changed."""
         self._visited, self._stall_timer = VisitedPlaces(), StallTimer(self.robot.max_speed)
-        self._requested: tuple[int, CandidatePaths] | None = None  # stamp in ns and paths of the last request
+        # Stamp in ns and paths of the last request, None instead of the paths if the map has none.
+        self._requested: tuple[int, CandidatePaths | None] | None = None
         self._prediction_failure = ""  # why the last request was not answered
         self._place: tuple[Array, dict[str, float]] | None = None  # (3,) in base_link, and its expected free energy
         self._field: tuple[Array, CostField | None] | None = None  # a place (2,) m in map and its field
@@ -185,8 +186,16 @@ class ActiveLocaliser:
         stamp = belief.stamp_ns
         if len(poses) < 2 or (self._requested is not None and 0 <= stamp - self._requested[0] < CHOICE_PERIOD_NS):
             return None
+        paths = self._candidate_paths(poses, weights)
+        if paths is None:
+            self._place = None
+        self._requested = (stamp, paths)
+        return paths
+
+    def _candidate_paths(self, poses: Array, weights: Array) -> CandidatePaths | None:
+        """Paths from the first of the hypotheses (K, 3), also to the present place; None if the map has none."""
         field = self.graph.cost_field(poses[0][:2], self.min_point_distance + PLACE_SPACING_M)
-        if field is None:
+        if field is None or not field.reaches(poses[0][:2]):
             return None
         displacements, path_costs = self._candidate_places(field, poses[0])
         if self._place is not None:
@@ -195,10 +204,7 @@ class ActiveLocaliser:
             if np.isfinite(cost):
                 displacements = np.concatenate([present[None], displacements])
                 path_costs = np.concatenate([[cost], path_costs])
-        if not len(path_costs):
-            return None
-        self._requested = (stamp, CandidatePaths(poses, weights, displacements, path_costs))
-        return self._requested[1]
+        return CandidatePaths(poses, weights, displacements, path_costs) if len(path_costs) else None
 
     def use_predictions(self, reply: PredictReply, range_max: float, cost_to_goal: Callable[[Array], Array]) -> None:
         """Chooses a place with the predictions for the last request.
@@ -206,9 +212,9 @@ class ActiveLocaliser:
         ``cost_to_goal`` returns the cost (...,) m of the paths to the goal from places (..., 2) m in map.
         """
         self._prediction_failure = ""
-        if self._requested is None:
+        paths = None if self._requested is None else self._requested[1]
+        if paths is None:
             return
-        _, paths = self._requested
         shape = (len(paths.hypotheses), len(paths.displacements), -1)
         ranges = reply.ranges.astype(np.float64).reshape(shape)
         sigma = np.full_like(ranges, DEFAULT_SIGMA_M)
@@ -242,22 +248,28 @@ class ActiveLocaliser:
             action = back_off(velocity, surroundings, self.robot).action
             return Decision(action, BACKING_OFF, "blocked", recovering=True)
         poses, _ = _likely_hypotheses(belief)
+        if len(poses) > 1 and self._requested is not None and self._requested[1] is None:
+            return self._drive_to_open_space(belief, scan, surroundings, velocity)
         if len(poses) > 1:
-            self._unknown_since_ns = None
-            if self._place is not None:
-                self._give_up_if_stalled(belief.stamp_ns, self._place[0][:2])
-                return self._drive_to(poses[0], *self._place, surroundings, velocity, len(poses))
-            self._stall_timer.restart()
-            if self._prediction_failure:
-                reason = f"{len(poses)} places are possible; standing without predicted scans to tell them apart"
-                return Decision(reason=f"{reason}: {self._prediction_failure}", state="lost")
-            return Decision(reason=f"{len(poses)} places are possible: choosing where to drive to tell them apart")
+            return self._tell_apart(belief.stamp_ns, poses, surroundings, velocity)
         if self._unknown_since_ns is None or belief.stamp_ns < self._unknown_since_ns:
             self._unknown_since_ns = belief.stamp_ns
         if belief.stamp_ns - self._unknown_since_ns < INITIAL_WAIT_NS:
             self._stall_timer.restart()
             return Decision(reason=f"the belief is {belief.state}: standing while the estimator searches", state="lost")
         return self._drive_to_open_space(belief, scan, surroundings, velocity)
+
+    def _tell_apart(self, stamp_ns: int, poses: Array, surroundings: Surroundings, velocity: Array) -> Decision:
+        """Drives to the place that was chosen to tell the hypotheses (K, 3) apart, or waits until there is one."""
+        self._unknown_since_ns = None
+        if self._place is not None:
+            self._give_up_if_stalled(stamp_ns, self._place[0][:2])
+            return self._drive_to(poses[0], *self._place, surroundings, velocity, len(poses))
+        self._stall_timer.restart()
+        if self._prediction_failure:
+            reason = f"{len(poses)} places are possible; standing without predicted scans to tell them apart"
+            return Decision(reason=f"{reason}: {self._prediction_failure}", state="lost")
+        return Decision(reason=f"{len(poses)} places are possible: choosing where to drive to tell them apart")
 
     def _give_up_if_stalled(self, stamp_ns: int, place: Array) -> None:
         """Counts the place (2,) m in base_link as visited and backs off, if the robot makes no progress towards it.

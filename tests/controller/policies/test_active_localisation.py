@@ -116,3 +116,15 @@ def test_a_robot_that_probably_knows_its_place_stays_in_the_mapped_part_of_a_bui
         decision = localiser.decide(uncertain, seen, np.zeros((0, 2)), np.zeros(3), Sector(0.0, np.pi))
     assert decision.state == "exploring"
     assert decision.action[0] < 0 if probability == 0.99 else decision.action[0] > 0
+
+
+def test_a_hypothesis_from_which_the_map_has_no_path():
+    """It is 1 m outside the mapped room. The robot does not stand for ever."""
+    poses, hall = np.array([[11.0, 2.0, 0.0], [7.0, 2.0, 0.0]]), room(20, 4)
+    hypotheses = [BeliefHypothesis(pose=Pose.of(pose), weight=0.5) for pose in poses]
+    localiser = ActiveLocaliser(ROBOT, FreeSpaceGraph(FreeSpace.of(room(10, 4)), ROBOT.radius), 0.33, Recovery())
+    ambiguous = belief(0, poses[0], "ambiguous").model_copy(update={"hypotheses": hypotheses})
+    assert localiser.prediction_request(ambiguous) is None
+    decision = localiser.decide(ambiguous, scan(0, poses[0], hall), np.zeros((0, 2)), np.zeros(3), Sector(0.0, np.pi))
+    assert decision.state == "exploring"
+    assert decision.action.any()
