@@ -93,6 +93,18 @@ class UnknownPlace:
         log_off_map = log_carried + float(np.log(off_map)) + log_new - self.scan_log_likelihood
         self.log_off_map = max(self.log_off_map, log_off_map)
 
+    @property
+    def log_start(self) -> float:
+        """Evidence that the robot is at a place of the map from the next key scan on, and was at none until now.
+
+        It was at a place that the search has not found, or it enters the map from a place that is not on it.
+        """
+        log_enter = self.log_off_map + math.log(NEXT_SURROUNDINGS[2, 0])
+        if self.log_evidence <= self.log_off_map:
+            return log_enter
+        log_on_map = self.log_evidence + math.log(-math.expm1(self.log_off_map - self.log_evidence))
+        return float(np.logaddexp(log_on_map, log_enter))
+
     def add_key_scan(self) -> None:
         """Adds the evidence of the present scan, which becomes a key scan."""
         self.log_evidence += self.scan_log_likelihood

@@ -60,6 +60,7 @@ class LocalMapScan(LocalScan):
     tracked: bool  # whether that was so probable that the state was `tracking`
     log_change: float  # nats, log probability of what had changed since the scan before
     log_unknown: float  # nats, evidence before this scan that the robot is at none of the hypotheses
+    log_start: float  # nats, the part of it for a place of the map from this scan on, see `UnknownPlace.log_start`
 
     @property
     def unmapped_points(self) -> Array:

@@ -15,7 +15,14 @@ from common.geometry.world import World
 from services.estimator.precise import beam_sums, global_seeds
 from services.estimator.precise.gauss_newton import MAX_STEP, Prior, View
 from services.estimator.precise.global_seeds import Seeds, thin_places
-from services.estimator.precise.hypotheses import TrackedHypothesis, select_best, unobserved_directions, weigh
+from services.estimator.precise.hypotheses import (
+    NEXT_SURROUNDINGS,
+    TrackedHypothesis,
+    UnknownPlace,
+    select_best,
+    unobserved_directions,
+    weigh,
+)
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.motion_model import (
     MotionCandidate,
@@ -376,3 +383,14 @@ def test_thin_places():
     thin = thin_places(points, 0.5)
     assert len(thin) == 36
     assert len({(int(x / 0.5), int(y / 0.5)) for x, y in thin}) == 36
+
+
+def test_evidence_of_a_place_that_the_robot_was_not_at_before():
+    """It begins with that of the places that a search may have missed; the robot seldom enters from off the map."""
+    unknown, enter = UnknownPlace(), np.log(NEXT_SURROUNDINGS[2, 0])
+    unknown.restart(1e-3, 1e-9)
+    assert unknown.log_start == pytest.approx(np.log(1e-3), abs=1e-5)
+    unknown.restart(1e-3, 5e-4)
+    assert unknown.log_start == pytest.approx(np.log(5e-4 + 5e-4 * np.exp(enter)))
+    unknown.exclude_mapped_places()
+    assert unknown.log_start == pytest.approx(np.log(5e-4) + enter)

@@ -51,7 +51,7 @@ def local_map(scene, *poses, frame=(0.0, 0.0, 0.0)):
     for pose in poses:
         scan = view(scene, pose)
         nothing, everything = np.zeros(len(scan.ranges), np.bool_), np.ones(len(scan.ranges), np.bool_)
-        key = LocalMapScan(made.to_local(np.array(pose)), scan, nothing, everything, True, 0.0, 0.0)
+        key = LocalMapScan(made.to_local(np.array(pose)), scan, nothing, everything, True, 0.0, 0.0, 0.0)
         made.add(key, np.array(pose), np.diag([1e-4, 1e-4, 1e-5]))
     return made
 
@@ -147,11 +147,11 @@ def test_surface_in_place_of_another(tracked):
     mapped = ~nothing
     mapped[100:150] = False
     covariance = np.diag([1e-4, 1e-4, 1e-5])
-    made.add(LocalMapScan(np.zeros(3), scan, nothing, ~nothing, tracked, 0.0, 0.0), HERE, covariance)
+    made.add(LocalMapScan(np.zeros(3), scan, nothing, ~nothing, tracked, 0.0, 0.0, 0.0), HERE, covariance)
     seen, appeared = made.find_seen_and_appeared(np.zeros(3), scan, mapped)
     assert np.flatnonzero(~seen).tolist() == (list(range(100, 150)) if tracked else [])
     assert not appeared.any()
-    made.add(LocalMapScan(np.zeros(3), scan, nothing, mapped, tracked, 0.0, 0.0), HERE, covariance)
+    made.add(LocalMapScan(np.zeros(3), scan, nothing, mapped, tracked, 0.0, 0.0, 0.0), HERE, covariance)
     assert made.find_seen_and_appeared(np.zeros(3), view(scene, HERE), mapped)[0].all()
 
 
