@@ -140,7 +140,8 @@ class LocalMap:
           key scans. Where that surface is one of the map, but the beam does not end at a surface of the map (``mapped``
           (B,) is false), something else stands there now, so the beam is new evidence. Only key scans in state
           `tracking` are trusted to know which of their surfaces are in the map. In other states the best hypothesis may
-          change with each search, and the same surfaces would count again.
+          change with each search, and the same surfaces would count again. The first beam on a surface, which is the
+          evidence for its place, is also seen if another part of the surface was.
         - Appeared: the beam ends where a key scan saw free space. The surface is new, wherever the robot is.
         """
         seen, appeared = np.zeros(len(view.ranges), np.bool_), np.zeros(len(view.ranges), np.bool_)
@@ -152,11 +153,16 @@ class LocalMap:
         free = np.zeros(len(near), np.bool_)
         free[~near] = self._in_free_space(placed[~near])
         appeared[view.returned] = free
+        first_seen = np.zeros(len(view.ranges), np.bool_)
+        first_seen[view.returned] = ~near & ~free
         unmapped = near & ~mapped[view.returned]
         distance, _ = self._tree_of_unmapped_points().query(placed[unmapped], distance_upper_bound=SEEN_RADIUS_M)
         near[unmapped] = np.isfinite(distance)
         seen[:] = ~view.returned
         seen[view.returned] = near
+        # Otherwise a wall would count again with each beam by which more of it is seen.
+        starts, surface = view.surfaces.starts, np.cumsum(view.surfaces.starts)
+        seen |= starts & first_seen & (np.bincount(surface, seen)[surface] > 0)
         return seen, appeared
 
     def _in_free_space(self, points: Array) -> npt.NDArray[np.bool_]:

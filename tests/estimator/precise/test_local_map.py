@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -136,6 +137,24 @@ def test_seen_surfaces():
     behind = replace(scan, ranges=scan.ranges + 0.14)  # another room, whose walls are near those of this one
     seen, _ = made.find_seen_and_appeared(here, behind, mapped)
     assert seen.mean() < 0.5  # only beams that meet walls at a shallow angle
+
+
+def test_a_wall_of_which_a_part_was_seen():
+    """Seeing more of it is no evidence for its place again: its first beam does not count as new."""
+    scene = Scene.of(ROOM, 361, 1)
+    scan, made = view(scene, HERE), LocalMap()
+    nothing = np.zeros(len(scan.ranges), np.bool_)
+    first, end = max(
+        pairwise(np.flatnonzero(np.append(scan.surfaces.starts, True))), key=lambda each: each[1] - each[0]
+    )
+    ranges = np.full(len(scan.ranges), -np.inf)
+    ranges[first + 40 : end] = scan.ranges[first + 40 : end]
+    key = LocalMapScan(np.zeros(3), replace(scan, ranges=ranges), nothing, ~nothing, True, 0.0, 0.0, 0.0)
+    made.add(key, HERE, np.diag([1e-4, 1e-4, 1e-5]))
+    seen, _ = made.find_seen_and_appeared(np.zeros(3), scan, ~nothing)
+    assert seen[first]
+    assert not seen[first + 1 : first + 10].any()
+    assert seen[first + 40 : end].all()
 
 
 @pytest.mark.parametrize("tracked", [True, False])
