@@ -46,9 +46,12 @@ NAME_PATTERN = r"^[\w.-]+$"  # of names in files
 PATTERN_PROBLEMS = {NAME_PATTERN: "only letters, digits, '.', '-' and '_' may be in a name, not {input}"}
 
 
-def similar_key(key: str, known: Iterable[str]) -> str | None:
-    """The one of the ``known`` keys that was probably meant by an unknown ``key``; None if none is similar."""
-    return next(iter(difflib.get_close_matches(key, sorted(known), 1)), None)
+def similar_key(key: str, known: Iterable[str], min_similarity: float = 0.6) -> str | None:
+    """The one of the ``known`` keys that was probably meant by an unknown ``key``; None if none is similar.
+
+    ``min_similarity`` is from 0 to 1, where 1 is equality (see `difflib`).
+    """
+    return next(iter(difflib.get_close_matches(key, sorted(known), 1, min_similarity)), None)
 
 
 def unknown_key(key: str, known: Iterable[str]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from pathlib import Path
 
@@ -10,7 +9,8 @@ from common.errors import UserError, similar_key
 from common.runtime.config import ServiceSettings, read_settings_file
 
 COMMAND_SECTIONS = ("log", "train")
-MIN_SIMILARITY = 0.85  # of a variable to a setting, as `difflib` measures it
+PREFIX = "PRESAGE_"
+MIN_SIMILARITY = 0.85  # of the rest of a variable's name to that of a setting
 
 
 def check_keys(path: Path | None) -> Path | None:
@@ -39,18 +39,16 @@ def check_variables() -> None:
 
     A service cannot tell it from a setting of another service, and would use the default, which may be a speed.
     """
-    known: set[str] = set()
+    known: set[str] = set()  # without the prefix, by which all would be similar
     for cls in _services():
-        known.update(f"PRESAGE_{cls.service.upper()}_{name.upper()}" for name in cls.model_fields)
-        known.update(f"PRESAGE_{name.upper()}" for name in cls.model_fields.keys() - cls.private)
-    ends = {name.removeprefix("PRESAGE_"): name for name in sorted(known)}  # with the prefix, all would be similar
-    for name in sorted(os.environ.keys() - known):
-        if name.startswith("PRESAGE_"):
-            similar = difflib.get_close_matches(name.removeprefix("PRESAGE_"), ends, 1, MIN_SIMILARITY)
-            if similar:
-                raise UserError(
-                    f"{name}: there is no such setting; did you mean {ends[similar[0]]}? Else unset this variable"
-                )
+        known.update(f"{cls.service}_{name}".upper() for name in cls.model_fields)
+        known.update(name.upper() for name in cls.model_fields.keys() - cls.private)
+    given = {name.removeprefix(PREFIX) for name in os.environ if name.startswith(PREFIX)}
+    for name in sorted(given - known):
+        if similar := similar_key(name, known, MIN_SIMILARITY):
+            raise UserError(
+                f"{PREFIX}{name}: there is no such setting; did you mean {PREFIX}{similar}? Else unset this variable"
+            )
 
 
 def _services() -> tuple[type[ServiceSettings], ...]:

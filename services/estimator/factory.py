@@ -159,7 +159,7 @@ def prepare_factory(options: EstimatorOptions) -> EstimatorFactory:
 
 def _prepare_particle_filter(options: EstimatorOptions, world: World) -> EstimatorFactory:
     tuned = options.estimator == "particle-filter"
-    RayCaster(world).expect(np.zeros((1, 3)), np.zeros(1))  # compile now, so that no request has to wait
+    world.ray_distances(np.zeros((1, 3)), np.zeros(1))  # compile now, so that no request has to wait
     sensor = functools.cache(functools.partial(Sensor, world))  # all filters share one field
 
     def make(geometry: ScannerGeometry) -> PoseEstimator:

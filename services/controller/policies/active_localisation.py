@@ -170,8 +170,8 @@ class ActiveLocaliser:
     def reset(self) -> None:
         """Forgets everything. Call it when the pose is known, or the goal has changed."""
         self._visited, self._stall_timer = VisitedPlaces(), StallTimer(self.robot.max_speed)
-        # Stamp in ns and paths of the last request, None instead of the paths if the map has none.
-        self._requested: tuple[int, CandidatePaths | None] | None = None
+        self._chosen_ns: int | None = None  # stamp at which paths were last looked for
+        self._paths: CandidatePaths | None = None  # that were found then; None if the map has none
         self._prediction_failure = ""  # why the last request was not answered
         self._place: tuple[Array, dict[str, float]] | None = None  # (3,) in base_link, and its expected free energy
         self._field: tuple[Array, CostField | None] | None = None  # a place (2,) m in map and its field
@@ -184,13 +184,12 @@ class ActiveLocaliser:
         """
         poses, weights = _likely_hypotheses(belief)
         stamp = belief.stamp_ns
-        if len(poses) < 2 or (self._requested is not None and 0 <= stamp - self._requested[0] < CHOICE_PERIOD_NS):
+        if len(poses) < 2 or (self._chosen_ns is not None and 0 <= stamp - self._chosen_ns < CHOICE_PERIOD_NS):
             return None
-        paths = self._candidate_paths(poses, weights)
-        if paths is None:
+        self._chosen_ns, self._paths = stamp, self._candidate_paths(poses, weights)
+        if self._paths is None:
             self._place = None
-        self._requested = (stamp, paths)
-        return paths
+        return self._paths
 
     def _candidate_paths(self, poses: Array, weights: Array) -> CandidatePaths | None:
         """Paths from the first of the hypotheses (K, 3), also to the present place; None if the map has none."""
@@ -212,7 +211,7 @@ class ActiveLocaliser:
         ``cost_to_goal`` returns the cost (...,) m of the paths to the goal from places (..., 2) m in map.
         """
         self._prediction_failure = ""
-        paths = None if self._requested is None else self._requested[1]
+        paths = self._paths
         if paths is None:
             return
         shape = (len(paths.hypotheses), len(paths.displacements), -1)
@@ -248,7 +247,7 @@ class ActiveLocaliser:
             action = back_off(velocity, surroundings, self.robot).action
             return Decision(action, BACKING_OFF, "blocked", recovering=True)
         poses, _ = _likely_hypotheses(belief)
-        if len(poses) > 1 and self._requested is not None and self._requested[1] is None:
+        if len(poses) > 1 and self._chosen_ns is not None and self._paths is None:
             return self._drive_to_open_space(belief, scan, surroundings, velocity)
         if len(poses) > 1:
             return self._tell_apart(belief.stamp_ns, poses, surroundings, velocity)

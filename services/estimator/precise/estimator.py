@@ -520,16 +520,22 @@ class PreciseEstimator:
 
     def _add_key_scan(self, view: View) -> None:
         """Makes the present scan a key scan: keeps its evidence, and adds its surfaces to the local map."""
-        best, log_unknown = self.hypotheses[0], self._unknown_place.log_evidence
-        log_start = self._unknown_place.log_start
+        best, unknown = self.hypotheses[0], self._unknown_place
         mapped, tracked = view.surface_evidence(best.pose[None]).weights[0] > 0.5, self._is_tracked()
         if tracked:
             self._precision.learn_changes(view, best.pose)
             self._precision.learn_map_error(view, best.pose)
-        self._unknown_place.add_key_scan()
         key = LocalMapScan(
-            self._local_pose, view, self._ignored_beams, mapped, tracked, self._log_change, log_unknown, log_start
+            self._local_pose,
+            view,
+            self._ignored_beams,
+            mapped,
+            tracked,
+            self._log_change,
+            unknown.log_evidence,
+            unknown.log_start,
         )
+        unknown.add_key_scan()
         self._local_map.add(key, best.pose, best.noise_covariance)
         self.hypotheses = [
             replace(

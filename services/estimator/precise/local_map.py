@@ -153,8 +153,8 @@ class LocalMap:
         free = np.zeros(len(near), np.bool_)
         free[~near] = self._in_free_space(placed[~near])
         appeared[view.returned] = free
-        first_seen = np.zeros(len(view.ranges), np.bool_)
-        first_seen[view.returned] = ~near & ~free
+        elsewhere = np.zeros(len(view.ranges), np.bool_)  # where the key scans saw neither a surface nor free space
+        elsewhere[view.returned] = ~near & ~free
         unmapped = near & ~mapped[view.returned]
         distance, _ = self._tree_of_unmapped_points().query(placed[unmapped], distance_upper_bound=SEEN_RADIUS_M)
         near[unmapped] = np.isfinite(distance)
@@ -162,7 +162,7 @@ class LocalMap:
         seen[view.returned] = near
         # Otherwise a wall would count again with each beam by which more of it is seen.
         starts, surface = view.surfaces.starts, np.cumsum(view.surfaces.starts)
-        seen |= starts & first_seen & (np.bincount(surface, seen)[surface] > 0)
+        seen |= starts & elsewhere & (np.bincount(surface, seen)[surface] > 0)
         return seen, appeared
 
     def _in_free_space(self, points: Array) -> npt.NDArray[np.bool_]:

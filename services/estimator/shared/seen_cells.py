@@ -37,7 +37,8 @@ class SeenCells:
         low, high = np.min(grid.corners(), axis=0), np.max(grid.corners(), axis=0)
         cells = np.zeros(np.ceil((high - low) / SEEN_CELL_M).astype(int)[::-1] + 1, np.bool_)
         parts = math.ceil(2 * grid.resolution / SEEN_CELL_M)  # points per cell and axis
-        within = (np.stack(np.meshgrid(*[np.arange(parts)] * 2), axis=-1).reshape(-1, 1, 2) + 0.5) / parts
+        middles = (np.arange(parts) + 0.5) / parts
+        within = np.stack(np.meshgrid(middles, middles), axis=-1).reshape(-1, 1, 2)
         for first in range(0, grid.height, ROWS_AT_ONCE):
             row, column = np.nonzero(grid.values[first : first + ROWS_AT_ONCE] != UNKNOWN)
             points = (np.column_stack([column, row + first]) + within).reshape(-1, 2) * grid.resolution

@@ -97,7 +97,7 @@ class Mapper:
                 self._pieces.add(int(scans.pieces[link.second]))
 
     def draw(self) -> OccupancyGrid:
-        """The map of the scans until now, with more of them than `update` has time for: seconds after a long drive."""
+        """Draws the map of the scans until now, from more of them than `update`: after a long drive, for seconds."""
         numbers, ranges = self._front_end.grid_scans()
         poses = self._poses()[numbers]
         placed = np.isfinite(poses[:, 0])
