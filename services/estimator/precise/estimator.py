@@ -30,6 +30,7 @@ from services.estimator.precise.motion_model import (
     expected_motion,
     fuse,
     limit_covariance,
+    motion_complexity,
     motion_cost,
     predict_motion,
     reachable_poses,
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
 
     from common.geometry.se2 import Array
     from services.estimator.precise.global_seeds import Seeds
+    from services.estimator.precise.surface_evidence import SurfaceEvidence
     from services.estimator.shared.generative_models import Expected, GenerativeModel
 
 START_COVARIANCE = np.diag([0.25, 0.25, 0.09])  # m², m², rad², of a start that is given without one
@@ -151,6 +153,7 @@ class PreciseEstimator:
         self._stamp: float | None = None
         self._odom: Array | None = None
         self._last_log_fit = 0.0  # nats, see `_log_fit`; at the best hypothesis
+        self._last_mapped_fit = 0.0  # nats, mean of `_fit_of_beams` for the map's surfaces
         self._last: LocalScan | None = None
 
         # The present scan
@@ -401,7 +404,11 @@ class PreciseEstimator:
         if observation.is_earlier_than(self._stamp):
             updated = replace(updated, velocity=None)
         else:
-            updated = replace(updated, motion_cost=self._motion_cost(predicted, updated))
+            updated = replace(
+                updated,
+                motion_cost=self._motion_cost(predicted, updated),
+                motion_complexity=motion_complexity(self.settings.motion, predicted, updated.noise_covariance),
+            )
         return updated, best.candidate
 
     def _find_alternatives(
@@ -445,8 +452,8 @@ class PreciseEstimator:
             local = self._local_map.to_local(hypotheses[0].pose)
         poses = np.array([each.pose for each in hypotheses])
         evidence = view.surface_evidence(poses)
-        seen, appeared = self._local_map.find_seen_and_appeared(local, view, evidence.weights[0] > 0.5)
-        small = view.surfaces.small
+        mapped, small = evidence.weights[0] > 0.5, view.surfaces.small
+        seen, appeared = self._local_map.find_seen_and_appeared(local, view, mapped)
         ignored = seen | appeared | small
 
         # Changes are equally probable at all hypotheses. If there are suddenly more of them, a search is due soon.
@@ -485,9 +492,11 @@ class PreciseEstimator:
 
         log_kidnapping = max(each.log_evidence for each in self.hypotheses)
         log_kidnapping += float(np.log(self.settings.unknown_probability))
-        # If the robot was carried away just now, the motion costs nothing, but all surfaces of the scan are new. So it
-        # counts only together with the whole scan: in a search at this scan, and for places off the map.
-        self._log_carried = log_kidnapping + cost_at_best
+        # If the robot was carried away just now, all surfaces of the scan are new, so this counts only with the
+        # whole scan: in a search at this scan, and for places off the map. But then there is neither a motion, with its
+        # cost and complexity, nor a surface seen before, which the map must predict as well as at the last scan.
+        fit_drop = float((self._last_mapped_fit - _fit_of_beams(view, evidence, mapped & seen)).sum())
+        self._log_carried = log_kidnapping + cost_at_best + hypotheses[0].motion_complexity + max(0.0, fit_drop)
         pairs = zip(self.hypotheses, hypotheses, strict=False)
         unknown_place = self._unknown_place
         unknown_place.allow(max(self._log_mismatch(before, after) for before, after in pairs))
@@ -555,7 +564,9 @@ class PreciseEstimator:
         # Prior against another place: the volume of all poses, divided by that of the poses at one place.
         information = best.curvature + np.linalg.inv(self.seeds.spread)
         log_places = np.log(self.seeds.volume) + 0.5 * (np.linalg.slogdet(information)[1] - 3 * np.log(2 * np.pi))
-        unknown = max([self._unknown_place.log_evidence, *(key.log_unknown for key in self._local_map.scans)])
+        unknown = max(
+            [self._unknown_place.log_evidence, self._log_carried, *(key.log_unknown for key in self._local_map.scans)]
+        )
         return bool(best.log_weight <= unknown - log_places)
 
     def _is_search_due(self, view: View) -> bool:
@@ -708,6 +719,9 @@ class PreciseEstimator:
         if self._is_key_scan_due():
             self._add_key_scan(view)
         self._last = LocalScan(self._local_pose, view)
+        evidence = view.surface_evidence(self.hypotheses[0].pose[None])
+        mapped_fit = _fit_of_beams(view, evidence, evidence.weights[0] > 0.5)
+        self._last_mapped_fit = float(mapped_fit.mean()) if len(mapped_fit) else 0.0
         self._last_log_fit = _log_fit(view, self.hypotheses[0].pose[None])
         same_beams = np.array_equal(view.angles, observation.angles)
         predicted = (
@@ -807,6 +821,14 @@ def _log_reference(view: View, skip: npt.NDArray[np.bool_]) -> float:
 def _log_fit(view: View, poses: Array) -> float:
     """Log likelihood in nats of all beams at the first of the ``poses`` (N, 3), minus `_log_reference`."""
     return float(view.surface_evidence(poses).log_likelihood[0] - view.surfaces.known_log_density.sum())
+
+
+def _fit_of_beams(view: View, evidence: SurfaceEvidence, beams: npt.NDArray[np.bool_]) -> Array:
+    """Log likelihoods (K,) in nats of ``beams`` (B,) at the first pose, minus their shares of `_log_reference`.
+
+    Beams on small surfaces are left out.
+    """
+    return np.asarray((evidence.by_beam[0] - view.surfaces.known_log_density)[beams & ~view.surfaces.small])
 
 
 def _log_unmapped_surfaces(view: View, skip: npt.NDArray[np.bool_]) -> float:

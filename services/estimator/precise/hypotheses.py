@@ -51,6 +51,7 @@ class TrackedHypothesis:
     surroundings: Array = field(default_factory=lambda: FIRST_SURROUNDINGS)  # (3,) probabilities at the last key scan
     scan_surroundings: Array = field(default_factory=lambda: FIRST_SURROUNDINGS)  # (3,) at the present scan
     motion_cost: float = 0.0  # nats, of the motion since the last scan, see `motion_model.motion_cost`
+    motion_complexity: float = 0.0  # nats, see `motion_model.motion_complexity`
     velocity: Array | None = None  # (3,) in base_link; None while unknown
     slip_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))  # as in `MotionCandidate`
     weight: float = 1.0

@@ -29,7 +29,9 @@ KEY_DISTANCE_M, KEY_TURN_RAD = 0.25, 0.35  # a key scan is taken after a motion 
 SEEN_RADIUS_M, SEEN_ACROSS_M = 0.15, 0.05
 MAX_SQUARED_DISTANCE = 4.0  # squared standard deviations of the result from the prior
 CHANGE_MEMORY_S = 30.0  # time constant with which changes of the surroundings are forgotten (a guess)
-PASSED_M = 0.3  # a beam that is longer by this than the distance to a surface has passed through it
+# A beam that is longer by this than the distance to a surface has passed through it, as far as the pose is known. Three
+# standard deviations of the noise are added in quadrature.
+PASSED_M = 0.1
 MIN_MATCHED_FRACTION = 0.5  # of a scan's points, else there is no match
 CLEAR_MATCHED_FRACTION = 0.8  # if fewer match, matching is repeated from `EXTRA_HEADINGS_RAD`
 EXTRA_HEADINGS_RAD = np.array([-0.3, -0.15, 0.15, 0.3])
@@ -241,9 +243,10 @@ def is_key_pose(last: Array, pose: Array) -> bool:
 
 
 def _passed(scan: LocalScan, points: Array, distance: float) -> npt.NDArray[np.bool_]:
-    """Mask (K,) of the local points (K, 2) m that beams of the scan pass by more than ``distance`` m."""
+    """Mask (K,) of the local points (K, 2) m that beams of the scan pass by ``distance`` m, and not by noise."""
     ranges, beam, inside = _beams_towards(scan.view, se2.compose(scan.pose, scan.view.mount), points)
-    return np.asarray(inside & (scan.view.nearest_of_neighbours[beam] > ranges + distance))
+    margin = np.hypot(distance, 3 * scan.view.likelihood.deviation(ranges))
+    return np.asarray(inside & (scan.view.nearest_of_neighbours[beam] > ranges + margin))
 
 
 def _beams_towards(

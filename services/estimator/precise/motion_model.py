@@ -150,12 +150,34 @@ def motion_cost(noise: MotionNoise, candidates: list[MotionCandidate], pose: Arr
     much its largest log density is below that of an expected motion, plus (z² - `MAX_MOTION_SIGMAS`²) / 2, if that is
     positive, with the Mahalanobis distance z of the pose from its mean.
     """
-    widened = [replace(each, covariance=each.covariance + covariance) for each in candidates]
-    peaks = np.array([np.log(each.probability) - 0.5 * np.linalg.slogdet(each.covariance)[1] for each in widened])
-    expected = min(peak for peak, each in zip(peaks, widened, strict=True) if each.probability > noise.unexpected)
+    widened, peaks = _peaks(candidates, covariance)
     squares = np.array([each.squared_distance(pose) for each in widened])
-    costs = np.maximum(0.0, expected - peaks) + 0.5 * np.maximum(0.0, squares - MAX_MOTION_SIGMAS**2)
-    return float(costs.min())
+    costs = np.maximum(0.0, _expected_peak(noise, candidates, peaks) - peaks)
+    return float((costs + 0.5 * np.maximum(0.0, squares - MAX_MOTION_SIGMAS**2)).min())
+
+
+def motion_complexity(noise: MotionNoise, candidates: list[MotionCandidate], covariance: Array) -> float:
+    """How much more certain a pose with ``covariance`` (3, 3) is than its prediction by an expected motion, in nats.
+
+    It is minus the logarithm of the probability that the prediction gave to the poses that the scan leaves.
+    """
+    _, peaks = _peaks(candidates, covariance)
+    return float(-0.5 * np.linalg.slogdet(covariance)[1] - _expected_peak(noise, candidates, peaks))
+
+
+def _peaks(candidates: list[MotionCandidate], covariance: Array) -> tuple[list[MotionCandidate], Array]:
+    """The candidates with ``covariance`` (3, 3) added to theirs, and the logarithms of their peaks.
+
+    The latter include the candidate's probability, and lack the constant of the normal distribution.
+    """
+    widened = [replace(each, covariance=each.covariance + covariance) for each in candidates]
+    peaks = [np.log(each.probability) - 0.5 * np.linalg.slogdet(each.covariance)[1] for each in widened]
+    return widened, np.array(peaks)
+
+
+def _expected_peak(noise: MotionNoise, candidates: list[MotionCandidate], peaks: Array) -> float:
+    """The lowest of the ``peaks`` (K,) of the motions that are not unexpected."""
+    return float(min(peak for peak, each in zip(peaks, candidates, strict=True) if each.probability > noise.unexpected))
 
 
 def smooth_velocity(previous: Array | None, current: Array, period: float) -> Array:

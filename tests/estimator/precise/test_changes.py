@@ -233,24 +233,36 @@ def test_unlearned_room(driven, kidnapped):
 
 
 ROOM = [(1.0, 3.4, 0.9, 0.4), (4.2, 0.9, 0.5, 0.9), (2.6, 2.4, 0.3, 0.3)]  # x, y, width, depth of boxes
-EXTRA = (4.0, 2.7, 0.35, 0.3)  # a box that only the eastern room has
+# What only the eastern room has: a further box, a box elsewhere, a thicker and a wider box
+EASTERN_ROOMS = {
+    "further": [*ROOM, (4.0, 2.7, 0.35, 0.3)],
+    "moved": [*ROOM[:2], (2.6, 2.55, 0.3, 0.3)],
+    "thicker": [*ROOM[:2], (2.6, 2.4, 0.3, 0.5)],
+    "wider": [(1.0, 3.4, 1.2, 0.4), *ROOM[1:]],
+}
 
 
-def test_kidnapping_between_similar_rooms():
-    """A robot carried to a room that differs by one box is not taken to be where it was, among new furniture."""
-    boxes = [(x + shift, y, w, d) for shift in (0.0, 6.0) for x, y, w, d in ROOM]
-    boxes += [(EXTRA[0] + 6.0, *EXTRA[1:]), (5.5, 2.0, 0.2, 4.0)]
+@pytest.mark.parametrize("jump", [(0.02, 0.02, 0.02), (0.12, 0.04, 0.05)])
+@pytest.mark.parametrize("eastern", EASTERN_ROOMS)
+def test_kidnapping_between_similar_rooms(eastern, jump):
+    """A robot carried to a room that differs by one box is not taken to be where it was, among new furniture.
+
+    Most of its scan shows surfaces where it has seen some just before, if it ``jump``s a little in its belief.
+    """
+    boxes = [*ROOM, *((x + 6.0, y, w, d) for x, y, w, d in EASTERN_ROOMS[eastern]), (5.5, 2.0, 0.2, 4.0)]
     obstacles = [{"box": {"center": (x, y), "size": (w, d)}} for x, y, w, d in boxes]
     rooms = World(name="rooms", boundary=[(0, 0), (11.5, 0), (11.5, 4), (0, 4)], obstacles=obstacles)
     made, scene = estimator(rooms)
     west = np.linspace([1.5, 1.4, 0.0], [2.4, 1.4, 0.0], 30)
     made.restart(west[0], CLOSE)
     assert drive(made, scene, west)[-1].state == "tracking"
-    east = np.linspace([8.52, 1.44, 0.05], [9.2, 1.44, 0.5], 30)
+    east = np.linspace(np.array([8.4, 1.4, 0.0]) + jump, [9.2, 1.44, 0.5], 30)
     found = drive(made, scene, east, len(west))
     off = [np.hypot(*(posterior.pose - pose)[:2]) for posterior, pose in zip(found, east, strict=True)]
     assert all(o < 0.05 for o, posterior in zip(off, found, strict=True) if posterior.state == "tracking")
-    assert found[-1].state == "tracking"
+    assert off[-1] < 0.05
+    # All of the other rooms is seen at once: later scans add little evidence.
+    assert found[-1].state == "tracking" or eastern != "further"
 
 
 def test_crowd_and_kidnapping():
