@@ -23,7 +23,14 @@ from services.estimator.precise.hypotheses import (
     weigh,
 )
 from services.estimator.precise.likelihood import Evidence, Likelihood
-from services.estimator.precise.local_map import ChangeRate, LocalMap, LocalMapScan, LocalScan, count_changes
+from services.estimator.precise.local_map import (
+    ChangeRate,
+    LocalMap,
+    LocalMapScan,
+    LocalScan,
+    MovedFraction,
+    count_changes,
+)
 from services.estimator.precise.motion_model import (
     MotionCandidate,
     decouple,
@@ -145,7 +152,7 @@ class PreciseEstimator:
         self._has_tracked = False
         self._unknown_place = UnknownPlace()
         self._local_map = LocalMap()
-        self._change_rate = ChangeRate()
+        self._change_rate, self._moved_fraction = ChangeRate(), MovedFraction()
         self._precision = Precision.before_first_scan(self._map_cell)
         self._scans_since_search, self._search_interval = 0, 1
 
@@ -339,7 +346,8 @@ class PreciseEstimator:
 
         ``motions`` are predicted in the local frame, so that an error of the pose in the map does not bias them; the
         pose of ``match`` is one more start there. ``prior`` (3, 3) is the covariance of the predicted pose in map.
-        Returns ``match`` if the local map gives no motion, or if the scan fits the map far better at its pose.
+        Returns ``match`` if the local map gives no motion, if surfaces have probably moved instead of the robot, or if
+        the scan fits the map far better at the pose of ``match``.
         """
         view = match.view
         # Not the widest motion, whose mean is that of another.
@@ -347,7 +355,11 @@ class PreciseEstimator:
         found = self._local_map.match(starts, view, motions[-1])
         if found is None:
             return match
-        moved = self._local_map.candidate(found, prior)
+        cost = motion_cost(self.settings.motion, motions, found.pose, np.linalg.inv(found.information).astype(float))
+        surfaces_moved = found.moved_probability(self._moved_fraction.probability, cost)
+        if found.movable_surfaces and surfaces_moved > 0.5:
+            return match
+        moved = self._local_map.candidate(found, prior, surfaces_moved)
         # All hypotheses share the relative motion.
         step = se2.between(self.hypotheses[0].pose, moved.mean)
         moves = [replace(moved, mean=se2.compose(each.pose, step)) for each in self.hypotheses]
@@ -455,6 +467,9 @@ class PreciseEstimator:
         mapped, small = evidence.weights[0] > 0.5, view.surfaces.small
         seen, appeared = self._local_map.find_seen_and_appeared(local, view, mapped)
         ignored = seen | appeared | small
+        unmapped = view.returned & ~mapped & ~small
+        moved, stayed = view.count_surfaces(unmapped & appeared), view.count_surfaces(unmapped & seen)
+        self._moved_fraction.learn(moved, stayed, period)
 
         # Changes are equally probable at all hypotheses. If there are suddenly more of them, a search is due soon.
         log_probability = 0.0  # of the number of changes

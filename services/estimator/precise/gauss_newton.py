@@ -197,6 +197,11 @@ class View:
             )
         return at.evidence[extra_sigma]
 
+    def count_surfaces(self, beams: npt.NDArray[np.bool_]) -> int:
+        """Number of surfaces of which most beams are among ``beams`` (B,)."""
+        surface = np.cumsum(self.surfaces.starts)
+        return int((np.bincount(surface, beams) > 0.5 * np.bincount(surface)).sum())
+
     def expected(self, pose: Array) -> Expected:
         """The scan that the model predicts at one ``pose`` (3,)."""
         return self._predicted(pose[None]).expected

@@ -99,6 +99,29 @@ class ChangeRate:
 
 
 @dataclass
+class MovedFraction:
+    """Fraction of the surfaces which the map lacks that move, such as people, learned while driving.
+
+    It has a beta distribution: before the first scan, as if one surface had moved, and four had stayed (a guess). A
+    surface is seen again and again, so it counts once per second.
+    """
+
+    moved: float = 1.0  # surfaces times s, forgotten exponentially
+    stayed: float = 4.0
+
+    @property
+    def probability(self) -> float:
+        """Probability that such a surface has moved since the last key scan."""
+        return self.moved / (self.moved + self.stayed)
+
+    def learn(self, moved: int, stayed: int, period: float) -> None:
+        """Learns from the surfaces of a scan, ``period`` s after the last one, and forgets earlier ones."""
+        kept = math.exp(-period / CHANGE_MEMORY_S)
+        self.moved = kept * self.moved + (1 - kept) * MovedFraction.moved + moved * period
+        self.stayed = kept * self.stayed + (1 - kept) * MovedFraction.stayed + stayed * period
+
+
+@dataclass
 class LocalMap:
     """The last key scans in a local frame. Localisation in the map moves this frame, and all scans with it."""
 
@@ -191,12 +214,15 @@ class LocalMap:
                 found = again
         return None if found is None or found.matched_fraction < MIN_MATCHED_FRACTION or found.degenerate else found
 
-    def candidate(self, match: Match, prior: Array) -> MotionCandidate:
-        """The pose in map that a match gives; ``prior`` (3, 3) is the pose's covariance in map before the match."""
+    def candidate(self, match: Match, prior: Array, moved: float) -> MotionCandidate:
+        """The pose in map that a match gives; ``prior`` (3, 3) is the pose's covariance in map before the match.
+
+        All movable surfaces have ``moved`` with this probability, otherwise none.
+        """
         turn = se2.rotation(float(self.frame[2]))
         # If the surfaces have moved instead of the robot, the error is all of its motion since the last key scan.
         motion = se2.difference(match.pose, self.scans[-1].pose)
-        covariance = match.covariance(turn.T @ prior @ turn + np.outer(motion, motion))
+        covariance = match.covariance(turn.T @ prior @ turn + np.outer(motion, motion), moved)
         return MotionCandidate(se2.compose(self.frame, match.pose), self.covariance + turn @ covariance @ turn.T, 1.0)
 
     def _best_match(self, starts: Array, view: View, prior: MotionCandidate) -> Match | None:

@@ -6,6 +6,7 @@ subtracted. Surfaces that the map lacks may have moved.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,8 +28,6 @@ MIN_POINTS = 20  # of a scan that must have a corresponding point
 MIN_INFORMATION_RATIO = 0.02  # a direction is unobserved if its information, divided by that across it, is less
 # Weight of all points in the choice of the weakest direction, which they decide if there are no fixed points
 TIE_BREAK = 1e-3
-# Probability (a guess) that a surface which the map lacks, such as a person, has moved since the last key scan
-MOVED_PROBABILITY = 0.2
 
 
 @dataclass(frozen=True)
@@ -45,16 +44,24 @@ class Match:
     fixed_step: Array  # (3,) towards the pose that fits them best, of one Gauss-Newton iteration
     movable_surfaces: int  # those that the map lacks, and that show the direction which the fixed points show worst
 
-    def covariance(self, if_moved: Array) -> Array:
-        """Covariance (3, 3) of the pose.
+    def moved_probability(self, moves: float, motion_cost: float) -> float:
+        """Probability that all movable surfaces have moved, instead of none; 1 if there are none.
 
-        It is that of a mixture: all movable surfaces have moved, or none. If they have, or there are none, it follows
-        from the fixed points and from ``if_moved`` (3, 3), the mean squared error of the pose without a match.
+        Each moves with probability ``moves``. If none has, the robot has moved as the match shows, which is
+        ``motion_cost`` nats less probable than expected.
+        """
+        moved = moves**self.movable_surfaces
+        return moved / (moved + (1 - moved) * math.exp(-motion_cost))
+
+    def covariance(self, if_moved: Array, moved: float) -> Array:
+        """Covariance (3, 3) of the pose, if all movable surfaces have ``moved`` with this probability, otherwise none.
+
+        If they have, or there are none, it follows from the fixed points and from ``if_moved`` (3, 3), the mean squared
+        error of the pose without a match.
         """
         covariance = np.linalg.inv(self.information + 1e-6 / CAUCHY_SCALE_M**2 * np.eye(3))
         by_fixed = np.linalg.inv(self.fixed_information + np.linalg.inv(if_moved))
         squared_error = by_fixed + np.outer(self.fixed_step, self.fixed_step)
-        moved = MOVED_PROBABILITY**self.movable_surfaces
         return np.asarray((1 - moved) * covariance + moved * squared_error)
 
 

@@ -283,6 +283,30 @@ def test_crowd_and_kidnapping():
     assert np.hypot(*(found[-1].pose - there)[:2]) < 0.02
 
 
+@pytest.mark.parametrize(
+    ("people", "speed"),
+    [([(31.5, 0.6), (32.6, 1.4)], -0.5), ([(31.2, 0.5), (31.9, 1.0), (32.5, 1.5)], 1.0)],
+)
+def test_people_who_start_to_walk_together(people, speed):
+    """Where only people show the place along a corridor, and all of them jump, they have moved, not the robot."""
+    made, _ = estimator(corridor_with([]), keep=lambda places: abs(places[:, 0] - 30) < 15)
+    here = np.array([30.0, 1.0, 0.0])
+    made.restart(here, CLOSE / 100)
+    for k in range(50):
+        walked = speed * max(0, k - 19) / RATE
+        scene = Scene.of(corridor_with([(x + walked, y) for x, y in people]), BEAMS, 3)
+        found = made.update(scene.observe(scene.clean(here[None])[0], k / RATE))
+        assert np.hypot(*(found.pose - here)[:2]) < 0.2 or found.state != "tracking", k
+        assert k > 19 or found.state == "tracking", k
+
+
+def corridor_with(people):
+    """A corridor of 60 m with one column in its middle, and people standing there."""
+    column = {"box": {"center": (33.0, 0.1), "size": (0.3, 0.2)}}
+    circles = [{"circle": {"center": person, "radius": 0.2}} for person in people]
+    return World(name="corridor", boundary=[(0, 0), (60, 0), (60, 2), (0, 2)], obstacles=[column, *circles])
+
+
 def test_odometry_with_the_wrong_sign(driven):
     """Where nothing was learned, recent scans show that the robot backs, although its odometry says it drives on."""
     made, scene, path = copy.deepcopy(driven)

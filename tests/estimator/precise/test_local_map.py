@@ -22,6 +22,7 @@ from services.estimator.precise.local_map import (
     LocalMap,
     LocalMapScan,
     LocalScan,
+    MovedFraction,
     _beams_towards,
     count_changes,
 )
@@ -71,7 +72,7 @@ def test_match_in_any_frame(offset, frame, seed):
     assert match is not None
     assert not match.degenerate
     assert match.matched_fraction > 0.7
-    off = se2.between(there, made.candidate(match, STEP).mean)
+    off = se2.between(there, made.candidate(match, STEP, 0.1).mean)
     assert np.hypot(off[0], off[1]) < 0.02
     assert abs(off[2]) < 0.01
 
@@ -83,7 +84,7 @@ def test_covariance_turns_with_the_frame():
     for yaw in (0.0, 1.2):
         made = local_map(scene, HERE, frame=(1.0, 2.0, yaw))
         match = match_near(made, HERE, scan)
-        found.append(made.candidate(match, STEP).covariance)
+        found.append(made.candidate(match, STEP, 0.1).covariance)
     assert found[0] == pytest.approx(found[1], rel=0.1, abs=3e-7)
 
 
@@ -207,6 +208,18 @@ def test_change_rate():
         rate.learn(0, period)
     assert rate.log_probability(5, period) == pytest.approx(quiet, abs=5)
     assert busy > quiet + 15
+
+
+def test_moved_fraction():
+    """It is learned from the surfaces of each scan, and forgotten."""
+    fraction = MovedFraction()
+    before = fraction.probability
+    for _ in range(500):
+        fraction.learn(6, 2, 0.1)
+    assert fraction.probability == pytest.approx(0.75, abs=0.02)
+    for _ in range(3000):
+        fraction.learn(0, 0, 0.07)
+    assert fraction.probability == pytest.approx(before, abs=0.02)
 
 
 def test_beams_of_a_corrected_scan():

@@ -33,6 +33,11 @@ def person(x, y=1.0):
     return {"circle": {"center": (x, y), "radius": 0.25}}
 
 
+def covariance(match):
+    """The covariance of a match, if each surface which the map lacks moves with probability 0.2."""
+    return match.covariance(UNKNOWN, match.moved_probability(0.2, 0.0))
+
+
 def points_of(scan):
     points = place_points(scan, HERE)
     on_wall = (points[:, 1] < 0.1) | (points[:, 1] > 1.9)
@@ -45,7 +50,7 @@ def test_tilted_lines_are_no_information(count, from_wall):
     people = [person(28.6 + 0.7 * k, (from_wall, 2 - from_wall)[k % 2]) for k in range(count)]
     match = points_of(view(*people)).match(HERE, view(seed=2), PRIOR)  # the people have gone
     assert np.sqrt(match.information[0, 0]) > 50  # a deviation of 2 cm at most, if the lines were exact
-    deviation = np.sqrt(np.diag(match.covariance(UNKNOWN)))
+    deviation = np.sqrt(np.diag(covariance(match)))
     assert deviation[0] > 0.5
     assert deviation[1] < 0.05
 
@@ -56,7 +61,7 @@ def test_column_of_the_map_shows_the_place():
     match = everything.match(HERE, view(person(31.5), seed=2), PRIOR)
     assert not match.degenerate
     assert match.movable_surfaces == 0
-    assert np.sqrt(np.diag(match.covariance(UNKNOWN)))[0] < 0.02
+    assert np.sqrt(np.diag(covariance(match)))[0] < 0.02
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(1e-3, 1.0), st.integers(0, 8))
@@ -84,7 +89,7 @@ def test_person_who_walks_along_a_corridor(step):
     error = match.pose[0] - HERE[0]
     assert abs(error) > 0.7 * abs(step)
     assert match.movable_surfaces == 1
-    deviation = np.sqrt(np.diag(match.covariance(UNKNOWN)))
+    deviation = np.sqrt(np.diag(covariance(match)))
     assert 2 * deviation[0] > abs(error)
     assert deviation[1] < 0.02
     assert deviation[2] < 0.02
@@ -96,9 +101,12 @@ def test_two_people_move_alike_less_often_than_one():
         for people in ([person(31.5)], [person(31.5, 0.6), person(32.6, 1.4)])
     )
     assert (one.movable_surfaces, two.movable_surfaces) == (1, 2)
-    assert two.covariance(UNKNOWN)[0, 0] < 0.3 * one.covariance(UNKNOWN)[0, 0]
+    assert covariance(two)[0, 0] < 0.3 * covariance(one)[0, 0]
     moved = 0.2**2
-    assert two.covariance(UNKNOWN) - (1 - moved) * np.linalg.inv(two.information) == pytest.approx(
+    assert two.moved_probability(0.2, 0.0) == pytest.approx(moved)
+    # A motion of the robot that is as improbable as that makes both equally probable.
+    assert two.moved_probability(0.2, np.log(1 / moved - 1)) == pytest.approx(0.5)
+    assert covariance(two) - (1 - moved) * np.linalg.inv(two.information) == pytest.approx(
         moved
         * (np.linalg.inv(two.fixed_information + np.linalg.inv(UNKNOWN)) + np.outer(two.fixed_step, two.fixed_step)),
         rel=1e-3,
@@ -113,4 +121,4 @@ def test_fixed_surfaces_that_contradict_widen_the_covariance():
     is_person = np.hypot(*(points - (31.5, 0.6)).T) < 0.3
     match = SurfacePoints.of(points, ~is_person).match(HERE, after, PRIOR)
     error = match.pose[0] - HERE[0]
-    assert 3 * np.sqrt(match.covariance(UNKNOWN)[0, 0]) > abs(error)
+    assert 3 * np.sqrt(covariance(match)[0, 0]) > abs(error)
