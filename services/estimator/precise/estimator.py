@@ -355,8 +355,12 @@ class PreciseEstimator:
         found = self._local_map.match(starts, view, motions[-1])
         if found is None:
             return match
-        cost = motion_cost(self.settings.motion, motions, found.pose, np.linalg.inv(found.information).astype(float))
-        surfaces_moved = found.moved_probability(self._moved_fraction.probability, cost)
+        # If surfaces have moved, the robot has moved as the map shows; otherwise as the local map does.
+        by_map = match.evidence.curvature[0] + np.linalg.inv(match.motions[0][-1].covariance)
+        noise = self.settings.motion
+        cost_by_map = motion_cost(noise, match.motions[0], match.poses[0], _inverse(by_map))
+        cost_by_local = motion_cost(noise, motions, found.pose, _inverse(found.information))
+        surfaces_moved = found.moved_probability(self._moved_fraction.probability, cost_by_local - cost_by_map)
         if found.movable_surfaces and surfaces_moved > 0.5:
             return match
         moved = self._local_map.candidate(found, prior, surfaces_moved)
@@ -460,6 +464,7 @@ class PreciseEstimator:
 
         ``local`` (3,) is the pose in the local frame, or None if the motion does not come from the local map.
         """
+        by_local_map = local is not None
         if local is None:
             local = self._local_map.to_local(hypotheses[0].pose)
         poses = np.array([each.pose for each in hypotheses])
@@ -510,8 +515,10 @@ class PreciseEstimator:
         # If the robot was carried away just now, all surfaces of the scan are new, so this counts only with the
         # whole scan: in a search at this scan, and for places off the map. But then there is neither a motion, with its
         # cost and complexity, nor a surface seen before, which the map must predict as well as at the last scan.
-        fit_drop = float((self._last_mapped_fit - _fit_of_beams(view, evidence, mapped & seen)).sum())
-        self._log_carried = log_kidnapping + cost_at_best + hypotheses[0].motion_complexity + max(0.0, fit_drop)
+        # A pose from the local map fits these less well, as the map had no say in it.
+        fit = _fit_of_beams(view, evidence, mapped & seen)
+        fit_drop = 0.0 if by_local_map else max(0.0, float((self._last_mapped_fit - fit).sum()))
+        self._log_carried = log_kidnapping + cost_at_best + hypotheses[0].motion_complexity + fit_drop
         pairs = zip(self.hypotheses, hypotheses, strict=False)
         unknown_place = self._unknown_place
         unknown_place.allow(max(self._log_mismatch(before, after) for before, after in pairs))
@@ -864,6 +871,10 @@ def _log_at_poses(view: View, poses: Array, skip: npt.NDArray[np.bool_], surroun
         logs = np.log(surroundings @ NEXT_SURROUNDINGS) + np.stack([mapped, unmapped, unmapped], axis=-1)
     total = np.logaddexp.reduce(logs, axis=-1)
     return total, np.exp(logs - total[..., None])
+
+
+def _inverse(matrix: Array) -> Array:
+    return np.asarray(np.linalg.inv(matrix), float)
 
 
 def _prior_of(candidates: list[MotionCandidate]) -> Prior:

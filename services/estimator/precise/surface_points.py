@@ -48,7 +48,7 @@ class Match:
         """Probability that all movable surfaces have moved, instead of none; 1 if there are none.
 
         Each moves with probability ``moves``. If none has, the robot has moved as the match shows, which is
-        ``motion_cost`` nats less probable than expected.
+        ``motion_cost`` nats less probable than how it has moved otherwise.
         """
         moved = moves**self.movable_surfaces
         return moved / (moved + (1 - moved) * math.exp(-motion_cost))
