@@ -62,7 +62,6 @@ if TYPE_CHECKING:
 
     from common.geometry.se2 import Array
     from services.estimator.precise.global_seeds import Seeds
-    from services.estimator.precise.surface_evidence import SurfaceEvidence
     from services.estimator.shared.generative_models import Expected, GenerativeModel
 
 START_COVARIANCE = np.diag([0.25, 0.25, 0.09])  # m², m², rad², of a start that is given without one
@@ -160,7 +159,6 @@ class PreciseEstimator:
         self._stamp: float | None = None
         self._odom: Array | None = None
         self._last_log_fit = 0.0  # nats, see `_log_fit`; at the best hypothesis
-        self._last_mapped_fit = 0.0  # nats, mean of `_fit_of_beams` for the map's surfaces
         self._last: LocalScan | None = None
 
         # The present scan
@@ -423,7 +421,11 @@ class PreciseEstimator:
             updated = replace(
                 updated,
                 motion_cost=self._motion_cost(predicted, updated),
-                motion_complexity=motion_complexity(self.settings.motion, predicted, updated.noise_covariance),
+                motion_complexity=motion_complexity(
+                    [limit_covariance(each, self.seeds.spread) for each in predicted],
+                    updated.pose,
+                    updated.noise_covariance,
+                ),
             )
         return updated, best.candidate
 
@@ -464,7 +466,6 @@ class PreciseEstimator:
 
         ``local`` (3,) is the pose in the local frame, or None if the motion does not come from the local map.
         """
-        by_local_map = local is not None
         if local is None:
             local = self._local_map.to_local(hypotheses[0].pose)
         poses = np.array([each.pose for each in hypotheses])
@@ -512,13 +513,9 @@ class PreciseEstimator:
 
         log_kidnapping = max(each.log_evidence for each in self.hypotheses)
         log_kidnapping += float(np.log(self.settings.unknown_probability))
-        # If the robot was carried away just now, all surfaces of the scan are new, so this counts only with the
-        # whole scan: in a search at this scan, and for places off the map. But then there is neither a motion, with its
-        # cost and complexity, nor a surface seen before, which the map must predict as well as at the last scan.
-        # A pose from the local map fits these less well, as the map had no say in it.
-        fit = _fit_of_beams(view, evidence, mapped & seen)
-        fit_drop = 0.0 if by_local_map else max(0.0, float((self._last_mapped_fit - fit).sum()))
-        self._log_carried = log_kidnapping + cost_at_best + hypotheses[0].motion_complexity + fit_drop
+        # If the robot was carried away just now, no motion had to be predicted, but all surfaces of the scan are new. This
+        # counts only together with the whole scan: in a search at this scan, and for places off the map.
+        self._log_carried = log_kidnapping + hypotheses[0].motion_complexity
         pairs = zip(self.hypotheses, hypotheses, strict=False)
         unknown_place = self._unknown_place
         unknown_place.allow(max(self._log_mismatch(before, after) for before, after in pairs))
@@ -741,9 +738,6 @@ class PreciseEstimator:
         if self._is_key_scan_due():
             self._add_key_scan(view)
         self._last = LocalScan(self._local_pose, view)
-        evidence = view.surface_evidence(self.hypotheses[0].pose[None])
-        mapped_fit = _fit_of_beams(view, evidence, evidence.weights[0] > 0.5)
-        self._last_mapped_fit = float(mapped_fit.mean()) if len(mapped_fit) else 0.0
         self._last_log_fit = _log_fit(view, self.hypotheses[0].pose[None])
         same_beams = np.array_equal(view.angles, observation.angles)
         predicted = (
@@ -843,14 +837,6 @@ def _log_reference(view: View, skip: npt.NDArray[np.bool_]) -> float:
 def _log_fit(view: View, poses: Array) -> float:
     """Log likelihood in nats of all beams at the first of the ``poses`` (N, 3), minus `_log_reference`."""
     return float(view.surface_evidence(poses).log_likelihood[0] - view.surfaces.known_log_density.sum())
-
-
-def _fit_of_beams(view: View, evidence: SurfaceEvidence, beams: npt.NDArray[np.bool_]) -> Array:
-    """Log likelihoods (K,) in nats of ``beams`` (B,) at the first pose, minus their shares of `_log_reference`.
-
-    Beams on small surfaces are left out.
-    """
-    return np.asarray((evidence.by_beam[0] - view.surfaces.known_log_density)[beams & ~view.surfaces.small])
 
 
 def _log_unmapped_surfaces(view: View, skip: npt.NDArray[np.bool_]) -> float:

@@ -198,9 +198,9 @@ class View:
         return at.evidence[extra_sigma]
 
     def count_surfaces(self, beams: npt.NDArray[np.bool_]) -> int:
-        """Number of surfaces of which most beams are among ``beams`` (B,)."""
-        surface = np.cumsum(self.surfaces.starts)
-        return int((np.bincount(surface, beams) > 0.5 * np.bincount(surface)).sum())
+        """Number of surfaces of which most measured beams are among ``beams`` (B,)."""
+        surface, measured = np.cumsum(self.surfaces.starts), self.ranges > -np.inf  # not NaN either
+        return int((np.bincount(surface, beams) > 0.5 * np.bincount(surface, measured)).sum())
 
     def expected(self, pose: Array) -> Expected:
         """The scan that the model predicts at one ``pose`` (3,)."""

@@ -29,8 +29,8 @@ KEY_DISTANCE_M, KEY_TURN_RAD = 0.25, 0.35  # a key scan is taken after a motion 
 SEEN_RADIUS_M, SEEN_ACROSS_M = 0.15, 0.05
 MAX_SQUARED_DISTANCE = 4.0  # squared standard deviations of the result from the prior
 CHANGE_MEMORY_S = 30.0  # time constant with which changes of the surroundings are forgotten (a guess)
-# A beam that is longer by this than the distance to a surface has passed through it, as far as the pose is known. Three
-# standard deviations of the noise are added in quadrature.
+# A beam that ends farther than this behind a surface has passed through it. Three standard deviations of the noise are
+# added in quadrature.
 PASSED_M = 0.1
 MIN_MATCHED_FRACTION = 0.5  # of a scan's points, else there is no match
 CLEAR_MATCHED_FRACTION = 0.8  # if fewer match, matching is repeated from `EXTRA_HEADINGS_RAD`
@@ -102,11 +102,11 @@ class ChangeRate:
 class MovedFraction:
     """Fraction of the surfaces which the map lacks that move, such as people, learned while driving.
 
-    It has a beta distribution: before the first scan, as if one surface had moved, and four had stayed (a guess). A
-    surface is seen again and again, so it counts once per second.
+    It has a beta distribution: before the first scan, as if one surface had been seen that moved, and four that stayed
+    (a guess). A surface is seen again and again, so it counts once per second; after a longer gap between scans, once.
     """
 
-    moved: float = 1.0  # surfaces times s, forgotten exponentially
+    moved: float = 1.0  # surfaces, forgotten exponentially
     stayed: float = 4.0
 
     @property
@@ -117,8 +117,9 @@ class MovedFraction:
     def learn(self, moved: int, stayed: int, period: float) -> None:
         """Learns from the surfaces of a scan, ``period`` s after the last one, and forgets earlier ones."""
         kept = math.exp(-period / CHANGE_MEMORY_S)
-        self.moved = kept * self.moved + (1 - kept) * MovedFraction.moved + moved * period
-        self.stayed = kept * self.stayed + (1 - kept) * MovedFraction.stayed + stayed * period
+        weight = min(1.0, period)
+        self.moved = kept * self.moved + (1 - kept) * MovedFraction.moved + moved * weight
+        self.stayed = kept * self.stayed + (1 - kept) * MovedFraction.stayed + stayed * weight
 
 
 @dataclass
@@ -214,15 +215,15 @@ class LocalMap:
                 found = again
         return None if found is None or found.matched_fraction < MIN_MATCHED_FRACTION or found.degenerate else found
 
-    def candidate(self, match: Match, prior: Array, moved: float) -> MotionCandidate:
+    def candidate(self, match: Match, prior: Array, moved_probability: float) -> MotionCandidate:
         """The pose in map that a match gives; ``prior`` (3, 3) is the pose's covariance in map before the match.
 
-        All movable surfaces have ``moved`` with this probability, otherwise none.
+        ``moved_probability`` is that all movable surfaces have moved, instead of none.
         """
         turn = se2.rotation(float(self.frame[2]))
         # If the surfaces have moved instead of the robot, the error is all of its motion since the last key scan.
         motion = se2.difference(match.pose, self.scans[-1].pose)
-        covariance = match.covariance(turn.T @ prior @ turn + np.outer(motion, motion), moved)
+        covariance = match.covariance(turn.T @ prior @ turn + np.outer(motion, motion), moved_probability)
         return MotionCandidate(se2.compose(self.frame, match.pose), self.covariance + turn @ covariance @ turn.T, 1.0)
 
     def _best_match(self, starts: Array, view: View, prior: MotionCandidate) -> Match | None:
@@ -269,7 +270,10 @@ def is_key_pose(last: Array, pose: Array) -> bool:
 
 
 def _passed(scan: LocalScan, points: Array, distance: float) -> npt.NDArray[np.bool_]:
-    """Mask (K,) of the local points (K, 2) m that beams of the scan pass by ``distance`` m, and not by noise."""
+    """Mask (K,) of the local points (K, 2) m behind which beams of the scan end, by more than ``distance`` m.
+
+    Three standard deviations of the noise are added in quadrature.
+    """
     ranges, beam, inside = _beams_towards(scan.view, se2.compose(scan.pose, scan.view.mount), points)
     margin = np.hypot(distance, 3 * scan.view.likelihood.deviation(ranges))
     return np.asarray(inside & (scan.view.nearest_of_neighbours[beam] > ranges + margin))

@@ -150,34 +150,31 @@ def motion_cost(noise: MotionNoise, candidates: list[MotionCandidate], pose: Arr
     much its largest log density is below that of an expected motion, plus (z² - `MAX_MOTION_SIGMAS`²) / 2, if that is
     positive, with the Mahalanobis distance z of the pose from its mean.
     """
-    widened, peaks = _peaks(candidates, covariance)
-    squares = np.array([each.squared_distance(pose) for each in widened])
-    costs = np.maximum(0.0, _expected_peak(noise, candidates, peaks) - peaks)
-    return float((costs + 0.5 * np.maximum(0.0, squares - MAX_MOTION_SIGMAS**2)).min())
+    peaks, excess = _peaks_and_excess(candidates, pose, covariance)
+    expected = min(peak for peak, each in zip(peaks, candidates, strict=True) if each.probability > noise.unexpected)
+    return float((np.maximum(0.0, expected - peaks) + excess).min())
 
 
-def motion_complexity(noise: MotionNoise, candidates: list[MotionCandidate], covariance: Array) -> float:
-    """How much more certain a pose with ``covariance`` (3, 3) is than its prediction by an expected motion, in nats.
+def motion_complexity(candidates: list[MotionCandidate], pose: Array, covariance: Array) -> float:
+    """How much more certain ``pose`` (3,), with ``covariance`` (3, 3), is than its prediction, in nats.
 
-    It is minus the logarithm of the probability that the prediction gave to the poses that the scan leaves.
+    It is minus the logarithm of the probability that the candidate which fits best gave to this pose and those that its
+    covariance leaves, plus the excess of `motion_cost` for a pose that is too far from it.
     """
-    _, peaks = _peaks(candidates, covariance)
-    return float(-0.5 * np.linalg.slogdet(covariance)[1] - _expected_peak(noise, candidates, peaks))
+    peaks, excess = _peaks_and_excess(candidates, pose, covariance)
+    return float((excess - peaks).min() - 0.5 * np.linalg.slogdet(covariance)[1])
 
 
-def _peaks(candidates: list[MotionCandidate], covariance: Array) -> tuple[list[MotionCandidate], Array]:
-    """The candidates with ``covariance`` (3, 3) added to theirs, and the logarithms of their peaks.
+def _peaks_and_excess(candidates: list[MotionCandidate], pose: Array, covariance: Array) -> tuple[Array, Array]:
+    """For each candidate, with ``covariance`` (3, 3) added to its own, two numbers in nats.
 
-    The latter include the candidate's probability, and lack the constant of the normal distribution.
+    The logarithm of its peak, with its probability but without the constant of the normal distribution; and
+    (z² - `MAX_MOTION_SIGMAS`²) / 2, if that is positive, with the Mahalanobis distance z of ``pose`` from its mean.
     """
     widened = [replace(each, covariance=each.covariance + covariance) for each in candidates]
     peaks = [np.log(each.probability) - 0.5 * np.linalg.slogdet(each.covariance)[1] for each in widened]
-    return widened, np.array(peaks)
-
-
-def _expected_peak(noise: MotionNoise, candidates: list[MotionCandidate], peaks: Array) -> float:
-    """The lowest of the ``peaks`` (K,) of the motions that are not unexpected."""
-    return float(min(peak for peak, each in zip(peaks, candidates, strict=True) if each.probability > noise.unexpected))
+    squares = np.array([each.squared_distance(pose) for each in widened])
+    return np.array(peaks), 0.5 * np.maximum(0.0, squares - MAX_MOTION_SIGMAS**2)
 
 
 def smooth_velocity(previous: Array | None, current: Array, period: float) -> Array:

@@ -6,12 +6,12 @@ subtracted. Surfaces that the map lacks may have moved.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
+from scipy.special import expit, logit
 
 from common.geometry import se2
 from common.geometry.se2 import Array
@@ -50,19 +50,19 @@ class Match:
         Each moves with probability ``moves``. If none has, the robot has moved as the match shows, which is
         ``motion_cost`` nats less probable than how it has moved otherwise.
         """
-        moved = moves**self.movable_surfaces
-        return moved / (moved + (1 - moved) * math.exp(-motion_cost))
+        return float(expit(logit(moves**self.movable_surfaces) + motion_cost))
 
-    def covariance(self, if_moved: Array, moved: float) -> Array:
-        """Covariance (3, 3) of the pose, if all movable surfaces have ``moved`` with this probability, otherwise none.
+    def covariance(self, if_moved: Array, moved_probability: float) -> Array:
+        """Covariance (3, 3) of the pose.
 
-        If they have, or there are none, it follows from the fixed points and from ``if_moved`` (3, 3), the mean squared
-        error of the pose without a match.
+        It is that of a mixture: all movable surfaces have moved, with ``moved_probability``, or none. If they have, or
+        there are none, it follows from the fixed points and from ``if_moved`` (3, 3), the mean squared error of the
+        pose without a match.
         """
         covariance = np.linalg.inv(self.information + 1e-6 / CAUCHY_SCALE_M**2 * np.eye(3))
         by_fixed = np.linalg.inv(self.fixed_information + np.linalg.inv(if_moved))
         squared_error = by_fixed + np.outer(self.fixed_step, self.fixed_step)
-        return np.asarray((1 - moved) * covariance + moved * squared_error)
+        return np.asarray((1 - moved_probability) * covariance + moved_probability * squared_error)
 
 
 @dataclass(frozen=True)

@@ -217,6 +217,9 @@ def test_moved_fraction():
     for _ in range(500):
         fraction.learn(6, 2, 0.1)
     assert fraction.probability == pytest.approx(0.75, abs=0.02)
+    after_a_gap = MovedFraction()
+    after_a_gap.learn(1, 0, 10.0)
+    assert after_a_gap.probability < 0.4
     for _ in range(3000):
         fraction.learn(0, 0, 0.07)
     assert fraction.probability == pytest.approx(before, abs=0.02)

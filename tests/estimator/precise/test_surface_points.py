@@ -104,6 +104,7 @@ def test_two_people_move_alike_less_often_than_one():
     assert covariance(two)[0, 0] < 0.3 * covariance(one)[0, 0]
     moved = 0.2**2
     assert two.moved_probability(0.2, 0.0) == pytest.approx(moved)
+    assert two.moved_probability(0.2, -1000.0) == 0
     # A motion of the robot that is as improbable as that makes both equally probable.
     assert two.moved_probability(0.2, np.log(1 / moved - 1)) == pytest.approx(0.5)
     assert covariance(two) - (1 - moved) * np.linalg.inv(two.information) == pytest.approx(
