@@ -513,8 +513,8 @@ class PreciseEstimator:
 
         log_kidnapping = max(each.log_evidence for each in self.hypotheses)
         log_kidnapping += float(np.log(self.settings.unknown_probability))
-        # If the robot was carried away just now, no motion had to be predicted, but all surfaces of the scan are new. This
-        # counts only together with the whole scan: in a search at this scan, and for places off the map.
+        # If the robot was carried away just now, no motion had to be predicted, but all surfaces of the scan are new.
+        # This counts only together with the whole scan: in a search at this scan, and for places off the map.
         self._log_carried = log_kidnapping + hypotheses[0].motion_complexity
         pairs = zip(self.hypotheses, hypotheses, strict=False)
         unknown_place = self._unknown_place
