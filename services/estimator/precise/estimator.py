@@ -635,7 +635,13 @@ class PreciseEstimator:
         significant = SIGNIFICANT_MAP_ERROR * view.likelihood.sigma
         if error < max(view.map_error, significant) and abs(offset - view.map_offset) < significant:
             return view
-        view = replace(view, map_error=error, correlated_fraction=precision.correlated_fraction, map_offset=offset)
+        view = replace(
+            view,
+            map_error=error,
+            correlated_fraction=precision.correlated_fraction,
+            map_offset=offset,
+            log_prior=view.log_prior if error > self._precision.map_error else 0.0,
+        )
         self.hypotheses, self._start = [], start
         return self._search_for_hypotheses([view])
 

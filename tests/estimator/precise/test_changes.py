@@ -400,6 +400,15 @@ def test_map_error_of_the_first_scan():
     assert np.mean(errors) < 40, errors
 
 
+@pytest.mark.parametrize("seed", [3527014, 3527019])
+def test_map_that_is_as_exact_as_assumed(seed):
+    """It is tracked from the first scan, even if this scan alone made larger errors more probable."""
+    trial = make_trial(CASES["noisy-map"], seed, 0.55)
+    made = prepare_factory(EstimatorOptions(trial.map_world, "precise", "exact"))(ScannerGeometry.of(trial.scanner))
+    made.restart(*trial.start)
+    assert all(made.update(observation).state == "tracking" for observation in trial.observations)
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_unknown_start_in_a_rough_map(seed):
     """At the first scan, the map may be less exact than the model states."""
