@@ -166,6 +166,8 @@ class PreciseEstimator:
         self._local_pose = np.zeros(3)  # in the frame of the local map
         self._ignored_beams = np.zeros(0, np.bool_)  # (B,) no evidence, see `LocalMapScan.ignored`
         self._log_change = 0.0  # nats, log probability of the changes since the last scan
+        self._changes = 0  # surfaces that have vanished or appeared since then
+        self._moved = self._stayed = 0  # surfaces that the map lacks, since the last key scan
         # nats, evidence that the robot was carried between the last scan and this one, without that of this scan
         self._log_carried = -np.inf
 
@@ -474,15 +476,13 @@ class PreciseEstimator:
         seen, appeared = self._local_map.find_seen_and_appeared(local, view, mapped)
         ignored = seen | appeared | small
         unmapped = view.returned & ~mapped & ~small
-        moved, stayed = view.count_surfaces(unmapped & appeared), view.count_surfaces(unmapped & seen)
-        self._moved_fraction.learn(moved, stayed, period)
+        self._moved, self._stayed = view.count_surfaces(unmapped & appeared), view.count_surfaces(unmapped & seen)
 
         # Changes are equally probable at all hypotheses. If there are suddenly more of them, a search is due soon.
         log_probability = 0.0  # of the number of changes
         if self._last:
-            changes = count_changes(self._last, LocalScan(local, view))
-            log_probability = self._change_rate.log_probability(changes, period)
-            self._change_rate.learn(changes, period)
+            self._changes = count_changes(self._last, LocalScan(local, view))
+            log_probability = self._change_rate.log_probability(self._changes, period)
         log_change = log_probability + _log_unmapped_surfaces(view, ~appeared | small)
         if log_probability < np.log(SUDDEN_CHANGE_PROBABILITY):
             self._search_interval = 1
@@ -680,6 +680,7 @@ class PreciseEstimator:
         """Starts a new local map at the present scan."""
         self._local_map.clear()
         self._local_pose, self._ignored_beams, self._log_change = np.zeros(3), view.surfaces.small, 0.0
+        self._changes = self._moved = self._stayed = 0
         self._unknown_place.scan_log_likelihood = _log_unmapped_surfaces(view, self._ignored_beams)
 
     def _add_hypotheses(self, found: list[TrackedHypothesis], view: View) -> None:
@@ -706,7 +707,6 @@ class PreciseEstimator:
         if evidence[best] > self.hypotheses[0].log_weight:
             self._search_interval = 1
             if carried[best] > stayed[best]:
-                self._change_rate.forget_latest()
                 self._restart_local_map(view)
                 unknown, off_map = self._unknown_place, self.settings.off_map_probability
                 unknown.allow_off_map(log_carried, off_map, unknown.scan_log_likelihood)
@@ -741,6 +741,9 @@ class PreciseEstimator:
             pose_at_stamp(each.pose, self._velocity(each, observation), period, observation) for each in self.hypotheses
         ]
         self._stamp, self._odom = observation.stamp, observation.odom
+        # Only now, because nothing around the robot has changed if a search has shown that it was carried.
+        self._change_rate.learn(self._changes, period)
+        self._moved_fraction.learn(self._moved, self._stayed, period)
         if self._is_key_scan_due():
             self._add_key_scan(view)
         self._last = LocalScan(self._local_pose, view)

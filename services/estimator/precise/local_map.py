@@ -80,7 +80,6 @@ class ChangeRate:
     """
 
     remembered: float = 0.0  # changes, forgotten exponentially
-    _remembered_before: float = 0.0  # without the changes learned last
 
     def log_probability(self, changes: int, period: float) -> float:
         """Log probability in nats of a number of changes within ``period`` s."""
@@ -90,12 +89,7 @@ class ChangeRate:
 
     def learn(self, changes: int, period: float) -> None:
         """Learns from a number of changes within ``period`` s, and forgets earlier ones exponentially."""
-        self._remembered_before = math.exp(-period / CHANGE_MEMORY_S) * self.remembered
-        self.remembered = self._remembered_before + changes
-
-    def forget_latest(self) -> None:
-        """Forgets the changes learned last, because the robot was carried: nothing around it has changed."""
-        self.remembered = self._remembered_before
+        self.remembered = math.exp(-period / CHANGE_MEMORY_S) * self.remembered + changes
 
 
 @dataclass

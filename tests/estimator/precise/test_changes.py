@@ -22,6 +22,7 @@ from services.estimator.factory import EstimatorOptions, ScannerGeometry, load_m
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.global_seeds import Seeds, thin_places
 from services.estimator.precise.hypotheses import NEAR_HEADING_RAD, NEAR_POSITION_M, probability_of_being_near
+from services.estimator.precise.local_map import MovedFraction
 from services.estimator.precise.motion_model import MotionCandidate
 from services.estimator.precise.precision import Precision
 from services.estimator.shared.generative_models import Expected, RayCaster
@@ -312,11 +313,35 @@ def test_people_who_start_to_walk_together(people, speed):
         assert k > 19 or found.state == "tracking", k
 
 
+@pytest.mark.parametrize("speed", [0.0, 0.8])
+def test_how_many_people_walk_is_learned(speed):
+    made, _ = estimator(corridor_with([]))
+    here = np.array([32.0, 1.0, 0.0])
+    made.restart(here, CLOSE / 100)
+    for k in range(45):
+        people = [(33.0 + speed * k / RATE, 0.5), (37.0 - speed * k / RATE, 1.5)]
+        scene = Scene.of(corridor_with(people), BEAMS, 3)
+        made.update(scene.observe(scene.clean(here[None])[0], k / RATE))
+    assert (made._moved_fraction.probability > MovedFraction().probability) == (speed > 0)
+
+
 def corridor_with(people):
     """A corridor of 60 m with one column in its middle, and people standing there."""
     column = {"box": {"center": (33.0, 0.1), "size": (0.3, 0.2)}}
     circles = [{"circle": {"center": person, "radius": 0.2}} for person in people]
     return World(name="corridor", boundary=[(0, 0), (60, 0), (60, 2), (0, 2)], obstacles=[column, *circles])
+
+
+def test_kidnapping_is_no_change_of_the_surroundings():
+    """Nothing is learned about how often surfaces change or move."""
+    made, scene = estimator(load_world("maze"))
+    here, there = scene.poses(2)
+    made.restart(here, CLOSE / 100)
+    drive(made, scene, np.tile(here, (10, 1)))
+    found = drive(made, scene, there[None], 10)[0]
+    assert tasks.is_at(found.pose, there)
+    assert made._change_rate.remembered == 0
+    assert made._moved_fraction.probability == MovedFraction().probability
 
 
 def test_odometry_with_the_wrong_sign(driven):
