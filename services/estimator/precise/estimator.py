@@ -213,7 +213,8 @@ class PreciseEstimator:
         hypotheses += self._find_alternatives(view, *fused[0], motions[0])
         is_motion_sudden = -hypotheses[0].motion_cost < np.log(SUDDEN_CHANGE_PROBABILITY)
         # Weights, also of the unknown place
-        self._weigh_hypotheses(view, hypotheses, match.local_pose, period)
+        expected = np.array([expected_motion(each).mean for each in motions])
+        self._weigh_hypotheses(view, hypotheses, expected, match.local_pose, period)
         self._scan = view, observation
         # Global search
         self._scans_since_search += 1
@@ -462,11 +463,12 @@ class PreciseEstimator:
         return motion_cost(self.settings.motion, predicted, hypothesis.pose, hypothesis.noise_covariance)
 
     def _weigh_hypotheses(
-        self, view: View, hypotheses: list[TrackedHypothesis], local: Array | None, period: float
+        self, view: View, hypotheses: list[TrackedHypothesis], expected: Array, local: Array | None, period: float
     ) -> None:
         """Weighs hypotheses by how well the map predicts those surfaces of the scan that were not seen before.
 
-        ``local`` (3,) is the pose in the local frame, or None if the motion does not come from the local map.
+        ``expected`` (N, 3) are the poses at which the N former hypotheses were expected. ``local`` (3,) is the pose in
+        the local frame, or None if the motion does not come from the local map.
         """
         if local is None:
             local = self._local_map.to_local(hypotheses[0].pose)
@@ -489,20 +491,24 @@ class PreciseEstimator:
 
         before = np.array([each.surroundings for each in hypotheses])
         log_likelihood, surroundings = _log_at_poses(view, poses, ignored, before)
+        # A motion costs less where the pose is less certain; that does not speak for a hypothesis.
+        losses = np.maximum(0.0, [each.motion_cost - hypotheses[0].motion_cost for each in hypotheses])
+        # If the scan fits as well where a hypothesis was expected, the robot may be there, without a jump.
+        count = len(self.hypotheses)
+        if losses[:count].any():
+            worse = _log_at_poses(view, poses[:count], small, before[:count])[0]
+            worse = worse - _log_at_poses(view, expected, small, before[:count])[0]
+            losses[:count] = np.clip(worse, 0.0, losses[:count])
         # Alternatives found for this scan come last in `hypotheses`, and have no counterpart in `self.hypotheses`. They
         # differ by the motion, against which surfaces that were seen before may speak. They do not speak for it: among
         # similar surfaces, the search may have missed the right match.
-        cost_at_best, cost_of_seen = hypotheses[0].motion_cost, np.zeros(len(hypotheses))
-        if len(hypotheses) > len(self.hypotheses):
+        if len(hypotheses) > count:
             of_seen = _log_at_poses(view, poses, appeared | small, before)[0] - log_likelihood
-            cost_of_seen[len(self.hypotheses) :] = np.maximum(0.0, of_seen[0] - of_seen)[len(self.hypotheses) :]
+            losses[count:] += np.maximum(0.0, of_seen[0] - of_seen)[count:]
         hypotheses = [
             replace(
                 hypothesis,
-                # A motion costs less where the pose is less certain; that does not speak for this hypothesis.
-                log_evidence=hypothesis.log_evidence
-                - max(0.0, hypothesis.motion_cost - cost_at_best)
-                - cost_of_seen[k],
+                log_evidence=hypothesis.log_evidence - losses[k],
                 explained=evidence.explained[k],
                 scan_log_likelihood=log_likelihood[k] + log_change,
                 scan_surroundings=surroundings[k],

@@ -206,21 +206,28 @@ def test_alternatives_explain_the_surfaces_seen_before():
     assert found[-1].state == "tracking"
 
 
-def test_a_motion_that_costs_less_is_no_gain():
-    """It costs less where the pose is less certain, but a jump of odometry is the same at all hypotheses."""
-    made, view, best = after_one_scan()
+def test_what_a_motion_costs():
+    """It counts as far as the motion of the best costs less, and as far as the scan fits worse without the motion.
 
-    def evidence(cost, cost_of_other):
-        """By how much more the evidence of another hypothesis 0.2 m away decreases than that of the best, in nats."""
-        other = replace(best, pose=best.pose + np.array([0.2, 0.0, 0.0]), motion_cost=cost_of_other)
+    A motion that costs less is no gain: a jump of odometry is the same at all hypotheses, but costs less where the pose
+    is less certain.
+    """
+    made, view, best = after_one_scan()
+    other = replace(best, pose=best.pose + np.array([0.11, 0.0, 0.0]))
+
+    def loss(cost, cost_of_best, expected):
+        """Nats that another hypothesis loses against the best one, after a motion from where it was ``expected``."""
         after = copy.deepcopy(made)
         after.hypotheses = [best, other]
-        after._weigh_hypotheses(view, [replace(best, motion_cost=cost), other], None, 0.1)
+        moved = [replace(best, motion_cost=cost_of_best), replace(other, motion_cost=cost)]
+        after._weigh_hypotheses(view, moved, np.stack([best.pose, expected]), None, 0.1)
         by_x = sorted(after.hypotheses, key=lambda each: each.pose[0])
         return by_x[0].log_evidence - by_x[1].log_evidence
 
-    assert evidence(8.0, 0.0) == pytest.approx(0)
-    assert evidence(0.0, 8.0) == pytest.approx(8)
+    turned = other.pose + np.array([0.0, 0.0, 0.5])  # there, the scan fits worse
+    assert loss(0.0, 5.0, turned) == pytest.approx(0)
+    assert loss(5.0, 0.0, turned) == pytest.approx(5)
+    assert loss(5.0, 0.0, other.pose) == pytest.approx(0)
 
 
 @pytest.fixture(scope="module")
