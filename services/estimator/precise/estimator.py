@@ -35,6 +35,7 @@ from services.estimator.precise.motion_model import (
     MotionCandidate,
     decouple,
     expected_motion,
+    expected_motions,
     fuse,
     limit_covariance,
     motion_complexity,
@@ -213,7 +214,8 @@ class PreciseEstimator:
         hypotheses += self._find_alternatives(view, *fused[0], motions[0])
         is_motion_sudden = -hypotheses[0].motion_cost < np.log(SUDDEN_CHANGE_PROBABILITY)
         # Weights, also of the unknown place
-        expected = np.array([expected_motion(each).mean for each in motions])
+        noise = self.settings.motion
+        expected = [np.array([motion.mean for motion in expected_motions(noise, each)]) for each in motions]
         self._weigh_hypotheses(view, hypotheses, expected, match.local_pose, period)
         self._scan = view, observation
         # Global search
@@ -240,7 +242,7 @@ class PreciseEstimator:
         views = [view] if self._precision.scans else [view, _with_rough_map(view)]
         view = self._search_for_hypotheses(views)
         if is_first and self._is_tracked():
-            view = self._search_with_map_error(view, start)
+            view = self._search_with_map_error(view, views[0].map_error, start)
         return self._finish_scan(view, observation)
 
     def predict(self, poses: Array, angles: Array) -> Predicted:
@@ -463,12 +465,12 @@ class PreciseEstimator:
         return motion_cost(self.settings.motion, predicted, hypothesis.pose, hypothesis.noise_covariance)
 
     def _weigh_hypotheses(
-        self, view: View, hypotheses: list[TrackedHypothesis], expected: Array, local: Array | None, period: float
+        self, view: View, hypotheses: list[TrackedHypothesis], expected: list[Array], local: Array | None, period: float
     ) -> None:
         """Weighs hypotheses by how well the map predicts those surfaces of the scan that were not seen before.
 
-        ``expected`` (N, 3) are the poses at which the N former hypotheses were expected. ``local`` (3,) is the pose in
-        the local frame, or None if the motion does not come from the local map.
+        For each former hypothesis, ``expected`` has the poses (J, 3) after its expected motions. ``local`` (3,) is the
+        pose in the local frame, or None if the motion does not come from the local map.
         """
         if local is None:
             local = self._local_map.to_local(hypotheses[0].pose)
@@ -492,13 +494,15 @@ class PreciseEstimator:
         before = np.array([each.surroundings for each in hypotheses])
         log_likelihood, surroundings = _log_at_poses(view, poses, ignored, before)
         # A motion costs less where the pose is less certain; that does not speak for a hypothesis.
-        losses = np.maximum(0.0, [each.motion_cost - hypotheses[0].motion_cost for each in hypotheses])
-        # If the scan fits as well where a hypothesis was expected, the robot may be there, without a jump.
-        count = len(self.hypotheses)
-        if losses[:count].any():
-            worse = _log_at_poses(view, poses[:count], small, before[:count])[0]
-            worse = worse - _log_at_poses(view, expected, small, before[:count])[0]
-            losses[:count] = np.clip(worse, 0.0, losses[:count])
+        costs = np.array([each.motion_cost for each in hypotheses])
+        losses, count = np.maximum(0.0, costs - costs[0]), len(self.hypotheses)
+        if count > 1 and costs[:count].any():
+            # Where the scan fits as well after an expected motion, the robot may be there, and did not jump.
+            owner = np.repeat(np.arange(count), [len(each) for each in expected])
+            fit = np.full(count, -np.inf)
+            np.maximum.at(fit, owner, _log_at_poses(view, np.concatenate(expected), small, before[owner])[0])
+            costs = np.clip(_log_at_poses(view, poses, small, before)[0][:count] - fit, 0.0, costs[:count])
+            losses[:count] = np.maximum(0.0, costs - costs[0])
         # Alternatives found for this scan come last in `hypotheses`, and have no counterpart in `self.hypotheses`. They
         # differ by the motion, against which surfaces that were seen before may speak. They do not speak for it: among
         # similar surfaces, the search may have missed the right match.
@@ -629,24 +633,26 @@ class PreciseEstimator:
             self._start_with(view, found, self.settings.off_map_probability, self.settings.off_map_probability)
         return view
 
-    def _search_with_map_error(self, view: View, start: tuple[Array, Array] | None) -> View:
-        """Searches again if the map's errors at the first scan are larger than assumed, or the offset differs.
+    def _search_with_map_error(self, view: View, assumed: float, start: tuple[Array, Array] | None) -> View:
+        """Searches again if the map's errors at the first scan differ from those of the ``view`` that fits it best.
 
-        Returns the view with these errors.
+        They were ``assumed`` in m before this scan. Returns the view with the errors that the scan shows.
         """
         precision = replace(self._precision)
         if not precision.scans:
             precision.learn_map_error(view, self.hypotheses[0].pose)
         error, offset = precision.map_error, precision.offset
         significant = SIGNIFICANT_MAP_ERROR * view.likelihood.sigma
-        if error < max(view.map_error, significant) and abs(offset - view.map_offset) < significant:
+        log_prior = view.log_prior if error > np.hypot(assumed, significant) else 0.0
+        as_in_view = error < max(view.map_error, significant) and abs(offset - view.map_offset) < significant
+        if as_in_view and log_prior == view.log_prior:
             return view
         view = replace(
             view,
             map_error=error,
             correlated_fraction=precision.correlated_fraction,
             map_offset=offset,
-            log_prior=view.log_prior if error > self._precision.map_error else 0.0,
+            log_prior=log_prior,
         )
         self.hypotheses, self._start = [], start
         return self._search_for_hypotheses([view])
@@ -750,6 +756,7 @@ class PreciseEstimator:
         # Only now, because nothing around the robot has changed if a search has shown that it was carried.
         self._change_rate.learn(self._changes, period)
         self._moved_fraction.learn(self._moved, self._stayed, period)
+        self._changes = self._moved = self._stayed = 0
         if self._is_key_scan_due():
             self._add_key_scan(view)
         self._last = LocalScan(self._local_pose, view)

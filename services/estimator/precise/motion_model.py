@@ -143,6 +143,11 @@ def expected_motion(candidates: list[MotionCandidate]) -> MotionCandidate:
     return candidates[-2] if len(candidates) > 1 else candidates[0]
 
 
+def expected_motions(noise: MotionNoise, candidates: list[MotionCandidate]) -> list[MotionCandidate]:
+    """The candidates that are more probable than a motion that nothing foretells."""
+    return [each for each in candidates if each.probability > noise.unexpected]
+
+
 def motion_cost(noise: MotionNoise, candidates: list[MotionCandidate], pose: Array, covariance: Array) -> float:
     """How much less probable a motion to ``pose`` (3,), known with ``covariance`` (3, 3), is than expected, in nats.
 
