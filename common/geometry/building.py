@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from common.errors import UserError, first_fault
-from common.geometry.floors import Floor, FloorName, Lift, moved, no_floor
+from common.geometry.floors import Floor, FloorName, Lift, translate_points, unknown_floor_message
 from common.geometry.occupancy_grid import MAX_CELLS, UNKNOWN, OccupancyGrid
 from common.geometry.shapes import Degrees, Obstacle, WorldName, WorldPart
 from common.limits import Coordinate
@@ -88,7 +88,7 @@ def lay_out(building: BuildingFile, worlds: Mapping[str, World]) -> dict[str, An
     else:
         fields["grid"], offsets = _combine_grids({name: world.grid for name, world in worlds.items() if world.grid})
     floors = {
-        name: Floor(name=name, offset=offsets[name], boundary=moved(world.boundary, offsets[name]).tolist())
+        name: Floor(name=name, offset=offsets[name], boundary=translate_points(world.boundary, offsets[name]).tolist())
         for name, world in worlds.items()
     }
     start = building.start
@@ -112,7 +112,7 @@ def lay_out(building: BuildingFile, worlds: Mapping[str, World]) -> dict[str, An
 def _start_in_map(start: FloorStart, floors: Mapping[str, Floor]) -> dict[str, float]:
     """Fields of the World's start."""
     if start.floor not in floors:
-        raise UserError(f"start: {no_floor(start.floor, floors)}")
+        raise UserError(f"start: {unknown_floor_message(start.floor, floors)}")
     floor = floors[start.floor]
     if (error := floor.placement_error((start.x, start.y))) is not None:
         raise UserError(f"start: {error}")
@@ -165,11 +165,11 @@ def _obstacle_in_map(obstacle: Obstacle, floor: str, offset: tuple[float, float]
     """Fields of a floor's obstacle, moved to map and with the floor's name before its own."""
     fields = obstacle.model_dump(exclude_none=True)
     if obstacle.polygon is not None:
-        fields["polygon"] = moved(obstacle.polygon, offset).tolist()
+        fields["polygon"] = translate_points(obstacle.polygon, offset).tolist()
     elif obstacle.box is not None:
-        fields["box"]["center"] = moved(obstacle.box.center, offset).tolist()
+        fields["box"]["center"] = translate_points(obstacle.box.center, offset).tolist()
     elif obstacle.circle is not None:
-        fields["circle"]["center"] = moved(obstacle.circle.center, offset).tolist()
+        fields["circle"]["center"] = translate_points(obstacle.circle.center, offset).tolist()
     if obstacle.name:
         fields["name"] = f"{floor}/{obstacle.name}"
     return fields

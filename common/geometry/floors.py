@@ -1,4 +1,7 @@
-"""The floors of a building and its lifts, as data."""
+"""The floors of a building and its lifts.
+
+All floors lie side by side in one frame, `map` (see `building`), so a point belongs to at most one of them.
+"""
 
 from __future__ import annotations
 
@@ -45,17 +48,17 @@ class Floor(WorldPart):
         return bool(x0 <= x <= x1 and y0 <= y <= y1)
 
     def to_map(self, places: npt.ArrayLike) -> Array:
-        """Points (..., 2) or poses (..., 3) in the floor's frame, in map."""
-        return moved(places, self.offset)
+        """Transforms points (..., 2) or poses (..., 3) from the floor's frame to map."""
+        return translate_points(places, self.offset)
 
     def from_map(self, places: npt.ArrayLike) -> Array:
-        """Inverse of `to_map`."""
-        return moved(places, (-self.offset[0], -self.offset[1]))
+        """Transforms points (..., 2) or poses (..., 3) from map to the floor's frame."""
+        return translate_points(places, (-self.offset[0], -self.offset[1]))
 
     def placement_error(self, places: npt.ArrayLike) -> str | None:
         """The reason why points (N, 2) or poses (N, 3) in the floor's frame are not all on it, or None if they are."""
         for place in np.atleast_2d(places):
-            if not self.contains(self.to_map(place)):  # it may be on the next floor in map
+            if not self.contains(self.to_map(place)):  # it may be on a neighbouring floor in map
                 edges = self.from_map(np.reshape(self.bounds, (2, 2)))
                 (x0, y0), (x1, y1) = (np.round(edges, 2) + 0.0).tolist()
                 where = f"which reaches from ({x0:g}, {y0:g}) to ({x1:g}, {y1:g}) m"
@@ -69,14 +72,17 @@ def floor_at(floors: Iterable[Floor], place: npt.ArrayLike) -> Floor | None:
 
 
 def place_text(floors: Iterable[Floor], place: npt.ArrayLike, decimals: int = 2) -> str:
-    """A point (2,) or pose (3,) in map for messages to users: on a floor, its name and coordinates in its frame."""
+    """A point (2,) or pose (3,) in map for messages to users: its coordinates in the frame of its floor, and the floor.
+
+    Of a place that is on no floor, the coordinates in map.
+    """
     floor = floor_at(floors, place)
     position = np.asarray(place, float) if floor is None else floor.from_map(place)
     x, y = np.round(position, decimals)[:2] + 0.0  # no -0.00
     return f"({x:.{decimals}f}, {y:.{decimals}f})" + ("" if floor is None else f" on floor {floor.name!r}")
 
 
-def no_floor(name: str, floors: Iterable[str]) -> str:
+def unknown_floor_message(name: str, floors: Iterable[str]) -> str:
     """The message for an unknown floor ``name``."""
     return f"there is no floor {name!r}: choose one of {', '.join(floors)}"
 
@@ -89,7 +95,7 @@ def check_floors(floors: list[Floor], lifts: list[dict[str, tuple[float, float]]
     for number, lift in enumerate(lifts, 1):
         for name, place in lift.items():
             if name not in known:
-                raise ValueError(f"lift {number}: {no_floor(name, known)}")
+                raise ValueError(f"lift {number}: {unknown_floor_message(name, known)}")
             if (error := known[name].placement_error(place)) is not None:
                 raise ValueError(f"lift {number}: {error}")
 
@@ -106,7 +112,7 @@ def corners_of(bounds: tuple[float, float, float, float]) -> list[tuple[float, f
     return [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
 
 
-def moved(places: npt.ArrayLike, offset: tuple[float, float]) -> Array:
+def translate_points(places: npt.ArrayLike, offset: tuple[float, float]) -> Array:
     """Points (..., 2) or poses (..., 3) moved by an offset in m."""
     result = np.array(places, float)
     result[..., :2] += offset

@@ -15,7 +15,16 @@ from pydantic import Field, ValidationError, model_validator
 
 from common.errors import UserError, first_fault
 from common.geometry import building, ros_map
-from common.geometry.floors import Floor, Lift, bounds_of, check_floors, corners_of, floor_at, no_floor, place_text
+from common.geometry.floors import (
+    Floor,
+    Lift,
+    bounds_of,
+    check_floors,
+    corners_of,
+    floor_at,
+    place_text,
+    unknown_floor_message,
+)
 from common.geometry.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from common.geometry.shapes import Box, Circle, Degrees, Obstacle, Ring, WorldName, WorldPart, check_ring
 from common.limits import Coordinate
@@ -127,10 +136,10 @@ class World(WorldPart):
                 return floor
         if not self.floors:
             raise UserError(f"there is no floor {name!r}: world {self.name!r} has no floors")
-        raise UserError(no_floor(name, [floor.name for floor in self.floors]))
+        raise UserError(unknown_floor_message(name, [floor.name for floor in self.floors]))
 
     def to_map(self, places: npt.ArrayLike, floor: str) -> Array:
-        """Points (..., 2) or poses (..., 3) in the frame of a floor, in map; if its name is empty, they are in map.
+        """Transforms points (..., 2) or poses (..., 3) from the frame of a floor (from map, if it is empty) to map.
 
         Raises UserError if there is no floor of that name, or a place is off the floor.
         """

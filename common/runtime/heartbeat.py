@@ -37,7 +37,7 @@ class Heartbeat:
         self._times.update(counts, now)
         partial = self._path.with_suffix(".partial")
         with suppress(OSError):
-            partial.write_text(json.dumps(asdict(Report(now, linked, note, idle, self._times.last))))
+            partial.write_text(json.dumps(asdict(Report(now, linked, note, idle, self._times.increased_at))))
             partial.replace(self._path)
 
 

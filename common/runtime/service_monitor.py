@@ -1,6 +1,6 @@
 """Watches which services of a robot are alive, since when, and what is wrong with them.
 
-`presage top`, `presage doctor`, the page and the health checks of containers all use it and only show its
+`presage top`, `presage doctor`, the live page and the health checks of containers all use it and only show its
 results. It imports only the standard library, so that a health check starts in 20 ms. Times are s of a monotonic clock.
 """
 
@@ -19,14 +19,15 @@ OPTIONAL_SERVICES = ("recorder", "viewer")
 REPLAY = "replay"  # publishes the messages of all other services, and no health messages
 SUBSTITUTES = {"simulator": "bridge_ros2", "estimator": "mapper"}  # services that take the place of another
 
-REPORT_TIMEOUT_S = 2.5  # a service is late if its last report (health message or heartbeat, one a second) is older
+REPORT_TIMEOUT_S = 2.5  # a service is silent if its last report (health message or heartbeat, one a second) is older
 INPUT_TIMEOUT_S = 2.0  # inputs newer than this count as arriving
 RESULT_TIMEOUT_S = 5.0  # without a result while inputs arrive, a service is faulty
 FORGET_AFTER_S = 30.0  # a service that ended longer ago is no longer listed
 MAX_SERVICES = 50  # limits the memory if a program publishes health messages with made-up names
 
-# The input (or None) and the result of each service: topic (or * for any), and kind of count.
-RESULTS = {
+# For each service, the input and the result that must follow while the input arrives; None: it is always expected. Each
+# is a topic (* for any) and the kind of its count. `remote` watches a robot outside its own containers.
+EXPECTED_RESULTS = {
     "simulator": (None, ("scan", "published")),
     "bridge_ros2": (None, ("scan", "published")),
     "replay": (None, ("scan", "published")),
@@ -38,7 +39,7 @@ RESULTS = {
 }
 COUNT_KINDS = ("received", "published", "written")
 
-LivenessState = Literal["alive", "late", "absent"]
+LivenessState = Literal["alive", "silent", "absent"]
 
 
 @dataclass(frozen=True)
@@ -49,12 +50,12 @@ class Report:
     linked: bool = True  # connected to at least one other session
     note: str = ""
     idle: bool = False  # publishes no results on purpose
-    last: dict[str, dict[str, float]] = field(default_factory=dict)  # by key and kind: when the count last increased
+    increased_at: dict[str, dict[str, float]] = field(default_factory=dict)  # when each count last did, by key and kind
 
 
 @dataclass(frozen=True)
 class ServiceStatus:
-    """The state of one service. A late service is connected but does not report."""
+    """The state of one service. A silent service is connected but has stopped reporting."""
 
     name: str
     state: LivenessState
@@ -64,8 +65,8 @@ class ServiceStatus:
     age: float | None = None  # s since its last health message
 
     @property
-    def reported(self) -> bool:
-        """Whether a health message has come, or none is expected."""
+    def has_started(self) -> bool:
+        """Whether its first health message has come; always true for a replay, which sends none."""
         return self.health is not None or self.name == REPLAY
 
     @property
@@ -84,9 +85,9 @@ def find_problem(service: str, robot: str, report: Report, now: float, default_t
         return f"no report for {age:.0f} s: it is stopped, hangs, or gets no processor time"
     if not report.linked:
         return "not connected to any session; is the router running?"
-    if service not in RESULTS or report.idle:
+    if service not in EXPECTED_RESULTS or report.idle:
         return ""
-    needed, (topic, kind) = RESULTS[service]
+    needed, (topic, kind) = EXPECTED_RESULTS[service]
     if needed is not None and now - _last_time(report, robot, *needed) > INPUT_TIMEOUT_S:
         return ""
     age = now - max(default_time, _last_time(report, robot, topic, kind))
@@ -99,7 +100,8 @@ def find_problem(service: str, robot: str, report: Report, now: float, default_t
 def _last_time(report: Report, robot: str, topic: str, kind: str) -> float:
     """Time at which the count of a topic last increased."""
     stem = f"presage/{robot}/"
-    rows = [row for key, row in report.last.items() if key.startswith(stem) and topic in ("*", key.removeprefix(stem))]
+    times = report.increased_at.items()
+    rows = [row for key, row in times if key.startswith(stem) and topic in ("*", key.removeprefix(stem))]
     return max((row[kind] for row in rows if kind in row), default=-math.inf)
 
 
@@ -119,7 +121,7 @@ class CountTimes:
     """Remembers when each count of a service last increased."""
 
     def __init__(self) -> None:
-        self.last: dict[str, dict[str, float]] = {}  # by key and kind
+        self.increased_at: dict[str, dict[str, float]] = {}  # by key and kind
         self._counts: dict[tuple[str, str], int] = {}
 
     def update(self, counts: Mapping[str, Mapping[str, int]], now: float) -> None:
@@ -128,7 +130,7 @@ class CountTimes:
             for kind in COUNT_KINDS:
                 count = row.get(kind, 0)
                 if count > self._counts.get((key, kind), 0):
-                    self.last.setdefault(key, {})[kind] = now
+                    self.increased_at.setdefault(key, {})[kind] = now
                 self._counts[key, kind] = count
 
 
@@ -142,7 +144,7 @@ class _Service:
     """Observations of one run of a service."""
 
     began: float  # first sign of life
-    report: Report  # a first one without contents, until a health message comes
+    report: Report  # empty until the first health message
     token_at: float = -math.inf  # when its liveliness token was last seen
     has_token: bool = False
     health: Health | None = None
@@ -164,7 +166,7 @@ class ServiceMonitor:
     def set_alive(self, names: Collection[str], now: float) -> None:
         """Stores the names of all services that have a liveliness token. Call it about once a second."""
         for name in names:
-            if (service := self._service(name, now)) is not None:
+            if (service := self._find_or_add(name, now)) is not None:
                 service.has_token, service.token_at = True, now
         for name, service in list(self._services.items()):
             service.has_token = name in names
@@ -173,15 +175,15 @@ class ServiceMonitor:
 
     def add_health(self, health: Health, now: float) -> None:
         """Stores a health message."""
-        service = self._service(health.service, now)
+        service = self._find_or_add(health.service, now)
         if service is not None and service.health is not None and health.uptime < service.health.uptime:
             self._services.pop(health.service)  # the service was restarted
-            service = self._service(health.service, now)
+            service = self._find_or_add(health.service, now)
         if service is None:
             return
         service.times.update(counts_of(health), now)
         service.health = health
-        service.report = Report(now, note=health.note, idle=health.idle, last=service.times.last)
+        service.report = Report(now, note=health.note, idle=health.idle, increased_at=service.times.increased_at)
 
     def add_scan(self, now: float) -> None:
         """Stores the arrival of a scan. While scans arrive, as from a robot's own driver, no simulator is needed."""
@@ -197,11 +199,14 @@ class ServiceMonitor:
         return [name for name in REQUIRED_SERVICES if not self.present(name, now) and self._is_needed(name, now)]
 
     def present(self, name: str, now: float) -> bool:
-        """Whether a service is alive or late."""
+        """Whether a service is alive or silent."""
         return name in self._services and self._services[name].present(now)
 
-    def _service(self, name: str, now: float) -> _Service | None:
-        """The record of a service that shows a sign of life; None if there are too many services."""
+    def _find_or_add(self, name: str, now: float) -> _Service | None:
+        """The record of a service that has just shown a sign of life; a new one if it was absent.
+
+        None if there are `MAX_SERVICES`.
+        """
         usual = name in REQUIRED_SERVICES or name in OPTIONAL_SERVICES
         if name not in self._services and len(self._services) >= MAX_SERVICES and not usual:
             return None
@@ -219,13 +224,14 @@ class ServiceMonitor:
         service = self._services.get(name)
         if service is None:
             return ServiceStatus(name, "absent", "not running" if self._is_needed(name, now) else "")
-        # The token of a replay is all that is known about it.
-        health, report = service.health, Report(now, idle=True) if name == REPLAY else service.report
+        # A replay publishes no health messages: while it is connected, it counts as reporting.
+        report = Report(now, idle=True) if name == REPLAY else service.report
+        health = service.health
         age = now - report.time if health is not None else None
         if not service.present(now):
             since = max(service.token_at, service.report.time)
             return ServiceStatus(name, "absent", f"gone for {now - since:.0f} s", since, health, age)
         problem = find_problem(name, self.robot, report, now, default_time=service.began)
         if now - report.time > REPORT_TIMEOUT_S:
-            return ServiceStatus(name, "late", problem, report.time + REPORT_TIMEOUT_S, health, age)
+            return ServiceStatus(name, "silent", problem, report.time + REPORT_TIMEOUT_S, health, age)
         return ServiceStatus(name, "alive", problem, service.began, health, age)

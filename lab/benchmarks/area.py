@@ -1,4 +1,7 @@
-"""`presage bench area`."""
+"""`presage bench area`: how a search from one scan depends on the area of the map.
+
+Generated office buildings stand side by side in one map.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,7 @@ from rich.table import Table
 
 from common.geometry import se2
 from common.geometry.se2 import Array
+from common.robot.robot import Robot
 from lab.accuracy.runner import quick_field
 from lab.accuracy.scenes import TIM571, Scene
 from lab.accuracy.tasks import is_at
@@ -33,18 +37,19 @@ from services.estimator.shared.interface import Observation
 SCANNER = TIM571.with_beams(622)
 SCANS = 300  # from which the field of each building is learned
 CELL_M = 0.04
+TYPICAL_BUILDING_M2 = 150.0
 GAP_CELLS = 10  # between buildings
 SHARES = ("found", "wrongly_tracking", "ambiguous")
 
 
 @dataclass(frozen=True)
-class Part:
+class LearnedBuilding:
     """One building of a site: its learned field, where the laser can be, and its free area."""
 
     seed: int
-    phi: np.ndarray[tuple[int, ...], np.dtype[np.float32]]  # (ny, nx) m
+    phi: np.ndarray[tuple[int, ...], np.dtype[np.float32]]  # (ny, nx) m, distance to the nearest surface
     origin: Array  # (2,) m, of node (0, 0)
-    scales: Array
+    scales: Array  # m, see `FieldModel`
     places: Array  # (S, 2) m
     area: float  # m²
 
@@ -53,7 +58,7 @@ class Part:
 class Site:
     """Buildings side by side, in one map."""
 
-    parts: list[Part]
+    buildings: list[LearnedBuilding]
     offsets: Array  # (K, 2) m in map, of each building's own origin
     model: FieldModel
     seeds: Seeds
@@ -61,7 +66,7 @@ class Site:
     @property
     def area(self) -> float:
         """Free area in m²."""
-        return sum(part.area for part in self.parts)
+        return sum(building.area for building in self.buildings)
 
 
 def bench_area(
@@ -71,45 +76,45 @@ def bench_area(
     check_file(json_file, "--json")
     make_folder(out)
     wanted = sorted(float(area) for area in areas.split(","))
-    parts = _parts(wanted[-1], seed, out, workers, console)
+    buildings = _learn_buildings(wanted[-1], seed, out, workers, console)
     rows = []
     for area in wanted:
-        count = int(np.searchsorted(np.cumsum([part.area for part in parts]), area)) + 1
-        site = site_of(parts[:count])
-        rows += [_measure(site, places, share, seed, console) for share in dict.fromkeys((0.0, moved))]
-    table = Table(title=f"one scan of {SCANNER.beams} beams, {places} places, processor time", title_justify="left")
+        count = int(np.searchsorted(np.cumsum([building.area for building in buildings]), area)) + 1
+        site = join_buildings(buildings[:count])
+        rows += [_measure(site, places, fraction, seed, console) for fraction in dict.fromkeys((0.0, moved))]
+    printed = Table(title=f"one scan of {SCANNER.beams} beams, {places} places, processor time", title_justify="left")
     for name in rows[0]:
-        table.add_column(name, justify="right")
+        printed.add_column(name, justify="right")
     for row in rows:
-        table.add_row(*(f"{value:.4g}" for value in row.values()))
-    console.print(table)
+        printed.add_row(*(f"{value:.4g}" for value in row.values()))
+    console.print(printed)
     write_json(json_file, {"rows": rows, **provenance(seed)})
     return 0
 
 
-def _parts(area: float, seed: int, out: Path, workers: int, console: Console) -> list[Part]:
-    """Buildings with at least ``area`` m²; learned now, unless the folder has them."""
-    parts: list[Part] = []
+def _learn_buildings(area: float, seed: int, out: Path, workers: int, console: Console) -> list[LearnedBuilding]:
+    """Buildings with at least ``area`` m² in sum: those in the folder ``out``, and the others learned now."""
+    buildings: list[LearnedBuilding] = []
     with pool(workers) as executor:
-        while (missing := area - sum(part.area for part in parts)) > 0:
-            numbers = range(seed * 1000 + len(parts), seed * 1000 + len(parts) + max(1, int(missing / 150)))
-            learned = executor.map(partial(_part, out), numbers)
-            parts += track(learned, "learning", total=len(numbers), console=console, transient=True)
-    return parts
+        while (missing := area - sum(building.area for building in buildings)) > 0:
+            first, count = seed * 1000 + len(buildings), max(1, int(missing / TYPICAL_BUILDING_M2))
+            learned = executor.map(partial(_learn_building, out), range(first, first + count))
+            buildings += track(learned, "learning", total=count, console=console, transient=True)
+    return buildings
 
 
 @lru_cache(maxsize=1000)
 def _building(seed: int) -> Building:
-    """`make_building`, kept because every place needs one, and to furnish it takes a second."""
+    """Caches `make_building`: each trial needs a building, and furnishing one takes a second."""
     return make_building(seed)
 
 
-def _part(out: Path, seed: int) -> Part:
+def _learn_building(out: Path, seed: int) -> LearnedBuilding:
     file = out / f"building-{seed}.npz"
     if not file.exists():
         world, rng, geometry = _building(seed).world, np.random.default_rng(seed), ScannerGeometry.of(SCANNER)
         model = quick_field(world, geometry, rng, SCANS)
-        visited = se2.compose(world.sample_poses(SCANS, rng, 0.27), geometry.mount)[:, :2]
+        visited = se2.compose(world.sample_poses(SCANS, rng, Robot().radius), geometry.mount)[:, :2]
         places = seed_places(model.field, visited)
         field = model.field.with_solids(places)
         np.savez(
@@ -122,35 +127,38 @@ def _part(out: Path, seed: int) -> Part:
         )
     with np.load(file) as data:
         values = dict(data)
-    return Part(seed=seed, **values | {"area": float(values["area"])})
+    return LearnedBuilding(seed=seed, **values | {"area": float(values["area"])})
 
 
-def site_of(parts: list[Part]) -> Site:
+def join_buildings(buildings: list[LearnedBuilding]) -> Site:
     """Places the buildings in rows."""
-    width = max(*(part.phi.shape[1] for part in parts), int(np.sqrt(sum(part.phi.size for part in parts))))
+    width = max(
+        *(building.phi.shape[1] for building in buildings),
+        int(np.sqrt(sum(building.phi.size for building in buildings))),
+    )
     corners, row, column, height = [], 0, 0, 0
-    for part in parts:
-        if column + part.phi.shape[1] > width:
+    for building in buildings:
+        if column + building.phi.shape[1] > width:
             row, column, height = row + height + GAP_CELLS, 0, 0
         corners.append((row, column))
-        column, height = column + part.phi.shape[1] + GAP_CELLS, max(height, part.phi.shape[0])
-    phi = np.full((row + height, width + GAP_CELLS), -1.0, np.float32)
-    for part, (i, j) in zip(parts, corners, strict=True):
-        phi[i : i + part.phi.shape[0], j : j + part.phi.shape[1]] = part.phi
-    offsets = np.array(corners)[:, ::-1] * CELL_M - [part.origin for part in parts]
-    scales = np.sqrt(np.mean([part.scales**2 for part in parts], axis=0))
+        column, height = column + building.phi.shape[1] + GAP_CELLS, max(height, building.phi.shape[0])
+    phi = np.full((row + height, width + GAP_CELLS), -1.0, np.float32)  # solid between the buildings
+    for building, (i, j) in zip(buildings, corners, strict=True):
+        phi[i : i + building.phi.shape[0], j : j + building.phi.shape[1]] = building.phi
+    offsets = np.array(corners)[:, ::-1] * CELL_M - [building.origin for building in buildings]
+    scales = np.sqrt(np.mean([building.scales**2 for building in buildings], axis=0))
     model = FieldModel(DistanceField(phi, (0.0, 0.0), CELL_M), scales)
-    places = np.concatenate([part.places + offset for part, offset in zip(parts, offsets, strict=True)])
-    return Site(parts, offsets, model, Seeds.at(model, places))
+    places = np.concatenate([building.places + offset for building, offset in zip(buildings, offsets, strict=True)])
+    return Site(buildings, offsets, model, Seeds.at(model, places))
 
 
 def _measure(site: Site, places: int, moved: float, seed: int, console: Console) -> dict[str, Any]:
     """One row of the table."""
-    rng = np.random.default_rng([seed, len(site.parts), round(100 * moved)])
+    rng = np.random.default_rng([seed, len(site.buildings), round(100 * moved)])
     estimator = PreciseEstimator(
         site.model, site.seeds, np.array(SCANNER.mount), ScannerGeometry.of(SCANNER).likelihood()
     )
-    _trial(estimator, *_scan(site, moved, rng))  # compiles
+    _trial(estimator, *_scan(site, moved, rng))  # a warm-up, as numba compiles now
     title = f"{site.area:.0f} m², {moved:.0%} moved"
     trials = [
         _trial(estimator, *_scan(site, moved, rng))
@@ -188,9 +196,9 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def _scan(site: Site, moved: float, rng: np.random.Generator) -> tuple[Observation, Array]:
     """A scan at a random place, and the pose (3,) in map."""
-    areas = np.array([part.area for part in site.parts])
+    areas = np.array([building.area for building in site.buildings])
     k = int(rng.choice(len(areas), p=areas / areas.sum()))
-    building = _building(site.parts[k].seed)
+    building = _building(site.buildings[k].seed)
     if moved:
         building = changes.move_furniture(building, moved, rng)
     scene = Scene(building.world, SCANNER, rng)

@@ -81,10 +81,10 @@ class HealthBoard:
             word = "gone" if service.since is not None else "missing" if service.problem else "not running"
             start = f"start it: {start_command(service.name, self.robot, self.connect)}"
             return ServiceRow(service, word, note=start)
-        if service.state == "late":
+        if service.state == "silent":
             return ServiceRow(service, "silent", note=service.text)
         if service.health is None:
-            return ServiceRow(service, "alive" if service.reported else "starting", note=service.text)
+            return ServiceRow(service, "alive" if service.has_started else "starting", note=service.text)
         rows = [(row, rate) for row in service.health.topics if (rate := self._rate(row.key, row.rate)) is not None]
         latencies = self._latencies.get(service.name)
         return ServiceRow(

@@ -50,7 +50,7 @@ def _presence(observation: BusObservation) -> Iterator[Finding]:
             advice = f"start it with: {start_command(service.name, observation.robot, observation.connect)}"
             needed = service.name in observation.monitor.missing(observation.seconds)
             yield Finding("missing", False if needed else None, f"{name}: not running", service.name, advice)
-        elif service.state == "late":
+        elif service.state == "silent":
             advice = "see its log; resume it or restart it"
             yield Finding("frozen", False, f"{name}: {service.problem}", where, advice)
         elif service.problem:

@@ -101,7 +101,7 @@ class BoardFeed:
         """Whether a health message of every live service has come."""
         now = time.monotonic()
         services = [each for board in self.boards.values() for each in board.monitor.services(now)]
-        return all(each.reported for each in services if each.state != "absent")
+        return all(each.has_started for each in services if each.state != "absent")
 
     def _take(self, sample: Sample) -> None:
         topic, now = topic_of(sample.key), time.monotonic()

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 DISCOVERY_PERIOD_S = 0.5  # between two checks for new and absent robots
 RETRY_PERIOD_S = 10.0  # after which a robot that could not be served is tried again
 HEALTH_CHECK_PERIOD_S = 0.05  # between two checks for due health messages
-MAX_MESSAGES_PER_TURN = 20  # handled for one robot before the next one
+MAX_MESSAGES_PER_STEP = 20  # handled for one robot before the next one
 INBOX_MESSAGES, INBOX_BYTES = 1000, 1 << 24  # of one robot
 # A tenth of Python's default, because tracking may wait this long for the search thread.
 THREAD_SWITCH_INTERVAL_S = 5e-4
@@ -60,7 +60,7 @@ class FleetRobot(EstimatorService):
 
     def update_estimator(self, scan: Scan, estimator: PoseEstimator, observation: Observation) -> None:
         """Tracks at once, and starts a search if one is needed."""
-        self.publish_search()  # of a scan that was handled late, because its odometry did not arrive
+        self.finish_search()  # of the last scan, if its odometry did not arrive until this one came
         if not isinstance(estimator, SearchingEstimator):
             super().update_estimator(scan, estimator, observation)
         elif (posterior := estimator.track(observation)) is not None:
@@ -72,7 +72,7 @@ class FleetRobot(EstimatorService):
         """Becomes active, unless another process serves this robot."""
         self.active = self.loop.try_start()
 
-    def publish_search(self) -> None:
+    def finish_search(self) -> None:
         """Waits for the search, if there is one, and publishes its result. Raises the exception of a failed search."""
         search, self.search = self.search, None
         if search is not None and self._searched_scan is not None and self.estimator is not None:
@@ -104,7 +104,7 @@ class FleetService(Service):
         if settings.initial_pose:
             raise UserError("--initial-pose is for one robot: with --robots, set each pose with `presage relocalise`")
         if settings.metrics:
-            self.log.warning("the estimator of several robots serves no metrics: its robots report health instead")
+            self.log.warning("--metrics is ignored with --robots: read the health messages of each robot instead")
 
     def make_loop(self, bus: Bus) -> Runnable:
         """Creates the loop that serves all robots; see Service."""
@@ -130,8 +130,9 @@ class FleetLoop:
             raise UserError(f"{len(self.names)} robots are named, --max-robots is {settings.max_robots}: raise it")
         self.log = logger(FleetService.name)
         self._robots: dict[str, FleetRobot] = {}
-        self._alive: dict[tuple[str, str], bool] = {}  # robot and service; changed by zenoh's threads
-        self._unserved_scans = Inbox(capacity=10 * settings.max_robots)  # of all robots that match a pattern
+        self._alive: set[tuple[str, str]] = set()  # robot and service; changed by zenoh's threads
+        # Scans of all robots that match a pattern, served or not; only their keys are used, to find robots
+        self._found_scans = Inbox(capacity=10 * settings.max_robots)
         self._changed = threading.Condition()  # notified of every message and every search that ended
         self._searches = ThreadPoolExecutor(1, "search")
         self._may_log = LogRateLimiter()
@@ -146,11 +147,11 @@ class FleetLoop:
         self._add_named_robots()
         self.bus.watch_robots(self._note_liveliness)
         for pattern in self.patterns:
-            self.bus.subscribe(SCAN, self._unserved_scans, robot=key_expression(pattern))
+            self.bus.subscribe(SCAN, self._found_scans, robot=key_expression(pattern))
         self.log.info("ready for robots", named=len(self.names), patterns=",".join(self.patterns) or "none")
         try:
             while not self._stopping:
-                self._turn()
+                self._step()
         finally:
             self._searches.shutdown(cancel_futures=True)
 
@@ -159,7 +160,8 @@ class FleetLoop:
         self._stopping = True
         self._wake()
 
-    def _turn(self) -> None:
+    def _step(self) -> None:
+        """Serves each robot once, and publishes health and looks for robots when it is time."""
         for robot in list(self._robots.values()):
             self._guard(robot, partial(self._serve, robot))
         now = time.monotonic()
@@ -179,16 +181,19 @@ class FleetLoop:
 
     def _serve(self, robot: FleetRobot) -> None:
         """Handles the messages of a robot in order, until a search has to end first."""
-        for _ in range(MAX_MESSAGES_PER_TURN):
+        for _ in range(MAX_MESSAGES_PER_STEP):
             if not robot.has_work():
                 return
             if robot.search is not None:
-                robot.loop.run_guarded(robot.publish_search)
+                robot.loop.run_guarded(robot.finish_search)
             else:
                 robot.loop.handle(robot.loop.inbox.get(0))
 
     def _guard(self, robot: FleetRobot, work: Callable[[], None]) -> None:
-        """Does some work for a robot. An error of the user's, such as another protocol, concerns this robot only."""
+        """Does some work for a robot. On a UserError, such as another protocol version, only this robot is removed.
+
+        It is tried again after `RETRY_PERIOD_S`.
+        """
         try:
             work()
         except UserError as error:
@@ -197,7 +202,7 @@ class FleetLoop:
             self._retry_later(robot.robot)
 
     def _retry_later(self, name: str) -> None:
-        """Does not try a robot again for `RETRY_PERIOD_S`."""
+        """Postpones the next attempt to serve a robot by `RETRY_PERIOD_S`."""
         now = time.monotonic()
         waiting = {other: at for other, at in self._retry_at.items() if at > now}
         self._retry_at = {**waiting, name: now + RETRY_PERIOD_S}
@@ -213,9 +218,9 @@ class FleetLoop:
 
     def _note_liveliness(self, robot: str, service: str, alive: bool) -> None:  # noqa: FBT001
         if alive:
-            self._alive[robot, service] = True
+            self._alive.add((robot, service))
         else:
-            self._alive.pop((robot, service), None)
+            self._alive.discard((robot, service))
 
     def _add_named_robots(self) -> None:
         """Begins to serve the robots named in the settings."""
@@ -226,7 +231,7 @@ class FleetLoop:
     def _add_found_robots(self) -> None:
         """Serves robots that a pattern found, unless they have an estimator of their own or there are too many."""
         found = [robot for robot, service in list(self._alive) if service == "simulator"]
-        while isinstance(sample := self._unserved_scans.get(0), Sample):
+        while isinstance(sample := self._found_scans.get(0), Sample):
             found.append(sample.key.split("/")[1])
         for name in found:
             if name in self._robots or not self._matches(name) or (name, "estimator") in self._alive:
@@ -240,7 +245,10 @@ class FleetLoop:
         return bool(ROBOT_NAME.fullmatch(name)) and any(fnmatchcase(name, pattern) for pattern in self.patterns)
 
     def _update_robots(self, now: float) -> None:
-        """Starts robots that can become active, and forgets those without scans and simulator."""
+        """Starts robots that can become active, and resets those that sent no scan and had no simulator for long.
+
+        Robots that a pattern found are then removed.
+        """
         for name, robot in list(self._robots.items()):
             if not robot.active:
                 self._guard(robot, robot.try_start)
@@ -253,12 +261,12 @@ class FleetLoop:
                 if robot.estimator is not None or not robot.named:
                     self.log.info("robot forgotten", robot=name, seconds=self.settings.forget)
                 robot.reset()
-                robot.last_seen = now
+                robot.last_seen = now  # so that it is not reset again at each check
                 if not robot.named:
                     self._remove(robot)
 
     def _try_to_add(self, name: str, *, named: bool) -> None:
-        """Serves a robot, or logs why that cannot be. Does nothing soon after a failure."""
+        """Begins to serve a robot; on a UserError logs the reason. Does nothing while the attempt is postponed."""
         if time.monotonic() < self._retry_at.get(name, 0.0):
             return
         robot = FleetRobot(self.settings, name, self.models, self._start_search, named=named)
@@ -273,14 +281,14 @@ class FleetLoop:
             self._retry_later(name)
             return
         self._robots[name] = robot
-        self._count()
+        self._update_counters()
 
     def _remove(self, robot: FleetRobot) -> None:
         robot.reset()
         del self._robots[robot.robot]
         robot.loop.bus.undeclare_all()
-        self._count()
+        self._update_counters()
 
-    def _count(self) -> None:
+    def _update_counters(self) -> None:
         for robot in self._robots.values():
             robot.counters["robots_served"] = len(self._robots)

@@ -182,7 +182,7 @@ def test_a_named_robot_with_another_protocol_is_tried_again(bus, monkeypatch):
 
     def turn():
         loop._next_health_check = loop._next_discovery = 0.0
-        loop._turn()
+        loop._step()
         return set(loop._robots)
 
     loop._stopping = True  # no turn waits

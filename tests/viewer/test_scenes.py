@@ -245,7 +245,7 @@ def test_recording_that_another_program_began(look):
 def test_controller_that_hangs(look):
     seen = look("tracking")
     seen.wait("store.frame?.status")
-    row = {"name": "controller", "state": "late", "alive": True, "note": "", "idle": False, "rates": []}
+    row = {"name": "controller", "state": "silent", "alive": True, "note": "", "idle": False, "rates": []}
     seen.see("(store.takeServices(arg, []), store.takeFrame(store.frame, performance.now()), 0)", [row])
     assert seen.see("store.frame.status") is None
 

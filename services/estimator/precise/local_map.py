@@ -23,19 +23,21 @@ from services.estimator.precise.surface_points import MIN_POINTS, Match, Surface
 
 MAX_SCANS = 12  # in the local map
 KEY_DISTANCE_M, KEY_TURN_RAD = 0.25, 0.35  # a key scan is taken after a motion of either size
-# A point was seen before if it is within this radius of a point of the local map (neighbouring beams are so far apart
-# on a distant surface), and this near to the line through that point and its neighbours, if there are enough. Three
-# standard deviations of the noise are added to the latter in quadrature. More takes much of another room for this one.
+# A point was seen before if a point of the local map is within this radius (on a distant surface, neighbouring beams
+# are so far apart), and if its distance from the surface there is below the second limit. Three standard deviations of
+# the noise are added to that limit in quadrature. Without enough neighbours for a line, only the radius counts. With
+# larger limits, much of another room would pass for this one.
 SEEN_RADIUS_M, SEEN_ACROSS_M = 0.15, 0.05
-MAX_SQUARED_DISTANCE = 4.0  # squared standard deviations of the result from the prior
+MAX_SQUARED_MAHALANOBIS = 4.0  # of the result of a match from the prior
 CHANGE_MEMORY_S = 30.0  # time constant with which changes of the surroundings are forgotten (a guess)
+PRIOR_MOVED, PRIOR_STAYED = 1.0, 4.0  # surfaces that the map lacks, as if seen before the first scan (a guess)
 # A beam that ends farther than this behind a surface has passed through it. Three standard deviations of the noise are
 # added in quadrature.
 PASSED_M = 0.1
 MIN_MATCHED_FRACTION = 0.5  # of a scan's points, else there is no match
 CLEAR_MATCHED_FRACTION = 0.8  # if fewer match, matching is repeated from `EXTRA_HEADINGS_RAD`
 EXTRA_HEADINGS_RAD = np.array([-0.3, -0.15, 0.15, 0.3])
-KEY_SCAN_DEVIATION = np.array([0.02, 0.02, 0.005])  # m, m, rad: that each key scan adds to the local map's pose
+KEY_SCAN_DEVIATION = np.array([0.02, 0.02, 0.005])  # m, m, rad: standard deviation that a key scan adds to the pose
 
 
 @dataclass(frozen=True)
@@ -59,10 +61,12 @@ class LocalMapScan(LocalScan):
     # a change), or at ones with fewer than MIN_BEAMS beams
     ignored: npt.NDArray[np.bool_]
     mapped: npt.NDArray[np.bool_]  # (B,) beams that end at surfaces of the map, according to the best hypothesis
-    tracked: bool  # whether that was so probable that the state was `tracking`
+    tracked: bool  # whether the state was `tracking`
     log_change: float  # nats, log probability of what had changed since the scan before
-    log_unknown: float  # nats, evidence before this scan that the robot is at none of the hypotheses
-    log_start: float  # nats, the part of it for a place of the map from this scan on, see `UnknownPlace.log_start`
+    log_unknown: float  # nats, evidence, without this scan, that the robot is at none of the hypotheses
+    # nats, evidence for a hypothesis that is found later: from this scan on, the robot is at this place of the map, but
+    # until now it was at none of the hypotheses
+    log_start: float
 
     @property
     def unmapped_points(self) -> Array:
@@ -75,8 +79,9 @@ class ChangeRate:
     """Rate at which surfaces in view vanish or appear, learned while driving.
 
     The rate has a gamma distribution, so the number of changes in a given time has a negative binomial distribution.
-    Its shape is Jeffreys' 0.5 plus the remembered changes, its rate parameter always `CHANGE_MEMORY_S`, as if there had
-    been that long a time without a change before the first scan. Valid for periods that are much shorter.
+    The gamma distribution's shape is 0.5 (Jeffreys' prior) plus the remembered changes. Its rate parameter is always
+    `CHANGE_MEMORY_S`, as if that long a time without a change had come before the first scan. Valid for periods much
+    shorter than that.
     """
 
     remembered: float = 0.0  # changes, forgotten exponentially
@@ -94,14 +99,14 @@ class ChangeRate:
 
 @dataclass
 class MovedFraction:
-    """Fraction of the surfaces which the map lacks that move, such as people, learned while driving.
+    """Fraction of moving surfaces, such as people, among those that are not in the map; learned while driving.
 
-    It has a beta distribution: before the first scan, as if one surface had been seen that moved, and four that stayed
-    (a guess). A surface is seen again and again, so it counts once per second; after a longer gap between scans, once.
+    It has a beta distribution, and returns to the prior with time. A surface is seen again and again, so it counts in
+    proportion to the time between two scans, but not more than once.
     """
 
-    moved: float = 1.0  # surfaces, forgotten exponentially
-    stayed: float = 4.0
+    moved: float = PRIOR_MOVED  # surfaces, forgotten exponentially
+    stayed: float = PRIOR_STAYED
 
     @property
     def probability(self) -> float:
@@ -112,8 +117,8 @@ class MovedFraction:
         """Learns from the surfaces of a scan, ``period`` s after the last one, and forgets earlier ones."""
         kept = math.exp(-period / CHANGE_MEMORY_S)
         weight = min(1.0, period)
-        self.moved = kept * self.moved + (1 - kept) * MovedFraction.moved + moved * weight
-        self.stayed = kept * self.stayed + (1 - kept) * MovedFraction.stayed + stayed * weight
+        self.moved = kept * self.moved + (1 - kept) * PRIOR_MOVED + moved * weight
+        self.stayed = kept * self.stayed + (1 - kept) * PRIOR_STAYED + stayed * weight
 
 
 @dataclass
@@ -133,7 +138,7 @@ class LocalMap:
         self._points = self._unmapped = None
 
     def to_local(self, pose: Array) -> Array:
-        """A pose (3,) in map, in the local frame."""
+        """Transforms a pose (3,) from map to the local frame."""
         return se2.between(self.frame, pose)
 
     def place(self, local: Array, pose: Array) -> None:
@@ -154,14 +159,13 @@ class LocalMap:
     def find_seen_and_appeared(
         self, local: Array, view: View, mapped: npt.NDArray[np.bool_]
     ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-        """Masks (B,) of two kinds of beams of a scan at ``local`` (3,).
+        """Two masks (B,) of the beams of a scan at ``local`` (3,).
 
-        - Seen before: the beam ends at a surface of the key scans. Beams without return count as seen once there are
-          key scans. Where that surface is one of the map, but the beam does not end at a surface of the map (``mapped``
-          (B,) is false), something else stands there now, so the beam is new evidence. Only key scans in state
-          `tracking` are trusted to know which of their surfaces are in the map. In other states the best hypothesis may
-          change with each search, and the same surfaces would count again. The first beam on a surface, which is the
-          evidence for its place, is also seen if another part of the surface was.
+        - Seen before: the beam ends near a point of a key scan, so it is no new evidence. If the map does not explain
+          the beam (``mapped`` (B,) is false), it must not explain that point either; otherwise something else stands
+          now in front of a known surface. Of key scans that were not `tracking`, no point counts as explained, because
+          the best hypothesis may change with each search, and the same surfaces would count again. Beams without return
+          count as seen as soon as a key scan has points.
         - Appeared: the beam ends where a key scan saw free space. The surface is new, wherever the robot is.
         """
         seen, appeared = np.zeros(len(view.ranges), np.bool_), np.zeros(len(view.ranges), np.bool_)
@@ -173,16 +177,18 @@ class LocalMap:
         free = np.zeros(len(near), np.bool_)
         free[~near] = self._in_free_space(placed[~near])
         appeared[view.returned] = free
-        elsewhere = np.zeros(len(view.ranges), np.bool_)  # where the key scans saw neither a surface nor free space
-        elsewhere[view.returned] = ~near & ~free
+        unobserved = np.zeros(len(view.ranges), np.bool_)  # where the key scans saw neither a surface nor free space
+        unobserved[view.returned] = ~near & ~free
+        known = near.copy()
         unmapped = near & ~mapped[view.returned]
         distance, _ = self._tree_of_unmapped_points().query(placed[unmapped], distance_upper_bound=SEEN_RADIUS_M)
-        near[unmapped] = np.isfinite(distance)
+        known[unmapped] = np.isfinite(distance)
         seen[:] = ~view.returned
-        seen[view.returned] = near
-        # Otherwise a wall would count again with each beam by which more of it is seen.
+        seen[view.returned] = known
+        # The first beam on a surface is the evidence for its place. If another part of it was seen before, more of a
+        # known wall has come into view, which would count again with each such beam.
         starts, surface = view.surfaces.starts, np.cumsum(view.surfaces.starts)
-        seen |= starts & elsewhere & (np.bincount(surface, seen)[surface] > 0)
+        seen |= starts & unobserved & (np.bincount(surface, seen)[surface] > 0)
         return seen, appeared
 
     def _in_free_space(self, points: Array) -> npt.NDArray[np.bool_]:
@@ -209,22 +215,22 @@ class LocalMap:
                 found = again
         return None if found is None or found.matched_fraction < MIN_MATCHED_FRACTION or found.degenerate else found
 
-    def candidate(self, match: Match, prior: Array, moved_probability: float) -> MotionCandidate:
-        """The pose in map that a match gives; ``prior`` (3, 3) is the pose's covariance in map before the match.
+    def candidate(self, match: Match, prior_covariance: Array, moved_probability: float) -> MotionCandidate:
+        """The pose in map that a match gives. ``prior_covariance`` (3, 3) is that of the pose in map before the match.
 
-        ``moved_probability`` is that all movable surfaces have moved, instead of none.
+        ``moved_probability`` is the probability that all movable surfaces have moved; otherwise none has.
         """
         turn = se2.rotation(float(self.frame[2]))
-        # If the surfaces have moved instead of the robot, the error is all of its motion since the last key scan.
+        # If the surfaces have moved and the robot has not, all of its motion since the last key scan is an error.
         motion = se2.difference(match.pose, self.scans[-1].pose)
-        covariance = match.covariance(turn.T @ prior @ turn + np.outer(motion, motion), moved_probability)
+        covariance = match.covariance(turn.T @ prior_covariance @ turn + np.outer(motion, motion), moved_probability)
         return MotionCandidate(se2.compose(self.frame, match.pose), self.covariance + turn @ covariance @ turn.T, 1.0)
 
     def _best_match(self, starts: Array, view: View, prior: MotionCandidate) -> Match | None:
         points = self._surface_points()
         found = [points.match(start, view, prior) for start in starts]
         plausible = [
-            each for each in found if each is not None and prior.squared_distance(each.pose) < MAX_SQUARED_DISTANCE
+            each for each in found if each is not None and prior.squared_distance(each.pose) < MAX_SQUARED_MAHALANOBIS
         ]
         return max(plausible, key=lambda each: each.score, default=None)
 
@@ -264,7 +270,7 @@ def is_key_pose(last: Array, pose: Array) -> bool:
 
 
 def _passed(scan: LocalScan, points: Array, distance: float) -> npt.NDArray[np.bool_]:
-    """Mask (K,) of the local points (K, 2) m behind which beams of the scan end, by more than ``distance`` m.
+    """Mask (K,) of the local points (K, 2) m that beams of the scan passed by more than ``distance`` m.
 
     Three standard deviations of the noise are added in quadrature.
     """

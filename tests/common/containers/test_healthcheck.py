@@ -45,8 +45,8 @@ def test_times_of_heartbeats(tmp_path):
     first = read_beats(tmp_path, "small")["robot"]
     heart.beat({"a": {"received": 1}, "b": {"published": 2}}, linked=False, note="n", idle=True)
     second = read_beats(tmp_path, "small")["robot"]
-    assert first.last == {"a": {"received": first.time}}
-    assert second == Report(second.time, False, "n", True, {**first.last, "b": {"published": second.time}})
+    assert first.increased_at == {"a": {"received": first.time}}
+    assert second == Report(second.time, False, "n", True, {**first.increased_at, "b": {"published": second.time}})
     assert second.time >= first.time
     assert read_beats(tmp_path, "other") == {}
 
@@ -78,7 +78,7 @@ def test_frozen_service(bus, process, link, tmp_path):
     sent = Scan(
         stamp_ns=1, ranges=np.ones(5, np.float32), angle_min=-1.0, angle_increment=0.5, range_min=0.05, range_max=25.0
     )
-    assert wait_until(lambda: bus.put(SCAN, sent.encode()) or SCAN.key(bus.robot) in beats().last, 30)
+    assert wait_until(lambda: bus.put(SCAN, sent.encode()) or SCAN.key(bus.robot) in beats().increased_at, 30)
     assert beats().time > before
     running.send(signal.SIGSTOP)
     try:

@@ -81,14 +81,14 @@ def test_states_over_time():
     monitor = ServiceMonitor("robot")
     monitor.set_alive({"controller"}, 10.0)
     assert states(monitor, 10.0 + REPORT_TIMEOUT_S) == {"controller": "alive"}
-    assert states(monitor, 10.1 + REPORT_TIMEOUT_S) == {"controller": "late"}
+    assert states(monitor, 10.1 + REPORT_TIMEOUT_S) == {"controller": "silent"}
     monitor.add_health(health("controller", note="n"), 20.0)
     found = service(monitor, "controller", 20.4)
-    assert (found.state, found.since, found.text, found.reported) == ("alive", 10.0, "n", True)
+    assert (found.state, found.since, found.text, found.has_started) == ("alive", 10.0, "n", True)
     assert found.age == pytest.approx(0.4)
-    late = service(monitor, "controller", 21.0 + REPORT_TIMEOUT_S)
-    assert (late.state, late.since) == ("late", 20.0 + REPORT_TIMEOUT_S)
-    assert late.text == f"{late.problem} (n)"
+    silent = service(monitor, "controller", 21.0 + REPORT_TIMEOUT_S)
+    assert (silent.state, silent.since) == ("silent", 20.0 + REPORT_TIMEOUT_S)
+    assert silent.text == f"{silent.problem} (n)"
     monitor.set_alive(set(), 21.0)
     assert states(monitor, 21.0) == {"controller": "alive"}  # its token may be missing for a moment
     gone = service(monitor, "controller", 30.0)
@@ -120,7 +120,7 @@ def test_missing_services(alive, scans, missing):
     assert absent == {*missing, *(["simulator"] if scans else [])}
     if "replay" in alive:  # it sends no health messages
         assert service(monitor, "replay", NOW + 9).state == "alive"
-        assert service(monitor, "replay", NOW + 9).reported
+        assert service(monitor, "replay", NOW + 9).has_started
 
 
 def test_results_that_stop():

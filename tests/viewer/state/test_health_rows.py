@@ -29,7 +29,7 @@ def test_rows():
         "idle": False, "rates": [],
     }  # fmt: skip
     simulator, estimator = rows_of(monitor, 110.0)
-    assert (simulator["state"], estimator["state"], estimator["alive"]) == ("late", "absent", False)
+    assert (simulator["state"], estimator["state"], estimator["alive"]) == ("silent", "absent", False)
 
 
 def test_roster():

@@ -43,7 +43,7 @@ export class Store {
 
   /** Services that are connected but send no health messages. */
   get stuck() {
-    return this.services.filter((one) => one.state === "late");
+    return this.services.filter((one) => one.state === "silent");
   }
 
   /** Rows of the running services and those that are missing; a real robot has neither a simulator nor misses one. */
