@@ -24,6 +24,7 @@ from common.messages.topics import Query, Topic, topic_of
 from common.messages.wire import ENCODING, DecodeError, Message
 
 R = TypeVar("R", bound=Reply)
+TIMEOUT_REPLY = "Timeout"  # the text of the error reply that zenoh itself makes when a request expires
 JOIN_PAUSE_S = 0.2  # between two attempts to connect to a router that refuses the credentials
 
 
@@ -50,7 +51,8 @@ class Bus(Liveliness):
         declared: list[Any] = [*self._declared, *self._publishers.values()]
         self._declared.clear()
         self._publishers.clear()
-        for each in reversed(declared):  # the liveliness token was declared last and goes first
+        # Publishers, the liveliness token, then subscriptions: a service that looks alive has all its subscriptions.
+        for each in reversed(declared):
             each.undeclare()
 
     def put(self, topic: Topic, payload: bytes, service: str = "*", key: str | None = None) -> None:
@@ -150,7 +152,7 @@ class Bus(Liveliness):
             for answer in answers:
                 if answer.ok is not None:
                     return _decode_reply(key, reply, answer.ok.payload.to_bytes())
-                if answer.err is not None and (error := answer.err.payload.to_string()) != "Timeout":
+                if answer.err is not None and (error := answer.err.payload.to_string()) != TIMEOUT_REPLY:
                     raise UserError(f"{key}: refused: {error}")
             if answers:
                 break
@@ -169,16 +171,16 @@ class Bus(Liveliness):
         It arrives after about ``timeout`` s at the latest. The request is sent once: if the session has just opened and
         does not know the queryables yet, the result is that there is no service.
         """
-        key, unanswered = query.key(self.robot, service), threading.Lock()
+        key, first_reply = query.key(self.robot, service), threading.Lock()
 
         def settle(payload: bytes, refusal: str = "") -> None:
-            if unanswered.acquire(blocking=False):  # never released, so only the first reply is used
+            if first_reply.acquire(blocking=False):  # never released, so only the first reply is used
                 inbox.put(RequestResult(query, number, payload, refusal))
 
         def on_reply(answer: zenoh.Reply) -> None:
             if answer.ok is not None:
                 settle(answer.ok.payload.to_bytes())
-            elif answer.err is not None and (error := answer.err.payload.to_string()) != "Timeout":
+            elif answer.err is not None and (error := answer.err.payload.to_string()) != TIMEOUT_REPLY:
                 settle(b"", f"{key}: refused: {error}")
 
         def on_end() -> None:

@@ -47,7 +47,7 @@ def runtime_folder() -> Path:
 
 
 @contextmanager
-def announced(endpoint: str, robots: Sequence[str], security: Credentials | None) -> Iterator[None]:
+def session_file(endpoint: str, robots: Sequence[str], security: Credentials | None) -> Iterator[None]:
     """Keeps a file that describes this process's session while the block runs."""
     process, folder = psutil.Process(), runtime_folder()
     keys = "" if security is None else str(security.folder.parent)

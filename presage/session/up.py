@@ -11,7 +11,7 @@ from rich.console import Console
 from common.bus.bus import open_bus
 from common.errors import UserError
 from presage.session.page import show_page_link
-from presage.session.running_sessions import announced, credentials_for
+from presage.session.running_sessions import credentials_for, session_file
 from presage.session.session_plan import SessionPlan, plan_session
 from presage.session.stack import Stack
 from presage.terminal.options import arguments
@@ -19,7 +19,7 @@ from presage.terminal.options import arguments
 
 @dataclass(frozen=True)
 class UpOptions:
-    """Options of `presage up`; what is None or empty is left to the environment, the settings file and defaults."""
+    """Options of `presage up`; an empty config, world or drive is left to environment, settings file and defaults."""
 
     config: Path | None = None
     world: str = ""
@@ -27,7 +27,7 @@ class UpOptions:
     simulator: list[str] = field(default_factory=list)  # further arguments of the simulator
     estimator: list[str] = field(default_factory=list)  # further arguments of the estimator
     robots: int = 1
-    record: Path | None = None
+    record: Path | None = None  # folder; if None, the recorder waits for the button on the page
     port: int = 7447  # 0 chooses a free port
     mapping: bool = False  # maps an unknown building instead of localising in a known world
     without: frozenset[str] = frozenset()  # services that are not started
@@ -62,7 +62,7 @@ def run_up(options: UpOptions, console: Console) -> None:
             stack.wait_alive(bus)
         if page:
             show_page_link(stack, console, open_it=options.open_page)
-        with announced(stack.endpoint, robots, stack.security):
+        with session_file(stack.endpoint, robots, stack.security):
             if options.mapping:
                 console.print(
                     "[bold green]mapping[/]: click a goal, press Explore or use the arrow keys on the page, then save "
@@ -77,17 +77,22 @@ def _check_combination(options: UpOptions, first_robot: str, *, simulated: bool,
     """Raises UserError for options that exclude one another."""
     if options.robots > 1 and options.record is not None:
         raise UserError(
-            f"--record records one robot only: leave it out, and run `presage --robot {first_robot} record` beside it"
+            "--record records one robot only: leave it out, and record each robot from another terminal, as with "
+            f"`presage --robot {first_robot} record`"
         )
     if not simulated and (options.robots > 1 or pace != "realtime"):
-        raise UserError("--no-simulator allows one robot in real time only: leave out --robots, and the setting pace")
+        raise UserError(
+            "--no-simulator supports one robot in real time only: leave out --robots, and remove pace from the settings"
+        )
     if options.mapping and options.robots > 1:
         raise UserError("--mapping maps with one robot: leave out --robots")
 
 
 def _start_services(stack: Stack, options: UpOptions, plan: SessionPlan, robots: list[str], *, page: bool) -> None:
     record, without = options.record, options.without
-    if (page or record is not None) and len(robots) == 1:  # an idle recorder starts from a button on the page
+    if (page or record is not None) and len(
+        robots
+    ) == 1:  # an idle recorder begins when the button on the page is pressed
         stack.start("recorder", *plan.config, *arguments(directory=record, idle=record is None))
     if options.mapping:
         stack.start("mapper", *plan.config)

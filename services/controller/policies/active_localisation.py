@@ -1,6 +1,7 @@
 """Chooses where to drive while the pose is ambiguous or unknown.
 
-The candidates are paths to places. With several possible poses, the expected free energy of a path in nats is
+The candidates are paths to viewpoints: places from which a scan may distinguish the possible poses. With several
+possible poses, the expected free energy of a path in nats is
 
     G(path) = NATS_PER_METRE * (cost to the place + cost from there to the goal)
               + entropy of a beam there - novelty * information of a scan there
@@ -10,9 +11,9 @@ distinguish the poses. Its novelty is less than 1 near a place where the robot h
 place are not independent.
 
 With an unknown pose there is no path to the goal, and no scan can be predicted. The candidates are then straight lines
-to free places in the present scan, the cost is that of the line and of the turn towards it, and any scan is assumed to
-give the pose, times its novelty, and times the probability that the map shows its place as free. So a robot in the map
-of a part of a building stays in this part.
+to free places in the present scan, and the cost is that of the line and of the turn towards it. The information is the
+entropy of an unknown pose, times the novelty of the place, times the probability that the map shows the place as free.
+So if the map covers a part of the building, the robot stays in this part.
 """
 
 from __future__ import annotations
@@ -43,13 +44,13 @@ if TYPE_CHECKING:
     from services.controller.policies.geodesic_field import CostField, FreeSpaceGraph
     from services.controller.policies.recovery import Recovery
 
-MIN_WEIGHT = 1e-3  # hypotheses with less weight do not keep a belief from `tracking`, so they are ignored
-# A hypothesis counts as at least this probable. The goal is only reached once all others are excluded, however
-# improbable they are, and the information of a scan about an improbable one would be worth hardly a metre.
+MIN_WEIGHT = 1e-3  # lighter hypotheses are ignored: a belief can be `tracking` despite them
+# A hypothesis counts as at least this probable. The robot drives to the goal only when all other hypotheses are
+# excluded; without this limit, to exclude an improbable one would not be worth a metre of driving.
 MIN_COUNTED_WEIGHT = 0.05
 MAX_HYPOTHESES = 6  # scans are predicted for each
 PLACE_SPACING_M = 1.0  # of the places that are compared
-# Cost of the path to a place; a metre costs 1 where nothing is near and scans give the pose.
+# Limits of the cost of the path to a viewpoint: 1 per metre where nothing is near and scans give the pose, else more.
 MIN_PATH_COST_M, MAX_PATH_COST_M = 0.8, 12.0
 MAX_PLACES = 60
 CHOICE_PERIOD_NS = 1_000_000_000  # minimum time between two choices of a place
@@ -61,17 +62,17 @@ VISITED_SPACING_M = 0.25
 STALLED_NS = 3_000_000_000  # after this time without progress, the robot gives up the place
 REACHED_M = 0.1  # a place nearer than this was reached
 PROGRESS_M, PROGRESS_RAD = 0.25, 0.5  # a motion or turn by this is progress; turning to and fro by less is not
-MAX_USEFUL_ROOM_M = 5.0  # more free distance than this is no advantage
-WINDOW_RAD = 0.35  # the room (free distance) in a direction is the shortest range this far to either side of it
-MIN_ROOM_M = 0.7  # if every direction has less, the robot turns on the spot
+MAX_USEFUL_DISTANCE_M = 5.0  # more free distance than this is no advantage
+HALF_WINDOW_RAD = 0.35  # the free distance in a direction is the shortest range this far to either side of it
+MIN_FREE_DISTANCE_M = 0.7  # if every direction has less, the robot turns on the spot
 TURN_RATE = 0.5  # rad/s, of a turn on the spot to look elsewhere
 MAX_LOOKAHEAD_M = 2.0  # distance of the lookahead point while the pose is unknown
 NOMINAL_SIGMA_M = 0.02  # standard deviation of a beam at which its entropy counts as 0
 
 
 @dataclass(frozen=True)
-class CandidatePaths:
-    """Paths to places, compared under one belief. The first hypothesis is the best one."""
+class CandidateViewpoints:
+    """Paths to viewpoints, compared under one belief. The first hypothesis is the best one."""
 
     hypotheses: Array  # (K, 3) base_link in map
     weights: Array  # (K,)
@@ -170,40 +171,40 @@ class ActiveLocaliser:
     def reset(self) -> None:
         """Forgets everything. Call it when the pose is known, or the goal has changed."""
         self._visited, self._stall_timer = VisitedPlaces(), StallTimer(self.robot.max_speed)
-        self._chosen_ns: int | None = None  # stamp at which paths were last looked for
-        self._paths: CandidatePaths | None = None  # that were found then; None if the map has none
+        self._requested_ns: int | None = None  # stamp of the last search for candidates
+        self._paths: CandidateViewpoints | None = None  # result of that search; None if the map has no path
         self._prediction_failure = ""  # why the last request was not answered
-        self._place: tuple[Array, dict[str, float]] | None = None  # (3,) in base_link, and its expected free energy
+        self._viewpoint: tuple[Array, dict[str, float]] | None = None  # (3,) in base_link, and its expected free energy
         self._field: tuple[Array, CostField | None] | None = None  # a place (2,) m in map and its field
         self._unknown_since_ns: int | None = None  # stamp since which there are no likely hypotheses
 
-    def prediction_request(self, belief: Belief) -> CandidatePaths | None:
+    def prediction_request(self, belief: Belief) -> CandidateViewpoints | None:
         """Candidate paths; scans must be predicted for their end poses and passed to `use_predictions`.
 
         Returns None if no predictions are needed now.
         """
         poses, weights = _likely_hypotheses(belief)
         stamp = belief.stamp_ns
-        if len(poses) < 2 or (self._chosen_ns is not None and 0 <= stamp - self._chosen_ns < CHOICE_PERIOD_NS):
+        if len(poses) < 2 or (self._requested_ns is not None and 0 <= stamp - self._requested_ns < CHOICE_PERIOD_NS):
             return None
-        self._chosen_ns, self._paths = stamp, self._candidate_paths(poses, weights)
+        self._requested_ns, self._paths = stamp, self._candidate_paths(poses, weights)
         if self._paths is None:
-            self._place = None
+            self._viewpoint = None
         return self._paths
 
-    def _candidate_paths(self, poses: Array, weights: Array) -> CandidatePaths | None:
-        """Paths from the first of the hypotheses (K, 3), also to the present place; None if the map has none."""
+    def _candidate_paths(self, poses: Array, weights: Array) -> CandidateViewpoints | None:
+        """Paths from the best of the hypotheses (K, 3), also to the present viewpoint; None if the map has none."""
         field = self.graph.cost_field(poses[0][:2], self.min_point_distance + PLACE_SPACING_M)
         if field is None or not field.reaches(poses[0][:2]):
             return None
         displacements, path_costs = self._candidate_places(field, poses[0])
-        if self._place is not None:
-            present, _ = self._place
+        if self._viewpoint is not None:
+            present, _ = self._viewpoint
             cost = field.cost_from(se2.compose(poses[0], present)[:2])
             if np.isfinite(cost):
                 displacements = np.concatenate([present[None], displacements])
                 path_costs = np.concatenate([[cost], path_costs])
-        return CandidatePaths(poses, weights, displacements, path_costs) if len(path_costs) else None
+        return CandidateViewpoints(poses, weights, displacements, path_costs) if len(path_costs) else None
 
     def use_predictions(self, reply: PredictReply, range_max: float, cost_to_goal: Callable[[Array], Array]) -> None:
         """Chooses a place with the predictions for the last request.
@@ -221,7 +222,7 @@ class ActiveLocaliser:
             sigma = reply.sigma.astype(np.float64).reshape(shape)
         energy = path_energy(paths, ranges, sigma, range_max, cost_to_goal, self._visited.novelty)
         best = int(np.argmin(energy.total))
-        self._place = paths.displacements[best], energy.of(best, energy.total)
+        self._viewpoint = paths.displacements[best], energy.of(best, energy.total)
 
     def fail_prediction(self, reason: str) -> None:
         """Stores why the last request was not answered. The next one follows after `CHOICE_PERIOD_NS`."""
@@ -231,23 +232,23 @@ class ActiveLocaliser:
         """Chooses a velocity; ``points`` (K, 2) m in base_link are obstacles."""
         motion = self._visited.move(belief.stamp_ns, velocity)
         self._stall_timer.move(belief.stamp_ns, motion)
-        if self._place is not None:
-            self._place = (se2.between(motion, self._place[0]), self._place[1])
+        if self._viewpoint is not None:
+            self._viewpoint = (se2.between(motion, self._viewpoint[0]), self._viewpoint[1])
             # A further scan from a place that was reached gives no information. If it were kept, the robot would stay
             # until another place is worth its path.
-            if np.hypot(*self._place[0][:2]) < REACHED_M:
-                self._place = None
+            if np.hypot(*self._viewpoint[0][:2]) < REACHED_M:
+                self._viewpoint = None
         self._recovery.restart_timer()  # here, progress decides when the robot backs off
-        static = np.zeros(len(points), bool)
+        moving = np.zeros(len(points), bool)  # all points count as static
         surroundings = Surroundings(
-            _no_walls, points, static, 0.0, self.min_point_distance, field_of_view=field_of_view, may_turn=self.may_turn
+            _no_walls, points, moving, 0.0, self.min_point_distance, field_of_view=field_of_view, may_turn=self.may_turn
         )
         if self._recovery.is_active(belief.stamp_ns):
             self._stall_timer.restart()
             action = back_off(velocity, surroundings, self.robot).action
             return Decision(action, BACKING_OFF, "blocked", recovering=True)
         poses, _ = _likely_hypotheses(belief)
-        if len(poses) > 1 and self._chosen_ns is not None and self._paths is None:
+        if len(poses) > 1 and self._requested_ns is not None and self._paths is None:
             return self._drive_to_open_space(belief, scan, surroundings, velocity)
         if len(poses) > 1:
             return self._tell_apart(belief.stamp_ns, poses, surroundings, velocity)
@@ -261,9 +262,9 @@ class ActiveLocaliser:
     def _tell_apart(self, stamp_ns: int, poses: Array, surroundings: Surroundings, velocity: Array) -> Decision:
         """Drives to the place that was chosen to tell the hypotheses (K, 3) apart, or waits until there is one."""
         self._unknown_since_ns = None
-        if self._place is not None:
-            self._give_up_if_stalled(stamp_ns, self._place[0][:2])
-            return self._drive_to(poses[0], *self._place, surroundings, velocity, len(poses))
+        if self._viewpoint is not None:
+            self._give_up_if_stalled(stamp_ns, self._viewpoint[0][:2])
+            return self._drive_to(poses[0], *self._viewpoint, surroundings, velocity, len(poses))
         self._stall_timer.restart()
         if self._prediction_failure:
             reason = f"{len(poses)} places are possible; standing without predicted scans to tell them apart"
@@ -273,7 +274,7 @@ class ActiveLocaliser:
     def _give_up_if_stalled(self, stamp_ns: int, place: Array) -> None:
         """Counts the place (2,) m in base_link as visited and backs off, if the robot makes no progress towards it.
 
-        From where the robot cannot reach one place, it often cannot reach others.
+        It backs off because, if it cannot reach one place from here, it often cannot reach others either.
         """
         if self._stall_timer.expired:
             self._stall_timer.restart()
@@ -320,19 +321,19 @@ class ActiveLocaliser:
         where = self.graph.free.place_text(target, decimals=1)
         reason = f"{count} places are possible: going to {where} to tell them apart"
         if field is None or not len(path):
-            self._place = None
-            return Decision(reason="no way to where places could be told apart", state="blocked")
+            self._viewpoint = None
+            return Decision(reason="no path to a place where the possible poses could be told apart", state="blocked")
         lookahead = se2.rotate(-pose[2], field.lookahead_point(pose[:2], path) - pose[:2])
         return self._approach(lookahead, surroundings, velocity, Decision(reason=reason, path=path, terms=terms))
 
     def _drive_to_open_space(self, belief: Belief, scan: Scan, surroundings: Surroundings, velocity: Array) -> Decision:
         """Drives straight to the free place in the present scan where the next scan is expected to tell most."""
-        bearing, room = _open_ranges(scan)
-        length = np.minimum(room - self.min_point_distance, MAX_USEFUL_ROOM_M)
-        if room.max() < MIN_ROOM_M and self.may_turn:
-            reason = f"the belief is {belief.state}: turning to where there is room"
+        bearing, room = _free_distances(scan)
+        length = np.minimum(room - self.min_point_distance, MAX_USEFUL_DISTANCE_M)
+        if room.max() < MIN_FREE_DISTANCE_M and self.may_turn:
+            reason = f"the belief is {belief.state}: turning towards free space"
             return Decision(np.array([0.0, 0.0, TURN_RATE]), reason, "exploring")
-        reason = f"the belief is {belief.state}: driving to where there is room, to see more"
+        reason = f"the belief is {belief.state}: driving to free space, to see more"
         direction = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
         turn = np.abs(se2.wrap(bearing - surroundings.forward)) * self.robot.max_speed / self.robot.max_turn
         places = np.maximum(length, 0.0)[:, None] * direction
@@ -349,7 +350,7 @@ class ActiveLocaliser:
     def _probability_of_being_mapped(self, places: Array, belief: Belief) -> Array:
         """Probability (M,) that the map shows the free places (M, 2) m in base_link as free.
 
-        Only if the pose of the belief is right can it be known that the map does not show them so.
+        It is 1 where the map is free at the pose of the belief, and 1 - P(this pose is right) elsewhere.
         """
         in_map = se2.transform(belief.pose.array(), places)
         outside = ~self.graph.grid.inside(in_map) | (self.graph.free.clearance_at(in_map) <= 0)
@@ -371,7 +372,7 @@ class ActiveLocaliser:
 
 
 def path_energy(
-    paths: CandidatePaths,
+    paths: CandidateViewpoints,
     ranges: Array,
     sigma: Array,
     range_max: float,
@@ -403,14 +404,14 @@ def _likely_hypotheses(belief: Belief) -> tuple[Array, Array]:
     return poses, np.array([max(h.weight, MIN_COUNTED_WEIGHT) for h in likely])
 
 
-def _open_ranges(scan: Scan) -> tuple[Array, Array]:
+def _free_distances(scan: Scan) -> tuple[Array, Array]:
     """Bearing (B,) rad in base_link of each beam, and the room in its direction (B,) m: the least range around it."""
     ranges = np.where(np.isneginf(scan.ranges), 0.0, scan.ranges.astype(np.float64))
-    ranges = np.minimum(ranges, MAX_USEFUL_ROOM_M)
+    ranges = np.minimum(ranges, MAX_USEFUL_DISTANCE_M)
     # Beams that were not measured, or were cut out, must not limit the room: their neighbours decide.
     ranges[~is_surface(scan.ranges) & ~np.isinf(scan.ranges)] = np.inf
     sweep = Sweep.of(scan)
-    half = max(1, round(WINDOW_RAD / max(sweep.spacing, WINDOW_RAD / 1000)))  # beams
+    half = max(1, round(HALF_WINDOW_RAD / max(sweep.spacing, HALF_WINDOW_RAD / 1000)))  # beams
     # Padding with 0: outside the field of view there is no room.
     padded = np.pad(ranges, half, mode="wrap") if sweep.all_round else np.pad(ranges, half)
     room = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1).min(axis=1)

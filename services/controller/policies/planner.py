@@ -14,7 +14,7 @@ from common.geometry import se2
 from common.robot.scan_geometry import ALL_ROUND, Sweep
 from common.runtime import safety
 from services.controller.policies import expected_free_energy as efe
-from services.controller.policies.active_localisation import ActiveLocaliser, CandidatePaths
+from services.controller.policies.active_localisation import ActiveLocaliser, CandidateViewpoints
 from services.controller.policies.decision import Decision, DecisionState
 from services.controller.policies.free_space import NO_MAP, FreeSpace
 from services.controller.policies.geodesic_field import WALL_COST_RANGE_M, CostField, FreeSpaceGraph
@@ -214,7 +214,7 @@ class GeodesicPolicy:
             self._reachable_from = self._component
         return refusal
 
-    def prediction_request(self, belief: Belief) -> CandidatePaths | None:
+    def prediction_request(self, belief: Belief) -> CandidateViewpoints | None:
         """Paths at whose ends scans must be predicted before `decide_unlocalised`; None if none are needed."""
         if self._goal is None or not self.epistemic:
             return None

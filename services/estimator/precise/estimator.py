@@ -11,8 +11,8 @@ import numpy as np
 from common.geometry import se2
 from services.estimator.precise.gauss_newton import COARSE_SIGMA_M, GaussNewton, Optimiser, Prior, View
 from services.estimator.precise.hypotheses import (
-    FIRST_SURROUNDINGS,
-    NEXT_SURROUNDINGS,
+    SURROUNDINGS_PRIOR,
+    SURROUNDINGS_TRANSITIONS,
     TrackedHypothesis,
     UnknownPlace,
     clip_to_map,
@@ -533,7 +533,7 @@ class PreciseEstimator:
         log_new = _log_unmapped_surfaces(view, small)
         unknown_place.scan_log_likelihood = max(_log_unmapped_surfaces(view, ignored) + log_change, log_new)
         unknown_place.allow(log_kidnapping)
-        unknown_place.allow_off_map(self._log_carried, self.settings.off_map_probability, log_new)
+        unknown_place.add_kidnapping_off_map(self._log_carried, self.settings.off_map_probability, log_new)
         self._set_hypotheses(hypotheses)
         if not np.array_equal(self.hypotheses[0].pose, hypotheses[0].pose):  # another hypothesis is best now
             self._local_map.place(local, self.hypotheses[0].pose)
@@ -571,7 +571,7 @@ class PreciseEstimator:
             tracked,
             self._log_change,
             unknown.log_evidence,
-            unknown.log_start,
+            unknown.log_arrival,
         )
         unknown.add_key_scan()
         self._local_map.add(key, best.pose, best.noise_covariance)
@@ -702,7 +702,7 @@ class PreciseEstimator:
         log_carried = max(self._unknown_place.log_evidence, self._log_carried)
         carried = log_carried + log_likelihood - _log_reference(view, view.surfaces.small)
         evidence = np.array([each.log_evidence for each in found]) + np.maximum(stayed, carried)
-        surroundings[carried >= stayed] = FIRST_SURROUNDINGS
+        surroundings[carried >= stayed] = SURROUNDINGS_PRIOR
         # In base_link, the motion is the same at all hypotheses. A robot that was carried has moved in an unknown way.
         velocity = self.hypotheses[0].velocity
         added = [
@@ -721,7 +721,7 @@ class PreciseEstimator:
             if carried[best] > stayed[best]:
                 self._restart_local_map(view)
                 unknown, off_map = self._unknown_place, self.settings.off_map_probability
-                unknown.allow_off_map(log_carried, off_map, unknown.scan_log_likelihood)
+                unknown.add_kidnapping_off_map(log_carried, off_map, unknown.scan_log_likelihood)
         self._unknown_place.exclude_mapped_places()
         self._set_hypotheses([*self.hypotheses, *added])
 
@@ -732,10 +732,10 @@ class PreciseEstimator:
         """
         poses = np.array([each.pose for each in found])
         stayed = np.full((1, len(found)), -np.inf)  # the first row is for no key scan, then one row per key scan
-        first = np.tile(FIRST_SURROUNDINGS, (1, len(found), 1))
+        first = np.tile(SURROUNDINGS_PRIOR, (1, len(found), 1))
         surroundings = first
         for key in self._local_map.scans:
-            stayed = np.vstack([stayed, np.full(len(found), key.log_start)])
+            stayed = np.vstack([stayed, np.full(len(found), key.log_arrival)])
             surroundings = np.vstack([surroundings, first])
             at_key = se2.compose(poses, se2.between(self._local_pose, key.pose))
             gain, surroundings = _log_at_poses(key.view, at_key, key.ignored, surroundings)
@@ -869,14 +869,14 @@ def _log_unmapped_surfaces(view: View, skip: npt.NDArray[np.bool_]) -> float:
 def _log_at_poses(view: View, poses: Array, skip: npt.NDArray[np.bool_], surroundings: Array) -> tuple[Array, Array]:
     """Log likelihoods (..., N) in nats, minus `_log_reference`, at ``poses`` (N, 3) in the map.
 
-    Each is a mixture over the three kinds of surroundings (see `NEXT_SURROUNDINGS`); in clutter and in a room that the
+    Each is a mixture over the three kinds of surroundings (see `SURROUNDINGS_PRIOR`); in clutter and in a room that the
     map lacks, a scan is equally likely at all poses. ``surroundings`` (..., N, 3) are their probabilities at the
     previous key scan. Also returns those at this scan.
     """
     mapped = view.surface_evidence(poses).without(skip) - _log_reference(view, skip)
     unmapped = np.full_like(mapped, _log_unmapped_surfaces(view, skip))
     with np.errstate(divide="ignore"):
-        logs = np.log(surroundings @ NEXT_SURROUNDINGS) + np.stack([mapped, unmapped, unmapped], axis=-1)
+        logs = np.log(surroundings @ SURROUNDINGS_TRANSITIONS) + np.stack([mapped, unmapped, unmapped], axis=-1)
     total = np.logaddexp.reduce(logs, axis=-1)
     return total, np.exp(logs - total[..., None])
 

@@ -21,39 +21,41 @@ if TYPE_CHECKING:
 
 NEAR_POSITION_M, NEAR_HEADING_RAD = 0.2, math.radians(5)  # a pose with a larger error is wrong
 SAME_POSITION_M, SAME_HEADING_RAD = 0.1, 0.1  # of hypotheses nearer to one another, the best is kept
-# A scan observes a direction if its log likelihood is lower by this (nats) at two poses, one to either side at this
-# distance. Poses within the map's error fit equally well, so twice its standard deviation is added (guesses).
+# A scan observes a direction if a step of `PROBE_DISTANCE_M` along it, either way, lowers the log likelihood by more
+# than `MIN_LOG_LIKELIHOOD_DROP` nats. Poses within the map's error fit equally well, so `PROBE_MAP_DEVIATIONS` standard
+# deviations of it are added to the step (guesses).
 MIN_LOG_LIKELIHOOD_DROP, PROBE_DISTANCE_M, PROBE_MAP_DEVIATIONS = math.log(100), 0.1, 2.0
 WEAK_PRIOR = np.eye(3)  # 1/m², 1/rad²: keeps the covariance finite along unobserved directions
 MIN_WEIGHT = 1e-9  # hypotheses with less weight are dropped
-# The surfaces that a key scan shows for the first time are as the map predicts (0), clutter (1), or in a room that the
-# map lacks (2). These are the probabilities at the first key scan, and from one key scan (row) to the next (column):
-# guesses, by which clutter lasts two key scans on average, and a room fifty.
-FIRST_SURROUNDINGS = np.array([0.7, 0.3, 0.0])
-NEXT_SURROUNDINGS = np.array([[0.784, 0.214, 0.002], [0.498, 0.5, 0.002], [0.014, 0.006, 0.98]])
+# A hidden Markov model: the surfaces that a key scan shows for the first time are as the map predicts (0), clutter (1),
+# or in a room that the map lacks (2). The transitions are from one key scan (row) to the next (column). All of these
+# probabilities are guesses, by which clutter lasts two key scans on average, and a room fifty.
+SURROUNDINGS_PRIOR = np.array([0.7, 0.3, 0.0])
+SURROUNDINGS_TRANSITIONS = np.array([[0.784, 0.214, 0.002], [0.498, 0.5, 0.002], [0.014, 0.006, 0.98]])
 
 
 @dataclass(frozen=True)
 class TrackedHypothesis:
-    """One hypothesis about the pose (a mode of the posterior), and the evidence of the last scan."""
+    """One hypothesis about the pose (a mode of the posterior), and the evidence of the present scan."""
 
     pose: Array  # (3,) base_link in map
     noise_covariance: Array  # (3, 3) caused by scanner noise and motion: fusion of scans reduces it
     model_covariance: Array  # (3, 3) caused by the model's error: fusion does not reduce it
-    accuracy: float  # nats, -ln p of the last scan
+    accuracy: float  # nats, -ln p of the present scan: smaller is better
     complexity: float  # nats, Kullback-Leibler divergence of the posterior from the prior
-    xi: Array  # (3,) minus the gradient of accuracy
-    curvature: Array  # (3, 3) Gauss-Newton Hessian of accuracy
-    explained: float = 0.0  # fraction of the last scan's beams that end at surfaces of the map
+    xi: Array  # (3,) gradient of ln p by the pose
+    curvature: Array  # (3, 3) Gauss-Newton Hessian of -ln p
+    explained: float = 0.0  # fraction of the present scan's beams that end at surfaces of the map
     log_evidence: float = 0.0  # nats, of the key scans and the prior; unnormalised
     # nats, of the present scan; in the result of a search absolute, in the estimator relative to `_log_reference`
     scan_log_likelihood: float = 0.0
-    surroundings: Array = field(default_factory=lambda: FIRST_SURROUNDINGS)  # (3,) probabilities at the last key scan
-    scan_surroundings: Array = field(default_factory=lambda: FIRST_SURROUNDINGS)  # (3,) at the present scan
-    motion_cost: float = 0.0  # nats, of the motion since the last scan, see `motion_model.motion_cost`
+    surroundings: Array = field(default_factory=lambda: SURROUNDINGS_PRIOR)  # (3,) probabilities at the last key scan
+    scan_surroundings: Array = field(default_factory=lambda: SURROUNDINGS_PRIOR)  # (3,) at the present scan
+    motion_cost: float = 0.0  # nats, of the motion since the previous scan, see `motion_model.motion_cost`
     motion_complexity: float = 0.0  # nats, see `motion_model.motion_complexity`
     velocity: Array | None = None  # (3,) in base_link; None while unknown
-    slip_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))  # as in `MotionCandidate`
+    # (3, 3) covariance of the pose with the scale errors of odometry, as in `MotionCandidate`
+    slip_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
     weight: float = 1.0
     # number of consecutive scans at which neither the map nor the local map showed the motion along some direction
     unobserved_scans: int = 0
@@ -70,10 +72,11 @@ class TrackedHypothesis:
 
 @dataclass
 class UnknownPlace:
-    """The hypothesis that the robot is at none of the other ones; evidence in nats, unnormalised as theirs."""
+    """The hypothesis that the robot is at none of the tracked hypotheses. Evidence in nats, unnormalised as theirs."""
 
     log_evidence: float = 0.0  # of the key scans and the prior
-    log_off_map: float = 0.0  # the same for places that are not on the map, which remain after a search of all of it
+    # the part of it for places that are not on the map; after a search of the whole map, only this part remains
+    log_off_map: float = 0.0
     scan_log_likelihood: float = 0.0  # of the present scan
     weight: float = 1.0  # probability
 
@@ -82,27 +85,28 @@ class UnknownPlace:
         self.log_evidence, self.log_off_map = float(np.log(probability)), float(np.log(off_map))
 
     def allow(self, log_evidence: float) -> None:
-        """Allows for another place with this evidence, after a kidnapping or a match at a wrong place."""
+        """Raises the evidence to at least this value, after a kidnapping or a match at a wrong place."""
         self.log_evidence = max(self.log_evidence, log_evidence)
 
-    def allow_off_map(self, log_carried: float, off_map: float, log_new: float) -> None:
-        """Allows for a kidnapping just before the present scan, which has the evidence ``log_carried`` in nats.
+    def add_kidnapping_off_map(self, log_carried: float, off_map: float, log_new: float) -> None:
+        """Adds the possibility that the robot was carried off the map just before the present scan.
 
-        With probability ``off_map`` it was to a place that is not on the map. There all surfaces of the scan are new:
-        it has the log likelihood ``log_new``, in nats.
+        ``log_carried`` is the evidence that it was carried at all, and ``off_map`` the probability that this ended off
+        the map. There, all surfaces of the scan are new, with the log likelihood ``log_new`` of the scan.
         """
         log_off_map = log_carried + float(np.log(off_map)) + log_new - self.scan_log_likelihood
         self.log_off_map = max(self.log_off_map, log_off_map)
 
     @property
-    def log_start(self) -> float:
-        """Evidence that the robot is at a place of the map from the next key scan on, and was at none until now.
+    def log_arrival(self) -> float:
+        """Evidence that the robot is at a place of the map from the next key scan on, but was at none before it.
 
         It was at a place that the search has not found, or it enters the map from a place that is not on it.
         """
-        log_enter = self.log_off_map + math.log(NEXT_SURROUNDINGS[2, 0])
+        log_enter = self.log_off_map + math.log(SURROUNDINGS_TRANSITIONS[2, 0])
         if self.log_evidence <= self.log_off_map:
             return log_enter
+        # The logarithm of exp(log_evidence) - exp(log_off_map)
         log_on_map = self.log_evidence + math.log(-math.expm1(self.log_off_map - self.log_evidence))
         return float(np.logaddexp(log_on_map, log_enter))
 
@@ -147,7 +151,7 @@ def _are_observed(view: View, poses: Array, curvatures: Array, directions: Array
 
 
 def project_evidence(evidence: Evidence, k: int, unobserved: Array) -> None:
-    """Sets the k-th evidence to zero, in place, along the unobserved directions: unit vectors (K, 3) of x, y, yaw."""
+    """Sets the k-th evidence to 0, in place, along the unobserved directions: unit vectors (K, 3) of x, y, yaw."""
     if not len(unobserved):
         return
     projection = np.eye(3) - unobserved.T @ unobserved
@@ -269,7 +273,7 @@ def weigh(hypotheses: list[TrackedHypothesis], log_unknown: float, count: int) -
     """Normalises the weights of the best hypothesis at each place, and drops those of negligible weight.
 
     Returns up to ``count`` hypotheses, best first, whose weights sum to 1, and the probability that the robot is at
-    none of them. ``log_unknown`` is the unnormalised logarithm of that.
+    none of them. ``log_unknown`` is its unnormalised log weight.
     """
     logs = np.array([each.log_weight for each in hypotheses])
     best = select_best(np.array([each.pose for each in hypotheses]), logs, count)

@@ -66,7 +66,7 @@ class LocalMapScan(LocalScan):
     log_unknown: float  # nats, evidence, without this scan, that the robot is at none of the hypotheses
     # nats, evidence for a hypothesis that is found later: from this scan on, the robot is at this place of the map, but
     # until now it was at none of the hypotheses
-    log_start: float
+    log_arrival: float
 
     @property
     def unmapped_points(self) -> Array:

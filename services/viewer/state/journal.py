@@ -18,7 +18,7 @@ NUMBERS = re.compile(r"[-+\d.,()]+")
 class Journal:
     """Has one row for each change of state or reason.
 
-    A reason that ends, or that only differs in its numbers, makes no new row.
+    A status with the same state makes no new row if its reason is empty, or differs only in numbers.
     """
 
     def __init__(self) -> None:
@@ -56,7 +56,7 @@ class Journal:
 
 
 def is_displaced(before: Truth, after: Truth) -> bool:
-    """Whether the robot moved or turned further between two true poses than its speed at both ends allows."""
+    """Whether the robot moved or turned further between two true poses than its velocities at the two poses allow."""
     seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
     away = math.hypot(after.pose.x - before.pose.x, after.pose.y - before.pose.y)
     turned = after.pose.yaw - before.pose.yaw
@@ -64,9 +64,9 @@ def is_displaced(before: Truth, after: Truth) -> bool:
         return False
     turned = abs(math.remainder(turned, math.tau))
     speed = max(math.hypot(truth.twist.vx, truth.twist.vy) for truth in (before, after))
-    turn = max(abs(truth.twist.wz) for truth in (before, after))
+    turn_rate = max(abs(truth.twist.wz) for truth in (before, after))
     reach = DISTANCE_MARGIN + (speed + ACCELERATION * seconds) * seconds
-    return away > reach or turned > ANGLE_MARGIN + (turn + TURN_ACCELERATION * seconds) * seconds
+    return away > reach or turned > ANGLE_MARGIN + (turn_rate + TURN_ACCELERATION * seconds) * seconds
 
 
 def _without_numbers(reason: str) -> str:

@@ -61,14 +61,14 @@ def test_slow_robot_makes_progress():
         assert not timer.expired
 
 
-def test_the_present_place_costs_as_much_as_its_path():
+def test_the_present_viewpoint_costs_as_much_as_its_path():
     """It is 2 m away, behind a wall around which the path is much longer."""
     poses, world = np.array([[3.5, 1.0, 0.0], [8.0, 1.0, 0.0]]), room(10, 6, box(4.5, 2.0, 0.2, 4.0))
     hypotheses = [BeliefHypothesis(pose=Pose.of(pose), weight=0.5) for pose in poses]
     ambiguous = belief(0, poses[0], "ambiguous").model_copy(update={"hypotheses": hypotheses})
     graph = FreeSpaceGraph(FreeSpace.of(world), ROBOT.radius)
     localiser = ActiveLocaliser(ROBOT, graph, 0.33, Recovery())
-    localiser._place = np.array([2.0, 0.0, 0.0]), {}
+    localiser._viewpoint = np.array([2.0, 0.0, 0.0]), {}
     paths = localiser.prediction_request(ambiguous)
     assert paths.displacements[0].tolist() == [2.0, 0.0, 0.0]
     assert paths.path_costs[0] > 6.0

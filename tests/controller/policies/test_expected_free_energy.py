@@ -12,7 +12,7 @@ from common.geometry import se2
 from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS
 from services.controller.policies import expected_free_energy as efe
-from services.controller.policies.active_localisation import CandidatePaths, VisitedPlaces, path_energy
+from services.controller.policies.active_localisation import CandidateViewpoints, VisitedPlaces, path_energy
 from services.controller.policies.expected_free_energy import entropy, place_information
 from services.controller.policies.free_space import FreeSpace, Grid
 from services.controller.policies.geodesic_field import FreeSpaceGraph
@@ -125,7 +125,7 @@ def test_identical_rooms():
     moves = se2.between(here, np.column_stack([places, np.full(len(places), here[2])]))
     goal = np.array([4.5, 3.0])  # in the first room
     for first, second in ((here, here + twin), (here + twin, here)):
-        paths = CandidatePaths(np.array([first, second]), np.array([0.5, 0.5]), moves, lengths)
+        paths = CandidateViewpoints(np.array([first, second]), np.array([0.5, 0.5]), moves, lengths)
         poses = se2.compose(paths.poses().reshape(-1, 3), np.array(scanner.mount))
         ranges = world.ray_distances(poses, scanner.angles()).reshape(2, len(places), 61)
         gain = gain_of(ranges)

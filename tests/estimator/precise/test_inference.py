@@ -16,7 +16,7 @@ from services.estimator.precise import beam_sums, global_seeds
 from services.estimator.precise.gauss_newton import MAX_STEP, Prior, View
 from services.estimator.precise.global_seeds import Seeds, thin_places
 from services.estimator.precise.hypotheses import (
-    NEXT_SURROUNDINGS,
+    SURROUNDINGS_TRANSITIONS,
     TrackedHypothesis,
     UnknownPlace,
     select_best,
@@ -402,10 +402,10 @@ def test_thin_places():
 
 def test_evidence_of_a_place_that_the_robot_was_not_at_before():
     """It begins with that of the places that a search may have missed; the robot seldom enters from off the map."""
-    unknown, enter = UnknownPlace(), np.log(NEXT_SURROUNDINGS[2, 0])
+    unknown, enter = UnknownPlace(), np.log(SURROUNDINGS_TRANSITIONS[2, 0])
     unknown.restart(1e-3, 1e-9)
-    assert unknown.log_start == pytest.approx(np.log(1e-3), abs=1e-5)
+    assert unknown.log_arrival == pytest.approx(np.log(1e-3), abs=1e-5)
     unknown.restart(1e-3, 5e-4)
-    assert unknown.log_start == pytest.approx(np.log(5e-4 + 5e-4 * np.exp(enter)))
+    assert unknown.log_arrival == pytest.approx(np.log(5e-4 + 5e-4 * np.exp(enter)))
     unknown.exclude_mapped_places()
-    assert unknown.log_start == pytest.approx(np.log(5e-4) + enter)
+    assert unknown.log_arrival == pytest.approx(np.log(5e-4) + enter)
