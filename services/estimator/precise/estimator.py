@@ -634,25 +634,23 @@ class PreciseEstimator:
         return view
 
     def _search_with_map_error(self, view: View, assumed: float, start: tuple[Array, Array] | None) -> View:
-        """Searches again if the map's errors at the first scan differ from those of the ``view`` that fits it best.
+        """Searches again if the first scan shows larger errors of the map than its ``view`` has, or another offset.
 
-        They were ``assumed`` in m before this scan. Returns the view with the errors that the scan shows.
+        Errors larger than those ``assumed`` in m before this scan remain improbable. Returns the view with the errors.
         """
         precision = replace(self._precision)
         if not precision.scans:
             precision.learn_map_error(view, self.hypotheses[0].pose)
         error, offset = precision.map_error, precision.offset
         significant = SIGNIFICANT_MAP_ERROR * view.likelihood.sigma
-        log_prior = view.log_prior if error > np.hypot(assumed, significant) else 0.0
-        as_in_view = error < max(view.map_error, significant) and abs(offset - view.map_offset) < significant
-        if as_in_view and log_prior == view.log_prior:
+        if error < max(view.map_error, significant) and abs(offset - view.map_offset) < significant:
             return view
         view = replace(
             view,
             map_error=error,
             correlated_fraction=precision.correlated_fraction,
             map_offset=offset,
-            log_prior=log_prior,
+            log_prior=view.log_prior if error > np.hypot(assumed, significant) else 0.0,
         )
         self.hypotheses, self._start = [], start
         return self._search_for_hypotheses([view])

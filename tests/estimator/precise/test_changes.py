@@ -459,25 +459,18 @@ def test_map_that_is_as_exact_as_assumed(seed):
     assert all(made.update(observation).state == "tracking" for observation in trial.observations)
 
 
-@pytest.mark.parametrize("rough", [False, True])
-def test_a_rough_map_is_improbable(rough, monkeypatch):
-    """The first scan is searched again with the errors that it shows. They are improbable only if they are large."""
-    made, scene = estimator(OFFICE, model=RoughMap(OFFICE, 1) if rough else None)
-    searched = []
-    search = PreciseEstimator._search_for_hypotheses
-    monkeypatch.setattr(
-        PreciseEstimator,
-        "_search_for_hypotheses",
-        lambda self, views: searched.append(views[-1]) or search(self, views),
-    )
+@pytest.mark.parametrize(("assumed", "improbable"), [(0.0, True), (0.1, False)])
+def test_errors_larger_than_assumed_are_improbable(assumed, improbable):
+    """When the first scan is searched again, with the errors of the map that it shows."""
+    made, scene = estimator(OFFICE, model=RoughMap(OFFICE, 1))
     here = np.array([3.0, CORRIDOR_Y, 0.0])
     made.restart(here, CLOSE)
     made.track(scene.observe(scene.clean(here[None])[0], 0.0))
-    rough_view = replace(made._scan[0], map_error=0.03, log_prior=-9.0)
-    made._search_for_hypotheses([rough_view])
-    view = made._search_with_map_error(rough_view, 0.0, (here, CLOSE))
-    assert view is searched[-1] or rough
-    assert view.log_prior == (-9.0 if rough else 0.0)
+    view = replace(made._scan[0], log_prior=-9.0)
+    made._search_for_hypotheses([view])
+    again = made._search_with_map_error(view, assumed, (here, CLOSE))
+    assert again.map_error > view.map_error
+    assert again.log_prior == (-9.0 if improbable else 0.0)
 
 
 @pytest.mark.parametrize("seed", range(5))
