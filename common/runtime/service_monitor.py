@@ -25,8 +25,9 @@ RESULT_TIMEOUT_S = 5.0  # without a result while inputs arrive, a service is fau
 FORGET_AFTER_S = 30.0  # a service that ended longer ago is no longer listed
 MAX_SERVICES = 50  # limits the memory if a program publishes health messages with made-up names
 
-# For each service, the input and the result that must follow while the input arrives; None: it is always expected. Each
-# is a topic (* for any) and the kind of its count. `remote` watches a robot outside its own containers.
+# For each service: its input, or None, and the result that must follow while this input arrives. Without an input, the
+# result must always come. Input and result are a topic (* for any) and the kind of its count. `remote` watches a robot
+# outside its own containers.
 EXPECTED_RESULTS = {
     "simulator": (None, ("scan", "published")),
     "bridge_ros2": (None, ("scan", "published")),
@@ -50,7 +51,8 @@ class Report:
     linked: bool = True  # connected to at least one other session
     note: str = ""
     idle: bool = False  # publishes no results on purpose
-    increased_at: dict[str, dict[str, float]] = field(default_factory=dict)  # when each count last did, by key and kind
+    # by key and kind: when the count last increased
+    increased_at: dict[str, dict[str, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ class UpOptions:
     simulator: list[str] = field(default_factory=list)  # further arguments of the simulator
     estimator: list[str] = field(default_factory=list)  # further arguments of the estimator
     robots: int = 1
-    record: Path | None = None  # folder; if None, the recorder waits for the button on the page
+    record: Path | None = None  # folder; if None, recording begins with the button on the page
     port: int = 7447  # 0 chooses a free port
     mapping: bool = False  # maps an unknown building instead of localising in a known world
     without: frozenset[str] = frozenset()  # services that are not started
@@ -90,9 +90,8 @@ def _check_combination(options: UpOptions, first_robot: str, *, simulated: bool,
 
 def _start_services(stack: Stack, options: UpOptions, plan: SessionPlan, robots: list[str], *, page: bool) -> None:
     record, without = options.record, options.without
-    if (page or record is not None) and len(
-        robots
-    ) == 1:  # an idle recorder begins when the button on the page is pressed
+    # An idle recorder begins when the button on the page is pressed.
+    if (page or record is not None) and len(robots) == 1:
         stack.start("recorder", *plan.config, *arguments(directory=record, idle=record is None))
     if options.mapping:
         stack.start("mapper", *plan.config)

@@ -35,7 +35,6 @@ from services.estimator.precise.motion_model import (
     MotionCandidate,
     decouple,
     expected_motion,
-    expected_motions,
     fuse,
     limit_covariance,
     motion_complexity,
@@ -215,7 +214,7 @@ class PreciseEstimator:
         is_motion_sudden = -hypotheses[0].motion_cost < np.log(SUDDEN_CHANGE_PROBABILITY)
         # Weights, also of the unknown place
         noise = self.settings.motion
-        expected = [np.array([motion.mean for motion in expected_motions(noise, each)]) for each in motions]
+        expected = [np.array([motion.mean for motion in each if motion.is_expected(noise)]) for each in motions]
         self._weigh_hypotheses(view, hypotheses, expected, match.local_pose, period)
         self._scan = view, observation
         # Global search
@@ -493,19 +492,11 @@ class PreciseEstimator:
 
         before = np.array([each.surroundings for each in hypotheses])
         log_likelihood, surroundings = _log_at_poses(view, poses, ignored, before)
-        # A motion costs less where the pose is less certain; that does not speak for a hypothesis.
-        costs = np.array([each.motion_cost for each in hypotheses])
-        losses, count = np.maximum(0.0, costs - costs[0]), len(self.hypotheses)
-        if count > 1 and costs[:count].any():
-            # Where the scan fits as well after an expected motion, the robot may be there, and did not jump.
-            owner = np.repeat(np.arange(count), [len(each) for each in expected])
-            fit = np.full(count, -np.inf)
-            np.maximum.at(fit, owner, _log_at_poses(view, np.concatenate(expected), small, before[owner])[0])
-            costs = np.clip(_log_at_poses(view, poses, small, before)[0][:count] - fit, 0.0, costs[:count])
-            losses[:count] = np.maximum(0.0, costs - costs[0])
+        losses = self._losses_by_motion(view, hypotheses, expected)
         # Alternatives found for this scan come last in `hypotheses`, and have no counterpart in `self.hypotheses`. They
         # differ by the motion, against which surfaces that were seen before may speak. They do not speak for it: among
         # similar surfaces, the search may have missed the right match.
+        count = len(self.hypotheses)
         if len(hypotheses) > count:
             of_seen = _log_at_poses(view, poses, appeared | small, before)[0] - log_likelihood
             losses[count:] += np.maximum(0.0, of_seen[0] - of_seen)[count:]
@@ -537,6 +528,26 @@ class PreciseEstimator:
         self._set_hypotheses(hypotheses)
         if not np.array_equal(self.hypotheses[0].pose, hypotheses[0].pose):  # another hypothesis is best now
             self._local_map.place(local, self.hypotheses[0].pose)
+
+    def _losses_by_motion(self, view: View, hypotheses: list[TrackedHypothesis], expected: list[Array]) -> Array:
+        """By how much more the motion of each hypothesis costs than that of the best: (N,) nats, at least 0.
+
+        A motion costs less where the pose is less certain; that does not speak for a hypothesis. For each former
+        hypothesis, ``expected`` has the poses (J, 3) after its expected motions. Where the scan fits as well at one of
+        these, the robot may be there, and did not jump.
+        """
+        costs = np.array([each.motion_cost for each in hypotheses])
+        losses, count, small = np.maximum(0.0, costs - costs[0]), len(self.hypotheses), view.surfaces.small
+        if count > 1 and costs[:count].any():
+            poses = np.array([each.pose for each in hypotheses])
+            surroundings = np.array([each.surroundings for each in hypotheses])
+            owner = np.repeat(np.arange(count), [len(each) for each in expected])
+            fit = np.full(count, -np.inf)
+            np.maximum.at(fit, owner, _log_at_poses(view, np.concatenate(expected), small, surroundings[owner])[0])
+            decrease = _log_at_poses(view, poses, small, surroundings)[0][:count] - fit
+            costs = np.clip(decrease, 0.0, costs[:count])
+            losses[:count] = np.maximum(0.0, costs - costs[0])
+        return np.asarray(losses)
 
     def _log_mismatch(self, before: TrackedHypothesis, after: TrackedHypothesis) -> float:
         """Evidence in nats that the scan was matched at a wrong pose.

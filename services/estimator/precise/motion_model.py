@@ -87,6 +87,10 @@ class MotionCandidate:
         """Whether ``pose`` (3,) is within `MAX_MOTION_SIGMAS` of the mean."""
         return self.squared_distance(pose) <= MAX_MOTION_SIGMAS**2
 
+    def is_expected(self, noise: MotionNoise) -> bool:
+        """Whether it is more probable than a motion that nothing foretells."""
+        return self.probability > noise.unexpected
+
 
 def predict_motion(
     noise: MotionNoise,
@@ -143,11 +147,6 @@ def expected_motion(candidates: list[MotionCandidate]) -> MotionCandidate:
     return candidates[-2] if len(candidates) > 1 else candidates[0]
 
 
-def expected_motions(noise: MotionNoise, candidates: list[MotionCandidate]) -> list[MotionCandidate]:
-    """The candidates that are more probable than a motion that nothing foretells."""
-    return [each for each in candidates if each.probability > noise.unexpected]
-
-
 def motion_cost(noise: MotionNoise, candidates: list[MotionCandidate], pose: Array, covariance: Array) -> float:
     """How much less probable a motion to ``pose`` (3,), known with ``covariance`` (3, 3), is than expected, in nats.
 
@@ -156,7 +155,7 @@ def motion_cost(noise: MotionNoise, candidates: list[MotionCandidate], pose: Arr
     positive, with the Mahalanobis distance z of the pose from its mean.
     """
     peaks, excess = _peaks_and_excess(candidates, pose, covariance)
-    expected = min(peak for peak, each in zip(peaks, candidates, strict=True) if each.probability > noise.unexpected)
+    expected = min(peak for peak, each in zip(peaks, candidates, strict=True) if each.is_expected(noise))
     return float((np.maximum(0.0, expected - peaks) + excess).min())
 
 
