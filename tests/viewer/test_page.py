@@ -107,8 +107,9 @@ def test_recording(page, system):
     page.wait("store.player && store.frame && store.world")
     length = page.see("store.player.duration_s")
     assert length > 1.5
+    assert page.see("store.player.paused")
     page.page.locator("#player-play").click()
-    page.wait("store.player.paused")  # playing on, a busy machine would pass the middle before it is looked at
+    page.wait("store.player.paused && store.player.position_s > arg - 0.1", argument=length)  # pauses at the end
     for share, side in ((0.1, "<"), (0.9, ">"), (0.2, "<")):
         page.page.locator("#player-seek").fill(str(round(share * length, 2)))
         page.wait("Math.abs(store.player.position_s - arg) < 0.5", argument=share * length)
