@@ -19,8 +19,12 @@ if TYPE_CHECKING:
 
 SEED_SPACING_M = 0.3  # between the places at which a search begins
 RANKED_HEADINGS, RANKED_BEAMS = 120, 72  # that are compared with the panorama of each place
-# If there are more places than this, a comparison with few beams selects that many of them first.
-FULLY_RANKED_PLACES, PRESELECTION_BEAMS = 4000, 24
+# Displacements in the laser frame (9, 2) m. A scan changes much over half of `SEED_SPACING_M`, and displacing the scan
+# costs less memory than more panoramas.
+SHIFTS_M = 0.1 * np.stack(np.meshgrid([0.0, 1.0, -1.0], [0.0, 1.0, -1.0]), axis=-1).reshape(-1, 2)
+# If there are more places, comparisons with few beams select as many of them first: one without displacements, if there
+# are more than the first number, and one with them, if there are more than the second.
+COARSELY_RANKED_PLACES, FULLY_RANKED_PLACES, PRESELECTION_BEAMS = 20_000, 1000, 24
 RANGE_STEP_M = 0.1  # of a stored range; 0 is unknown
 MAX_RANGE_STEPS = 255  # largest stored range, so that it fits a byte
 
@@ -53,15 +57,6 @@ class Seeds:
         """Volume in m² rad of the poses that the seeds represent."""
         return max(1, len(self.places)) * SEED_SPACING_M**2 * 2 * np.pi
 
-    @property
-    def starts_factor(self) -> float:
-        """Number of starts of a search, divided by that in a map of up to `FULLY_RANKED_PLACES` places.
-
-        The more places there are, the more of them look similar. The exponent was chosen on 50 000 m²: of 240 scans, a
-        constant number of starts missed 11, of which this finds 7.
-        """
-        return float(max(1.0, len(self.places) / FULLY_RANKED_PLACES) ** (1 / 3))
-
     @cached_property
     def spread(self) -> Array:
         """Covariance (3, 3) of a completely unknown pose: uniform over the map and all headings."""
@@ -70,33 +65,57 @@ class Seeds:
 
     def rank(self, view: View, count: int) -> Array:
         """The ``count`` base_link poses (count, 3) that fit the scan best, best first; at most two per place."""
-        places, panoramas = self.places, self.panoramas
-        if len(places) > FULLY_RANKED_PLACES:
-            least, _ = _costs(panoramas, view.thinned(PRESELECTION_BEAMS), all_headings=False)
-            chosen = np.sort(np.argsort(least, kind="stable")[:FULLY_RANKED_PLACES])
-            places, panoramas = places[chosen], panoramas[chosen]
-        least, costs = _costs(panoramas, view.thinned(RANKED_BEAMS))
-        best = np.sort(np.argsort(least, kind="stable")[:count])
-        place, heading = _least_costs(costs[best], count)
+        places, panoramas, few = self.places, self.panoramas, view.thinned(PRESELECTION_BEAMS)
+        for most, shifts in ((COARSELY_RANKED_PLACES, SHIFTS_M[:1]), (FULLY_RANKED_PLACES, SHIFTS_M)):
+            if len(places) > most:
+                chosen = np.sort(np.argsort(_least_misfits(panoramas, few, shifts), kind="stable")[:most])
+                places, panoramas = places[chosen], panoramas[chosen]
+        costs, shift = _misfits(panoramas, view.thinned(RANKED_BEAMS))
+        place, heading = _select(costs, count)
         headings = se2.wrap(heading * (2 * np.pi / RANKED_HEADINGS))
-        lasers = np.column_stack([places[best[place]], headings])
+        centres = np.column_stack([places[place], headings])
+        displacement = SHIFTS_M[shift[place, heading]]
+        lasers = se2.compose(centres, np.column_stack([displacement, np.zeros(len(place))]))
         return se2.compose(lasers, se2.inverse(view.mount))
 
 
-def _costs(
-    panoramas: npt.NDArray[np.uint8], view: View, *, all_headings: bool = True
-) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint16]]:
-    """Misfit of a scan with each panorama: the least one (S,), and that of all headings (S, H), if wanted."""
-    used = ~(np.isnan(view.ranges) | np.isneginf(view.ranges))
-    bins = np.round(view.angles[used] / (2 * np.pi / RANKED_HEADINGS)).astype(np.int64) % RANKED_HEADINGS
+def _least_misfits(panoramas: npt.NDArray[np.uint8], view: View, shifts: Array) -> npt.NDArray[np.uint16]:
+    """Misfit (S,) of a scan with each panorama, at the best heading and the best of the displacements (K, 2)."""
+    least = np.full(len(panoramas), np.iinfo(np.uint16).max, np.uint16)
+    one = np.empty_like(least)
+    for shift in shifts:
+        _compare(panoramas, view, shift, one, np.empty((0, RANKED_HEADINGS), np.uint16))
+        np.minimum(least, one, out=least)
+    return least
+
+
+def _misfits(panoramas: npt.NDArray[np.uint8], view: View) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.intp]]:
+    """Misfit (S, H) of a scan with each panorama at each heading, and the number of the best displacement (S, H)."""
     least = np.empty(len(panoramas), np.uint16)
-    costs = np.empty((len(panoramas) if all_headings else 0, RANKED_HEADINGS), np.uint16)
+    costs = np.empty((len(SHIFTS_M), len(panoramas), RANKED_HEADINGS), np.uint16)
+    for shift, each in zip(SHIFTS_M, costs, strict=True):
+        _compare(panoramas, view, shift, least, each)
+    best = costs.argmin(axis=0)
+    return np.take_along_axis(costs, best[None], axis=0)[0], best
+
+
+def _compare(
+    panoramas: npt.NDArray[np.uint8],
+    view: View,
+    shift: Array,
+    least: npt.NDArray[np.uint16],
+    costs: npt.NDArray[np.uint16],
+) -> None:
+    """Fills ``least`` and ``costs`` (see `beam_sums.rank_places`), for the laser displaced by ``shift`` (2,) m."""
+    used = ~(np.isnan(view.ranges) | np.isneginf(view.ranges))
+    angles, ranges = view.angles[used], view.ranges[used]
+    ended = np.isfinite(ranges)
+    ends = ranges[ended, None] * np.stack([np.cos(angles[ended]), np.sin(angles[ended])], axis=-1) + shift
+    angles[ended], ranges[ended] = np.arctan2(ends[:, 1], ends[:, 0]), np.hypot(*ends.T)
+    bins = np.round(angles / (2 * np.pi / RANKED_HEADINGS)).astype(np.int64) % RANKED_HEADINGS
     words = panoramas.view(np.uint64)
     words.flags.writeable = False  # as those of a file are: numba compiles again for others
-    beam_sums.rank_places(
-        words, bins, _in_steps(view.ranges[used]), int(_in_steps(np.array(view.range_max))), least, costs
-    )
-    return least, costs
+    beam_sums.rank_places(words, bins, _in_steps(ranges), int(_in_steps(np.array(view.range_max))), least, costs)
 
 
 def _in_steps(ranges: Array) -> npt.NDArray[np.uint8]:
@@ -104,17 +123,18 @@ def _in_steps(ranges: Array) -> npt.NDArray[np.uint8]:
     return np.clip(np.round(ranges / RANGE_STEP_M), 1, MAX_RANGE_STEPS).astype(np.uint8)
 
 
-def _least_costs(costs: npt.NDArray[np.uint16], count: int) -> tuple[Array, Array]:
-    """Indices of place and heading of the ``count`` lowest costs, with at most two separate headings per place."""
-    rows = np.arange(len(costs))
-    first = costs.argmin(axis=1)
-    rest = costs.copy()
+def _select(costs: npt.NDArray[np.uint16], count: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Places and headings of the ``count`` lowest costs (S, H), with at most two separate headings per place."""
+    best = np.sort(np.argsort(costs.min(axis=1), kind="stable")[:count])
+    rows = np.arange(len(best))
+    first = costs[best].argmin(axis=1)
+    rest = costs[best]
     for offset in range(-3, 4):
         rest[rows, (first + offset) % costs.shape[1]] = np.iinfo(np.uint16).max
     second = rest.argmin(axis=1)
-    place = np.concatenate([rows, rows])
+    place = np.concatenate([best, best])
     heading = np.concatenate([first, second])
-    order = np.argsort(np.concatenate([costs[rows, first], costs[rows, second]]), kind="stable")[:count]
+    order = np.argsort(costs[place, heading], kind="stable")[:count]
     return place[order], heading[order]
 
 

@@ -44,9 +44,9 @@ def search_everywhere(views: list[View], seeds: Seeds, settings: PreciseSettings
     most evidence by surfaces: with few beams, and from the best results with all beams, for each view.
     """
     view = views[0]
-    starts = seeds.rank(view, round(settings.ranked_seeds * seeds.starts_factor))
+    starts = seeds.rank(view, settings.ranked_seeds)
     fit = view.thinned(SEED_BEAMS).surface_evidence(starts, SEED_SIGMA_M).log_likelihood
-    starts = starts[np.argsort(-fit, kind="stable")[: round(settings.search_starts * seeds.starts_factor)]]
+    starts = starts[np.argsort(-fit, kind="stable")[: settings.search_starts]]
     few = view.thinned(settings.search_beams)
     poses, _ = few.descend(starts, None, SEED_SCHEDULE_M)
     fit = few.surface_evidence(poses, SEED_SCHEDULE_M[-1]).log_likelihood

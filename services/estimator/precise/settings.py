@@ -11,7 +11,7 @@ from services.estimator.precise.motion_model import MotionNoise
 class PreciseSettings:
     """Parameters of the precise estimator; the defaults are used for every shipped world."""
 
-    # Search; the first two are numbers for a small map, see `Seeds.starts_factor`
+    # Search
     ranked_seeds: int = 300  # seeds at which the evidence by surfaces is computed
     search_starts: int = 48  # the best of them, from which a search of the whole map descends
     search_beams: int = 100  # beams used by these descents

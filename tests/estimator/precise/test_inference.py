@@ -362,6 +362,17 @@ def test_seed_ranking():
         assert (near & (np.abs(se2.wrap(ranked[:, 2] - pose[2])) < 0.2)).any()
 
 
+def test_seed_ranking_between_places():
+    """A seed 0.14 m away is compared as if the laser stood at the pose, so that the search starts there."""
+    rng = np.random.default_rng(6)
+    seeds = Seeds.at(RayCaster(ROOM), thin_places(ROOM.sample_free(2000, rng, 0.05), 0.3))
+    for place in seeds.places[rng.choice(len(seeds.places), 10, replace=False)]:
+        laser = se2.compose(np.array([*place, rng.uniform(-np.pi, np.pi)]), np.array([0.1, -0.1, 0.0]))
+        pose = se2.compose(laser, se2.inverse(view(np.ones(4)).mount))
+        off = np.abs(se2.difference(seeds.rank(view(scan(pose, rng)), 10), pose))
+        assert ((off[:, :2] < 0.05).all(axis=1) & (off[:, 2] < 0.03)).any()
+
+
 def test_preselection(monkeypatch):
     rng = np.random.default_rng(5)
     seeds = Seeds.at(RayCaster(ROOM), thin_places(ROOM.sample_free(4000, rng, 0.05), 0.2))
