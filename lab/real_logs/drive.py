@@ -13,6 +13,7 @@ import numpy as np
 from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.world import load_world
+from lab.accuracy.compared_estimators import ScanMatchedOdometry
 from lab.statistics import squared_mahalanobis
 from presage.learning.train_drive import drive_of, split
 from presage.logs.scan_files import read_scans
@@ -29,6 +30,9 @@ START_COVARIANCE = np.diag([0.01, 0.01, 0.0025])  # m², m², rad²; of the give
 # AMCL's default motion model is differential and cannot follow every base, so its omnidirectional model is used.
 AMCL_SETTINGS = ParticleFilterSettings(robot_model_type="omni")
 ODOMETRY, LASER, GLOBAL, KIDNAPPED = "odometry", "laser", "global", "kidnapped"
+SCAN_MATCHING_FILTER = "particle-filter-scan-matching"
+FILTERS = ("particle-filter", SCAN_MATCHING_FILTER)  # those that are tuned
+ESTIMATORS = ("precise", "precise-exact", *FILTERS, "amcl-defaults")
 
 
 @dataclass(frozen=True)
@@ -38,13 +42,13 @@ class StretchJob:
     log: str
     map: str
     mount: tuple[float, float, float] | None  # pose of the laser in base_link; None for the log's own
-    estimator: str  # precise, particle-filter or amcl-defaults
+    estimator: str  # one of `ESTIMATORS`
     task: str
     first: int  # index of the first scan
     count: int = 0  # number of scans
     to: int = 0  # task kidnapped: index of the scan to which the robot is moved
     model: str = ""  # weights file of estimator precise
-    particles: tuple[tuple[str, float], ...] = ()  # settings of the particle filter, by name
+    particles: tuple[tuple[str, float], ...] = ()  # settings of a tuned particle filter, by name
     seed: int = 1
     exchanged: bool = False  # whether the second half of the drive is the training half
 
@@ -126,12 +130,13 @@ def hide_kidnapping(odom: Array, first_after: int) -> Array:
 def create_estimator(job: StretchJob) -> PoseEstimator:
     """A new estimator for the job's map, without a start pose."""
     drive = job.drive
-    if job.estimator == "precise":
-        factory = _precise(job.map, job.model)
-        return factory(ScannerGeometry(drive.angles, drive.mount, drive.range_max))
+    geometry = ScannerGeometry(drive.angles, drive.mount, drive.range_max)
+    if job.estimator in ("precise", "precise-exact"):
+        return _precise(job.map, job.model if job.estimator == "precise" else "exact")(geometry)
     settings = AMCL_SETTINGS if job.estimator == "amcl-defaults" else particle_settings(job.particles)
     x, y, yaw = map(float, drive.mount)
-    return ParticleFilter(load_world(job.map), settings, (x, y, yaw), job.seed, sensor=_sensor(job.map, settings))
+    found = ParticleFilter(load_world(job.map), settings, (x, y, yaw), job.seed, sensor=_sensor(job.map, settings))
+    return ScanMatchedOdometry(found, geometry) if job.estimator == SCAN_MATCHING_FILTER else found
 
 
 def particle_settings(changed: tuple[tuple[str, float], ...]) -> ParticleFilterSettings:

@@ -23,6 +23,8 @@ from common.geometry.world import load_world
 from lab.experiments import results
 from lab.experiments.trials import run_key, run_trials
 from lab.real_logs.drive import (
+    ESTIMATORS,
+    FILTERS,
     GLOBAL,
     KIDNAPPED,
     LASER,
@@ -50,7 +52,6 @@ from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.precise.learning.drive_learning import learn_drive
 from services.estimator.precise.learning.field_learning import Recipe
 
-ESTIMATORS = ("precise", "particle-filter", "amcl-defaults")
 TASKS = {
     ODOMETRY: "tracking with odometry",
     LASER: "tracking without",
@@ -93,7 +94,7 @@ def run(job: RealLogJob, out: Path, workers: int, console: Console) -> results.R
     model, card, tuned = _train_and_tune(job, template, half, out, console)
     template = replace(template, first=half, model=str(model))
     jobs = [
-        replace(each, estimator=name, particles=_settings(tuned, each.task) if name == "particle-filter" else ())
+        replace(each, estimator=name, particles=_settings(tuned[name], each.task) if name in tuned else ())
         for each in stretches(template, half, len(drive.ranges), job, odometry=drive.odom is not None)
         for name in ESTIMATORS
     ]
@@ -111,10 +112,7 @@ def run(job: RealLogJob, out: Path, workers: int, console: Console) -> results.R
         {
             **{k: str(v) if isinstance(v, Path) else v for k, v in asdict(job).items()},
             "scans": len(drive.ranges),
-            "particle_filter": {
-                **{name: dict(each) for name, each in _settings_by_task(tuned).items()},
-                "tried": tuned.tried,
-            },
+            "particle_filters": {name: _as_json(each) for name, each in tuned.items()},
             "calibration": asdict(card.calibration) if card.calibration else None,
         },
         summary,
@@ -152,8 +150,8 @@ def _check_drive(job: RealLogJob, drive: ReferenceDrive, half: int) -> None:
 
 def _train_and_tune(
     job: RealLogJob, stretch: StretchJob, half: int, out: Path, console: Console
-) -> tuple[Path, weights.FieldCard, TunedSettings]:
-    """The model trained on the training half, and the settings of the particle filter tuned on it.
+) -> tuple[Path, weights.FieldCard, dict[str, TunedSettings]]:
+    """The model trained on the training half, and the settings of each of the `FILTERS` tuned on it.
 
     An interrupted run's model and settings are reused if the command, its files and the checkout are the same.
     """
@@ -164,8 +162,7 @@ def _train_and_tune(
     with suppress(OSError, ValueError, KeyError, TypeError, UserError):  # no usable files of an interrupted run
         before = json.loads(kept.read_text(encoding="utf-8"))
         if before["key"] == key:
-            odometry, laser, finding = (tuple(before[what].items()) for what in ("odometry", "laser", "finding"))
-            return path, weights.load(path)[2], TunedSettings(odometry, laser, finding, before["tried"])
+            return path, weights.load(path)[2], {name: _from_json(before[name]) for name in FILTERS}
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("learning", total=1.0)
@@ -179,12 +176,13 @@ def _train_and_tune(
         card = card_of(training, world, first, learned, 0.0)
         weights.save(path, learned.model, learned.places, card)
         start = starting_point(learned.calibration.motion)
-        tuned = (
-            TunedSettings(start, start, (*start, ("keep_initial_pose", 0.0)), [])
+        tuned = {
+            name: TunedSettings(start, start, (*start, ("keep_initial_pose", 0.0)), [])
             if job.quick
-            else tune(replace(stretch, estimator="particle-filter"), half, start, path.parent, report)
-        )
-    stored = {"key": key, **{name: dict(each) for name, each in _settings_by_task(tuned).items()}, "tried": tuned.tried}
+            else tune(replace(stretch, estimator=name), half, start, path.parent, report)
+            for name in FILTERS
+        }
+    stored = {"key": key, **{name: _as_json(each) for name, each in tuned.items()}}
     kept.write_text(json.dumps(stored) + "\n", encoding="utf-8")
     return path, card, tuned
 
@@ -195,6 +193,15 @@ def _settings(tuned: TunedSettings, task: str) -> ParameterValues:
 
 def _settings_by_task(tuned: TunedSettings) -> dict[str, ParameterValues]:
     return {ODOMETRY: tuned.odometry, LASER: tuned.laser, "finding": tuned.finding}
+
+
+def _as_json(tuned: TunedSettings) -> dict[str, Any]:
+    return {**{name: dict(each) for name, each in _settings_by_task(tuned).items()}, "tried": tuned.tried}
+
+
+def _from_json(stored: dict[str, Any]) -> TunedSettings:
+    odometry, laser, finding = (tuple(stored[what].items()) for what in (ODOMETRY, LASER, "finding"))
+    return TunedSettings(odometry, laser, finding, stored["tried"])
 
 
 def stretches(template: StretchJob, half: int, count: int, job: RealLogJob, *, odometry: bool) -> list[StretchJob]:
@@ -259,7 +266,7 @@ def curves_of(rows: Sequence[dict[str, Any]]) -> dict[str, list[Any]]:
     return curves
 
 
-def notes(job: RealLogJob, card: weights.FieldCard, tuned: TunedSettings) -> list[str]:
+def notes(job: RealLogJob, card: weights.FieldCard, tuned: dict[str, TunedSettings]) -> list[str]:
     """Notes below the table: definitions, tuned settings and calibration."""
     found, learned = card.calibration, "second" if job.exchange else "first"
     lines = [
@@ -268,8 +275,9 @@ def notes(job: RealLogJob, card: weights.FieldCard, tuned: TunedSettings) -> lis
             f"whose error adds to the errors; found: state `tracking` there within {MAX_SEARCH_SCANS} scans"
         ),
         *(
-            f"particle filter, tuned on the {learned} half, {what}: {_format_settings(each)}"
-            for what, each in (("a", tuned.odometry), ("b", tuned.laser), ("c and d", tuned.finding))
+            f"{name}, tuned on the {learned} half, {what}: {_format_settings(each)}"
+            for name, settings in tuned.items()
+            for what, each in (("a", settings.odometry), ("b", settings.laser), ("c and d", settings.finding))
             if not job.quick
         ),
     ]
@@ -283,7 +291,7 @@ def notes(job: RealLogJob, card: weights.FieldCard, tuned: TunedSettings) -> lis
             f"{found.nees_median:.2f} median (ideal 2.37), {found.nees_mean:.1f} mean (3)"
         )
     if job.quick:
-        lines.append("quick run: few scans, and the particle filter is not tuned except for its motion noise")
+        lines.append("quick run: few scans, and the particle filters are not tuned except for their motion noise")
     return lines
 
 

@@ -17,6 +17,7 @@ from lab.pages import tables_page as page
 from lab.real_logs import experiment as real
 from lab.real_logs import filter_tuning as real_tuning
 from lab.real_logs.drive import (
+    ESTIMATORS,
     KIDNAPPED,
     LASER,
     MAX_SEARCH_SCANS,
@@ -74,7 +75,7 @@ def test_too_few_reference_poses(tmp_path):
         train_from_drive(Training(tmp_path / "short.npz", out=tmp_path, share=0.5, reading=HERE), Console(quiet=True))
 
 
-@pytest.mark.parametrize("estimator", ["precise", "particle-filter"])
+@pytest.mark.parametrize("estimator", [name for name in ESTIMATORS if name != "amcl-defaults"])
 def test_kidnapped_robot(folder, estimator):
     job = StretchJob(
         str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), estimator, KIDNAPPED, 100, to=155,
