@@ -49,8 +49,8 @@ class LogCase:
 
     def halves(self) -> tuple[ReferenceDrive, ReferenceDrive]:
         """The half from which the map is made, and the half that is localised."""
-        size = len(split(drive_at(self.log, self.mount, False))[1 if self.exchanged else 0].ranges)
-        drive = drive_at(self.log, self.mount, self.exchanged)
+        size = len(split(drive_at(self.log, self.mount, exchanged=False))[1 if self.exchanged else 0].ranges)
+        drive = drive_at(self.log, self.mount, exchanged=self.exchanged)
         numbers = np.arange(len(drive.ranges))
         return drive.part(numbers < size), drive.part(numbers >= size)
 
@@ -63,7 +63,7 @@ def _map_key(case: LogCase) -> str:
 
 def cases_of(log: str, mount: tuple[float, float, float] | None) -> list[LogCase]:
     """The cases of one log; those with odometry only if the log has it."""
-    kinds = [False] if drive_at(log, mount, False).odom is None else [False, True]
+    kinds = [False] if drive_at(log, mount, exchanged=False).odom is None else [False, True]
     return [LogCase(log, mount, exchanged, odometry) for exchanged in (False, True) for odometry in kinds]
 
 
@@ -76,7 +76,7 @@ def log_trial(case: LogCase) -> IntegrityTrial:
             drive.angles,
             drive.range_max,
             float(drive.stamps[k]),
-            drive.odom[k] if case.odometry and drive.odom is not None else None,
+            drive.odom[k] if case.odometry and drive.odom is not None and np.isfinite(drive.odom[k]).all() else None,
         )
         for k, ranges in enumerate(drive.ranges)
     ]

@@ -16,6 +16,7 @@ from common.geometry.world import load_world
 from lab.accuracy.compared_estimators import ScanMatchedOdometry
 from lab.statistics import squared_mahalanobis
 from presage.learning.train_drive import drive_of, split
+from presage.logs.log import Reading
 from presage.logs.scan_files import read_scans
 from services.estimator.factory import EstimatorFactory, EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.particle_filter.filter import ParticleFilter
@@ -24,12 +25,12 @@ from services.estimator.particle_filter.settings import ParticleFilterSettings
 from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.shared.interface import Observation, PoseEstimator
 
-MAX_SEARCH_SCANS = 40
+MAX_SEARCH_SCANS = 40  # after an unknown start or a kidnapping
 SCANS_BEFORE_KIDNAPPING = 10  # from a given pose on
 START_COVARIANCE = np.diag([0.01, 0.01, 0.0025])  # m², m², rad²; of the given start pose
 # AMCL's default motion model is differential and cannot follow every base, so its omnidirectional model is used.
 AMCL_SETTINGS = ParticleFilterSettings(robot_model_type="omni")
-ODOMETRY, LASER, GLOBAL, KIDNAPPED = "odometry", "laser", "global", "kidnapped"
+ODOMETRY, LASER, GLOBAL, KIDNAPPED = "odometry", "laser", "global", "kidnapped"  # LASER: without odometry
 SCAN_MATCHING_FILTER = "particle-filter-scan-matching"
 FILTERS = ("particle-filter", SCAN_MATCHING_FILTER)  # those that are tuned
 ESTIMATORS = ("precise", "precise-exact", *FILTERS, "amcl-defaults")
@@ -43,34 +44,32 @@ class StretchJob:
     map: str
     mount: tuple[float, float, float] | None  # pose of the laser in base_link; None for the log's own
     estimator: str  # one of `ESTIMATORS`
-    task: str
+    task: str  # ODOMETRY, LASER, GLOBAL or KIDNAPPED
     first: int  # index of the first scan
-    count: int = 0  # number of scans
+    count: int = 0  # number of scans; GLOBAL: 0 for `MAX_SEARCH_SCANS`; not used by KIDNAPPED
     to: int = 0  # task kidnapped: index of the scan to which the robot is moved
     model: str = ""  # weights file of estimator precise
     particles: tuple[tuple[str, float], ...] = ()  # settings of a tuned particle filter, by name
-    seed: int = 1
+    seed: int = 1  # of the particle filter
     exchanged: bool = False  # whether the second half of the drive is the training half
 
     @property
     def drive(self) -> ReferenceDrive:
         """The whole drive, with the training half first."""
-        return drive_at(self.log, self.mount, self.exchanged)
+        return drive_at(self.log, self.mount, exchanged=self.exchanged)
 
     @property
     def learned(self) -> int:
         """Number of scans in the training half of `drive`, which is also the index of the first scan after it."""
-        first, second = split(drive_at(self.log, self.mount))
+        first, second = split(drive_at(self.log, self.mount, exchanged=False))
         return len((second if self.exchanged else first).ranges)
 
 
 @functools.lru_cache(maxsize=2)
-def drive_at(log: str, mount: tuple[float, float, float] | None, exchanged: bool = False) -> ReferenceDrive:
+def drive_at(log: str, mount: tuple[float, float, float] | None, *, exchanged: bool) -> ReferenceDrive:
     """The scans of a log that have reference poses; cached per process. ``exchanged`` puts the second half first."""
-    from presage.logs.log import Reading
-
     if exchanged:
-        return exchange_halves(drive_at(log, mount))
+        return exchange_halves(drive_at(log, mount, exchanged=False))
     path = Path(log)
     return drive_of(read_scans(path, reading=Reading(mount=None if mount is None else np.array(mount))), path)
 
@@ -86,13 +85,13 @@ def exchange_halves(drive: ReferenceDrive) -> ReferenceDrive:
 def trial(job: StretchJob) -> dict[str, Any]:
     """Runs the job's estimator over its stretch. Returns errors, states and times of every scan."""
     drive, estimator = job.drive, create_estimator(job)
-    if job.task in (ODOMETRY, LASER):
+    if job.task != GLOBAL:
         estimator.restart(drive.poses[job.first], START_COVARIANCE)
+    if job.task in (ODOMETRY, LASER):
         indices = np.arange(job.first, job.first + job.count)
     elif job.task == GLOBAL:
         indices = np.arange(job.first, min(job.first + (job.count or MAX_SEARCH_SCANS), len(drive.ranges)))
     else:
-        estimator.restart(drive.poses[job.first], START_COVARIANCE)
         after = np.arange(job.to, min(job.to + MAX_SEARCH_SCANS, len(drive.ranges)))
         indices = np.concatenate([np.arange(job.first, job.first + SCANS_BEFORE_KIDNAPPING), after])
     clock = drive.stamps[indices]
@@ -104,13 +103,12 @@ def trial(job: StretchJob) -> dict[str, Any]:
         odom = None if odom is None else hide_kidnapping(odom, SCANS_BEFORE_KIDNAPPING)
     rows: dict[str, list[Any]] = {name: [] for name in ("stamp_s", "error_m", "yaw_error_rad", "state", "nees", "ms")}
     for i, k in enumerate(indices):
-        odom_pose = None if odom is None else odom[i]
+        odom_pose = None if odom is None or np.isnan(odom[i]).any() else odom[i]
         observation = Observation(drive.ranges[k], drive.angles, drive.range_max, float(clock[i]), odom_pose)
         began = time.process_time()
         posterior = estimator.update(observation)
         rows["ms"].append(round((time.process_time() - began) * 1e3, 2))
-        error = posterior.pose - drive.poses[k]
-        error[2] = se2.wrap(error[2])
+        error = se2.difference(posterior.pose, drive.poses[k])
         rows["stamp_s"].append(round(float(clock[i]), 4))
         rows["error_m"].append(round(float(np.hypot(error[0], error[1])), 5))
         rows["yaw_error_rad"].append(round(abs(float(error[2])), 5))
@@ -121,10 +119,16 @@ def trial(job: StretchJob) -> dict[str, Any]:
 
 
 def hide_kidnapping(odom: Array, first_after: int) -> Array:
-    """Odometry (N, 3) without the motion just before scan ``first_after``, as if the robot had been lifted."""
-    moved = odom.copy()
-    moved[first_after:] = se2.compose(odom[first_after - 1], se2.between(odom[first_after], odom[first_after:]))
-    return np.asarray(moved)
+    """Odometry (N, 3) without the motion just before scan ``first_after``, as if the robot had been lifted.
+
+    Where odometry is unknown, it is NaN, and the motion over unknown scans at the lift is left out, too.
+    """
+    known = np.flatnonzero(np.isfinite(odom).all(axis=1))
+    before, after = known[known < first_after], known[known >= first_after]
+    hidden = odom.copy()
+    if len(before) and len(after):
+        hidden[after] = se2.compose(odom[before[-1]], se2.between(odom[after[0]], odom[after]))
+    return np.asarray(hidden)
 
 
 def create_estimator(job: StretchJob) -> PoseEstimator:
@@ -141,8 +145,8 @@ def create_estimator(job: StretchJob) -> PoseEstimator:
 
 def particle_settings(changed: tuple[tuple[str, float], ...]) -> ParticleFilterSettings:
     """Settings of the particle filter: the tuned set, or AMCL's if "amcl_defaults" is 1, with the given changes."""
-    kinds = {"max_beams": int, "keep_initial_pose": bool}
-    values = {name: kinds[name](value) if name in kinds else value for name, value in changed}
+    types = {"max_beams": int, "keep_initial_pose": bool}
+    values = {name: types[name](value) if name in types else value for name, value in changed}
     base = AMCL_SETTINGS if values.pop("amcl_defaults", 0.0) else ParticleFilterSettings.tuned()
     return replace(base, **values)  # type: ignore[arg-type]
 

@@ -65,25 +65,25 @@ if TYPE_CHECKING:
     from services.estimator.shared.generative_models import Expected, GenerativeModel
 
 START_COVARIANCE = np.diag([0.25, 0.25, 0.09])  # m², m², rad², of a start that is given without one
-MAX_SEARCH_INTERVAL = 150  # scans between two searches without success; the interval doubles from 1
+MAX_SEARCH_INTERVAL_SCANS = 150  # between two searches without success; the interval doubles from 1
 # Probability (a guess) that a match with the local map is wrong. The match is rejected if the scan is less probable
 # than this at its pose in the map, relative to the pose that fits the map best.
 LOCAL_MISMATCH_PROBABILITY = 1e-6
-# A scan that the map predicts worse than the last one by more than this, in nats, may be matched at a wrong pose (a
-# guess). Then a wider area is searched.
-MAX_FIT_DROP = 20.0
+# A scan that the map predicts worse than the last one by more than this may be matched at a wrong pose (a guess). Then
+# a wider area is searched.
+MAX_FIT_DROP_NATS = 20.0
 # The probability that the map's errors are this large, before a key scan has shown them: guesses.
 ROUGH_MAP_PROBABILITY, ROUGH_MAP_ERROR_M = 1e-4, 0.03
 # Smaller errors of the map, divided by the scanner's noise, cannot be told from the noise of one scan (a guess).
 SIGNIFICANT_MAP_ERROR = 0.25
-# A beam at a surface that the map lacks ends at one of the map's by chance with at most this probability. The map
-# explained less than 5 to 9 % of the scan at nine of ten wrong poses in the buildings used for development.
+# A beam at a surface that the map lacks ends at one of the map's by chance with at most this probability. At nine of
+# ten wrong poses, the map explained less than 5 % of the scan (9 % in the worst of the buildings of development).
 EXPLAINED_BY_CHANCE = 0.1
 UNKNOWN_SIGMA_M = 100.0  # published where the map is unknown
-# A number of changes, or a motion, that is less probable (a guess) may be due to a kidnapping: such a motion causes a
-# search, and such a number of changes does so if another place could fit much better.
+# A motion, or a number of changes, that is less probable (a guess) may be due to a kidnapping. Such a motion causes a
+# search; such a number of changes does, too, if another place could fit much better.
 SUDDEN_CHANGE_PROBABILITY = 0.01
-MIN_GAIN = 1.0  # nats, by which a scan must be more probable at a place of the map than at an unknown one (a guess)
+MIN_GAIN_NATS = 1.0  # by which a scan must be more probable at a place of the map than at an unknown one (a guess)
 TARGET_BEAMS = 2000  # a scan with at least twice as many is thinned, because the time of a search grows with the beams
 
 
@@ -167,9 +167,10 @@ class PreciseEstimator:
         self._ignored_beams = np.zeros(0, np.bool_)  # (B,) no evidence, see `LocalMapScan.ignored`
         self._log_change = 0.0  # nats, log probability of the changes since the last scan
         self._changes = 0  # surfaces that have vanished or appeared since then
-        self._moved = self._stayed = 0  # surfaces that the map lacks, since the last key scan
-        # nats, evidence that the robot was carried between the last scan and this one, without that of this scan
-        self._log_carried = -np.inf
+        # Surfaces that the map lacks: those that have appeared since the last key scans, and those seen there
+        self._moved = self._stayed = 0
+        # nats, evidence that the robot was kidnapped between the last scan and this one, without that of this scan
+        self._log_kidnapped = -np.inf
 
     def use_model(self, model: GenerativeModel, seeds: Seeds) -> None:
         """Replaces the model by one learned from real scans in the same frame; the belief stays."""
@@ -332,7 +333,7 @@ class PreciseEstimator:
         widest = _prior_of([each[-1] for each in motions])
         predicted = np.array([expected_motion(each).mean for each in motions])
         poses, evidence = view.descend(predicted, widest)
-        if _log_fit(view, poses) < self._last_log_fit - MAX_FIT_DROP:
+        if _log_fit(view, poses) < self._last_log_fit - MAX_FIT_DROP_NATS:
             extra_starts = np.zeros((0, 3))
             if not with_odometry:
                 extra_starts = reachable_poses(self.settings.motion, self.hypotheses[0].pose, period, COARSE_SIGMA_M)
@@ -362,10 +363,10 @@ class PreciseEstimator:
         noise = self.settings.motion
         cost_by_map = motion_cost(noise, match.motions[0], match.poses[0], _inverse(by_map))
         cost_by_local = motion_cost(noise, motions, found.pose, _inverse(found.information))
-        surfaces_moved = found.moved_probability(self._moved_fraction.probability, cost_by_local - cost_by_map)
-        if found.movable_surfaces and surfaces_moved > 0.5:
+        moved_probability = found.moved_probability(self._moved_fraction.probability, cost_by_local - cost_by_map)
+        if found.movable_surfaces and moved_probability > 0.5:
             return match
-        moved = self._local_map.candidate(found, prior, surfaces_moved)
+        moved = self._local_map.candidate(found, prior, moved_probability)
         # All hypotheses share the relative motion.
         step = se2.between(self.hypotheses[0].pose, moved.mean)
         moves = [replace(moved, mean=se2.compose(each.pose, step)) for each in self.hypotheses]
@@ -512,19 +513,19 @@ class PreciseEstimator:
         ]
         self._local_pose, self._ignored_beams, self._log_change = local, ignored, log_change
 
-        log_kidnapping = max(each.log_evidence for each in self.hypotheses)
-        log_kidnapping += float(np.log(self.settings.unknown_probability))
+        log_kidnapping_prior = max(each.log_evidence for each in self.hypotheses)
+        log_kidnapping_prior += float(np.log(self.settings.unknown_probability))
         # If the robot was carried away just now, no motion had to be predicted, but all surfaces of the scan are new.
         # This counts only together with the whole scan: in a search at this scan, and for places off the map.
-        self._log_carried = log_kidnapping + hypotheses[0].motion_complexity
+        self._log_kidnapped = log_kidnapping_prior + hypotheses[0].motion_complexity
         pairs = zip(self.hypotheses, hypotheses, strict=False)
         unknown_place = self._unknown_place
         unknown_place.allow(max(self._log_mismatch(before, after) for before, after in pairs))
         # Either the surroundings have changed, or the robot was carried to another place and all surfaces are new.
         log_new = _log_unmapped_surfaces(view, small)
         unknown_place.scan_log_likelihood = max(_log_unmapped_surfaces(view, ignored) + log_change, log_new)
-        unknown_place.allow(log_kidnapping)
-        unknown_place.add_kidnapping_off_map(self._log_carried, self.settings.off_map_probability, log_new)
+        unknown_place.allow(log_kidnapping_prior)
+        unknown_place.add_kidnapping_off_map(self._log_kidnapped, self.settings.off_map_probability, log_new)
         self._set_hypotheses(hypotheses)
         if not np.array_equal(self.hypotheses[0].pose, hypotheses[0].pose):  # another hypothesis is best now
             self._local_map.place(local, self.hypotheses[0].pose)
@@ -605,7 +606,7 @@ class PreciseEstimator:
         information = best.curvature + np.linalg.inv(self.seeds.spread)
         log_places = np.log(self.seeds.volume) + 0.5 * (np.linalg.slogdet(information)[1] - 3 * np.log(2 * np.pi))
         unknown = max(
-            [self._unknown_place.log_evidence, self._log_carried, *(key.log_unknown for key in self._local_map.scans)]
+            [self._unknown_place.log_evidence, self._log_kidnapped, *(key.log_unknown for key in self._local_map.scans)]
         )
         return bool(best.log_weight <= unknown - log_places)
 
@@ -625,7 +626,7 @@ class PreciseEstimator:
 
         ``views`` are the present scan with different errors of the map; returns the one that is most probable.
         """
-        self._scans_since_search, self._search_interval = 0, min(2 * self._search_interval, MAX_SEARCH_INTERVAL)
+        self._scans_since_search, self._search_interval = 0, min(2 * self._search_interval, MAX_SEARCH_INTERVAL_SCANS)
         if self._start is not None:
             start, self._start = self._start, None
             found = search_near(views, *start, self.seeds, self.settings, self._rng)
@@ -641,13 +642,16 @@ class PreciseEstimator:
             view = _most_probable(views, self.hypotheses[0].pose)
             self._add_key_scan(view)
         else:
-            self._start_with(view, found, self.settings.off_map_probability, self.settings.off_map_probability)
+            # After a search of the whole map, a robot that is at none of these places is off the map.
+            off_map = self.settings.off_map_probability
+            self._start_with(view, found, unknown=off_map, off_map=off_map)
         return view
 
     def _search_with_map_error(self, view: View, assumed: float, start: tuple[Array, Array] | None) -> View:
         """Searches again if the first scan shows larger errors of the map than its ``view`` has, or another offset.
 
-        Errors larger than those ``assumed`` in m before this scan remain improbable. Returns the view with the errors.
+        If the error exceeds the one ``assumed`` before this scan, in m, it remains as improbable as it was. Returns the
+        view with the errors.
         """
         precision = replace(self._precision)
         if not precision.scans:
@@ -661,7 +665,7 @@ class PreciseEstimator:
             map_error=error,
             correlated_fraction=precision.correlated_fraction,
             map_offset=offset,
-            log_prior=view.log_prior if error > np.hypot(assumed, significant) else 0.0,
+            log_map_error_prior=view.log_map_error_prior if error > np.hypot(assumed, significant) else 0.0,
         )
         self.hypotheses, self._start = [], start
         return self._search_for_hypotheses([view])
@@ -673,8 +677,8 @@ class PreciseEstimator:
             views = [replace(view, map_error=max(view.map_error, elsewhere)) for view in views]
         found, view = search_everywhere(views, self.seeds, self.settings), views[0]
         small = view.surfaces.small
-        log_at_unknown_place = _log_reference(view, small) + _log_unmapped_surfaces(view, small)
-        return [each for each in found if each.scan_log_likelihood > log_at_unknown_place + MIN_GAIN] or found[:1]
+        log_at_unknown_place = view.surfaces.log_density[~small].sum()
+        return [each for each in found if each.scan_log_likelihood > log_at_unknown_place + MIN_GAIN_NATS] or found[:1]
 
     def _start_with(
         self, view: View, found: list[TrackedHypothesis], unknown: float, off_map: float, all_changed: float = 0.0
@@ -706,12 +710,12 @@ class PreciseEstimator:
 
     def _add_hypotheses(self, found: list[TrackedHypothesis], view: View) -> None:
         """Adds hypotheses: the robot may have been there since one of the key scans, or was carried there just now."""
-        stayed, surroundings = self._log_stayed(found, view)
+        if_stayed, surroundings = self._log_if_stayed(found, view)
         log_likelihood = np.array([each.scan_log_likelihood for each in found])
-        log_carried = max(self._unknown_place.log_evidence, self._log_carried)
-        carried = log_carried + log_likelihood - _log_reference(view, view.surfaces.small)
-        evidence = np.array([each.log_evidence for each in found]) + np.maximum(stayed, carried)
-        surroundings[carried >= stayed] = SURROUNDINGS_PRIOR
+        log_kidnapped = max(self._unknown_place.log_evidence, self._log_kidnapped)
+        if_kidnapped = log_kidnapped + log_likelihood - _log_reference(view, view.surfaces.small)
+        evidence = np.array([each.log_evidence for each in found]) + np.maximum(if_stayed, if_kidnapped)
+        surroundings[if_kidnapped >= if_stayed] = SURROUNDINGS_PRIOR
         # In base_link, the motion is the same at all hypotheses. A robot that was carried has moved in an unknown way.
         velocity = self.hypotheses[0].velocity
         added = [
@@ -720,39 +724,39 @@ class PreciseEstimator:
                 log_evidence=evidence[k],
                 scan_log_likelihood=0.0,
                 scan_surroundings=surroundings[k],
-                velocity=velocity if stayed[k] > carried[k] else None,
+                velocity=velocity if if_stayed[k] > if_kidnapped[k] else None,
             )
             for k, hypothesis in enumerate(found)
         ]
         best = int(np.argmax(evidence))
         if evidence[best] > self.hypotheses[0].log_weight:
             self._search_interval = 1
-            if carried[best] > stayed[best]:
+            if if_kidnapped[best] > if_stayed[best]:
                 self._restart_local_map(view)
                 unknown, off_map = self._unknown_place, self.settings.off_map_probability
-                unknown.add_kidnapping_off_map(log_carried, off_map, unknown.scan_log_likelihood)
+                unknown.add_kidnapping_off_map(log_kidnapped, off_map, unknown.scan_log_likelihood)
         self._unknown_place.exclude_mapped_places()
         self._set_hypotheses([*self.hypotheses, *added])
 
-    def _log_stayed(self, found: list[TrackedHypothesis], view: View) -> tuple[Array, Array]:
-        """Evidence (N,) in nats that the robot has been at each hypothesis since the key scan for which it is largest.
+    def _log_if_stayed(self, found: list[TrackedHypothesis], view: View) -> tuple[Array, Array]:
+        """Evidence (N,) in nats if the robot has been at each hypothesis since one key scan, that with most evidence.
 
         Also returns the probabilities (N, 3) of the surroundings of the present scan in that case.
         """
         poses = np.array([each.pose for each in found])
-        stayed = np.full((1, len(found)), -np.inf)  # the first row is for no key scan, then one row per key scan
-        first = np.tile(SURROUNDINGS_PRIOR, (1, len(found), 1))
-        surroundings = first
+        evidence = np.full((1, len(found)), -np.inf)  # the first row is for no key scan, then one row per key scan
+        prior = np.tile(SURROUNDINGS_PRIOR, (1, len(found), 1))
+        surroundings = prior
         for key in self._local_map.scans:
-            stayed = np.vstack([stayed, np.full(len(found), key.log_arrival)])
-            surroundings = np.vstack([surroundings, first])
+            evidence = np.vstack([evidence, np.full(len(found), key.log_arrival)])
+            surroundings = np.vstack([surroundings, prior])
             at_key = se2.compose(poses, se2.between(self._local_pose, key.pose))
             gain, surroundings = _log_at_poses(key.view, at_key, key.ignored, surroundings)
-            stayed += gain + key.log_change
+            evidence += gain + key.log_change
         gain, surroundings = _log_at_poses(view, poses, self._ignored_beams, surroundings)
-        stayed += gain + self._log_change
-        best, each = stayed.argmax(axis=0), np.arange(len(found))
-        return stayed[best, each], surroundings[best, each]
+        evidence += gain + self._log_change
+        best, columns = evidence.argmax(axis=0), np.arange(len(found))
+        return evidence[best, columns], surroundings[best, columns]
 
     def _finish_scan(self, view: View, observation: Observation) -> Posterior:
         """Stores what the next scan needs, and returns the posterior."""
@@ -792,7 +796,7 @@ class PreciseEstimator:
             Hypothesis(pose, covariance, hypothesis.weight)
             for pose, covariance, hypothesis in zip(poses, covariances, self.hypotheses, strict=True)
         )
-        elsewhere = 1 - best.weight * (1 - self._unknown_place.weight)
+        elsewhere = 1 - self._probability_at_best()
         return Posterior(
             state=self._state(),
             hypotheses=hypotheses,
@@ -812,9 +816,11 @@ class PreciseEstimator:
 
     def _probability(self) -> float:
         """Probability that the best hypothesis is within 0.2 m and 5 degrees of the truth."""
-        best = self.hypotheses[0]
-        at_best = best.weight * (1 - self._unknown_place.weight)
-        return at_best * self._probability_of_being_near(best)
+        return self._probability_at_best() * self._probability_of_being_near(self.hypotheses[0])
+
+    def _probability_at_best(self) -> float:
+        """Probability of the best hypothesis, also against the unknown place."""
+        return self.hypotheses[0].weight * (1 - self._unknown_place.weight)
 
     def _is_tracked(self) -> bool:
         """Whether the best hypothesis is so probable that the state is `tracking`."""
@@ -848,13 +854,13 @@ def _with_rough_map(view: View) -> View:
         view,
         map_error=float(np.hypot(view.map_error, ROUGH_MAP_ERROR_M)),
         correlated_fraction=1.0,
-        log_prior=float(np.log(ROUGH_MAP_PROBABILITY)),
+        log_map_error_prior=float(np.log(ROUGH_MAP_PROBABILITY)),
     )
 
 
 def _most_probable(views: list[View], pose: Array) -> View:
     """The one of ``views``, the same scan with different errors of the map, that is most probable at ``pose`` (3,)."""
-    return max(views, key=lambda view: view.log_prior + view.surface_evidence(pose[None]).log_likelihood[0])
+    return max(views, key=lambda view: view.log_map_error_prior + view.surface_evidence(pose[None]).log_likelihood[0])
 
 
 def _log_reference(view: View, skip: npt.NDArray[np.bool_]) -> float:

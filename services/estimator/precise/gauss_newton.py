@@ -1,7 +1,7 @@
 """Gauss-Newton descent on the free energy for many poses at once.
 
-The step is (H + P^-1)^-1 (xi + P^-1 (prior - x)). H is the Gauss-Newton Hessian of accuracy (the Fisher information of
-the density).
+The step from pose x is (H + P^-1)^-1 (xi + P^-1 (m - x)). xi is the gradient of ln p(scan | x), H the Gauss-Newton
+Hessian of -ln p (the Fisher information), m and P the mean and covariance of the prior. A small damping is added to H.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ MAX_STEP = np.array([0.5, 0.5, 0.3])  # m, m, rad: beyond this distance the line
 SETTLED_STEP = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: after a smaller step, a descent ends
 # Added in quadrature to every beam's standard deviation during a descent, so that the minimum is wide at first.
 COARSE_SIGMA_M, MEDIUM_SIGMA_M = 0.3, 0.1
-FOLLOWING_SCHEDULE_M = (0.05, 0.0, 0.0, 0.0, 0.0)  # at each step of a descent that starts near the minimum
+TRACKING_SCHEDULE_M = (0.05, 0.0, 0.0, 0.0, 0.0)  # at each step of a descent that starts near the minimum
 MAX_POLISHING_STEPS = 4
 # The errors of a map are counted as equal over this length of a surface, and as independent beyond (a guess).
 CORRELATION_LENGTH_M = 2.0
@@ -108,7 +108,7 @@ class View:
     changed_fraction: float = 0.25  # fraction of the beams that do not end at the map's first surface
     map_cell: float = 0.0  # m, edge of the cells if the map is a grid
     map_offset: float = 0.0  # m, mean distance of the real surfaces behind those that the model predicts
-    log_prior: float = 0.0  # nats, of the probability that the map's error is this large
+    log_map_error_prior: float = 0.0  # nats, log probability that the map's error is this large
     _last: deque[_PredictedScans] = field(default_factory=lambda: deque(maxlen=2), init=False, repr=False)
 
     def thinned(self, beams: int) -> View:
@@ -119,7 +119,7 @@ class View:
         return replace(self, angles=angles, ranges=ranges)
 
     def descend(
-        self, poses: Array, prior: Prior | None = None, schedule: tuple[float, ...] = FOLLOWING_SCHEDULE_M
+        self, poses: Array, prior: Prior | None = None, schedule: tuple[float, ...] = TRACKING_SCHEDULE_M
     ) -> tuple[Array, Evidence]:
         """Returns the minima near ``poses`` (N, 3), and the evidence there (see Optimiser)."""
         return self.optimiser.descend(self, poses, prior, schedule)
@@ -310,7 +310,7 @@ def limit_steps(steps: npt.NDArray[np.floating[Any]], largest: Array) -> Array:
 
 
 def polish(view: View, poses: Array) -> tuple[Array, Evidence]:
-    """Finds the minimum of the accuracy to a fraction of a millimetre, from poses (N, 3) already near it.
+    """Finds the minimum of -ln p(scan | pose) to a fraction of a millimetre, from poses (N, 3) already near it.
 
     Takes at most `MAX_POLISHING_STEPS` Gauss-Newton steps, without a prior and without evidence by surfaces, until the
     next one would be less than `SETTLED_STEP`. Returns the last poses that were evaluated, and the evidence there.

@@ -18,13 +18,16 @@ if TYPE_CHECKING:
     from services.estimator.shared.generative_models import GenerativeModel
 
 SEED_SPACING_M = 0.3  # between the places at which a search begins
-RANKED_HEADINGS, RANKED_BEAMS = 120, 72  # that are compared with the panorama of each place
-# Displacements in the laser frame (9, 2) m. A scan changes much over half of `SEED_SPACING_M`, and displacing the scan
-# costs less memory than more panoramas.
-SHIFTS_M = 0.1 * np.stack(np.meshgrid([0.0, 1.0, -1.0], [0.0, 1.0, -1.0]), axis=-1).reshape(-1, 2)
-# If there are more places, comparisons with few beams select as many of them first: one without displacements, if there
-# are more than the first number, and one with them, if there are more than the second.
-COARSELY_RANKED_PLACES, FULLY_RANKED_PLACES, PRESELECTION_BEAMS = 20_000, 1000, 24
+RANKED_HEADINGS = 120
+# Of the laser (9, 2) m, in its own frame, by a third of the spacing; the first is zero. A scan changes much over half
+# of the spacing, and comparing it as if the laser were displaced takes less memory than more panoramas.
+DISPLACEMENTS_M = 0.1 * np.stack(np.meshgrid([0, 1, -1], [0, 1, -1]), axis=-1).reshape(-1, 2)
+# A large map is ranked in stages, so that most places are compared with few beams only:
+PRESELECTION_BEAMS = 24  # or more, in the first two stages
+COARSELY_SELECTED_PLACES = 20_000  # kept by the first stage, which has no displacements
+FINELY_SELECTED_PLACES = 1000  # kept by the second stage, which has
+RANKED_BEAMS = 72  # or more, in the last stage
+MIN_HEADING_STEPS = 4  # 12 degrees, between the two headings that are kept at a place
 RANGE_STEP_M = 0.1  # of a stored range; 0 is unknown
 MAX_RANGE_STEPS = 255  # largest stored range, so that it fits a byte
 
@@ -55,67 +58,66 @@ class Seeds:
     @property
     def volume(self) -> float:
         """Volume in m² rad of the poses that the seeds represent."""
-        return max(1, len(self.places)) * SEED_SPACING_M**2 * 2 * np.pi
+        return len(self.places) * SEED_SPACING_M**2 * 2 * np.pi
 
     @cached_property
     def spread(self) -> Array:
         """Covariance (3, 3) of a completely unknown pose: uniform over the map and all headings."""
-        extent = np.ptp(self.places, axis=0) if len(self.places) else np.ones(2)
+        extent = np.ptp(self.places, axis=0)
         return np.diag([*np.maximum(extent, SEED_SPACING_M) ** 2 / 12, np.pi**2 / 3])
 
     def rank(self, view: View, count: int) -> Array:
         """The ``count`` base_link poses (count, 3) that fit the scan best, best first; at most two per place."""
-        places, panoramas, few = self.places, self.panoramas, view.thinned(PRESELECTION_BEAMS)
-        for most, shifts in ((COARSELY_RANKED_PLACES, SHIFTS_M[:1]), (FULLY_RANKED_PLACES, SHIFTS_M)):
-            if len(places) > most:
-                chosen = np.sort(np.argsort(_least_misfits(panoramas, few, shifts), kind="stable")[:most])
-                places, panoramas = places[chosen], panoramas[chosen]
-        costs, shift = _misfits(panoramas, view.thinned(RANKED_BEAMS))
-        place, heading = _select(costs, count)
-        headings = se2.wrap(heading * (2 * np.pi / RANKED_HEADINGS))
-        centres = np.column_stack([places[place], headings])
-        displacement = SHIFTS_M[shift[place, heading]]
-        lasers = se2.compose(centres, np.column_stack([displacement, np.zeros(len(place))]))
+        places, panoramas, thinned = self.places, self.panoramas, view.thinned(PRESELECTION_BEAMS)
+        stages = ((COARSELY_SELECTED_PLACES, DISPLACEMENTS_M[:1]), (FINELY_SELECTED_PLACES, DISPLACEMENTS_M))
+        for max_places, displacements in stages:
+            if len(places) > max_places:
+                misfits = _least_misfits(panoramas, thinned, displacements)
+                selected = np.sort(np.argsort(misfits, kind="stable")[:max_places])
+                places, panoramas = places[selected], panoramas[selected]
+        misfits, best_displacement = _misfits(panoramas, view.thinned(RANKED_BEAMS))
+        place, heading = _select(misfits, count)
+        lasers = np.column_stack([places[place], se2.wrap(heading * (2 * np.pi / RANKED_HEADINGS))])
+        displacements = DISPLACEMENTS_M[best_displacement[place, heading]]
+        lasers = se2.compose(lasers, np.column_stack([displacements, np.zeros(len(lasers))]))
         return se2.compose(lasers, se2.inverse(view.mount))
 
 
-def _least_misfits(panoramas: npt.NDArray[np.uint8], view: View, shifts: Array) -> npt.NDArray[np.uint16]:
+def _least_misfits(panoramas: npt.NDArray[np.uint8], view: View, displacements: Array) -> npt.NDArray[np.uint16]:
     """Misfit (S,) of a scan with each panorama, at the best heading and the best of the displacements (K, 2)."""
-    least = np.full(len(panoramas), np.iinfo(np.uint16).max, np.uint16)
-    one = np.empty_like(least)
-    for shift in shifts:
-        _compare(panoramas, view, shift, one, np.empty((0, RANKED_HEADINGS), np.uint16))
-        np.minimum(least, one, out=least)
-    return least
+    no_headings = np.empty((0, RANKED_HEADINGS), np.uint16)
+    misfits = [_compare(panoramas, view, each, no_headings) for each in displacements]
+    return np.asarray(np.min(misfits, axis=0))
 
 
 def _misfits(panoramas: npt.NDArray[np.uint8], view: View) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.intp]]:
-    """Misfit (S, H) of a scan with each panorama at each heading, and the number of the best displacement (S, H)."""
-    least = np.empty(len(panoramas), np.uint16)
-    costs = np.empty((len(SHIFTS_M), len(panoramas), RANKED_HEADINGS), np.uint16)
-    for shift, each in zip(SHIFTS_M, costs, strict=True):
-        _compare(panoramas, view, shift, least, each)
-    best = costs.argmin(axis=0)
-    return np.take_along_axis(costs, best[None], axis=0)[0], best
+    """Misfit (S, H) of a scan with each panorama at each heading, and the index (S, H) of the best displacement."""
+    misfits = np.empty((len(DISPLACEMENTS_M), len(panoramas), RANKED_HEADINGS), np.uint16)
+    for displacement, each in zip(DISPLACEMENTS_M, misfits, strict=True):
+        _compare(panoramas, view, displacement, each)
+    best = misfits.argmin(axis=0)
+    return np.take_along_axis(misfits, best[None], axis=0)[0], best
 
 
 def _compare(
-    panoramas: npt.NDArray[np.uint8],
-    view: View,
-    shift: Array,
-    least: npt.NDArray[np.uint16],
-    costs: npt.NDArray[np.uint16],
-) -> None:
-    """Fills ``least`` and ``costs`` (see `beam_sums.rank_places`), for the laser displaced by ``shift`` (2,) m."""
+    panoramas: npt.NDArray[np.uint8], view: View, displacement: Array, misfits: npt.NDArray[np.uint16]
+) -> npt.NDArray[np.uint16]:
+    """Returns the least misfit (S,) of a scan with each panorama if the laser is displaced by ``displacement`` (2,) m.
+
+    Fills ``misfits`` (S, H) with those of all headings, unless it is empty.
+    """
     used = ~(np.isnan(view.ranges) | np.isneginf(view.ranges))
     angles, ranges = view.angles[used], view.ranges[used]
-    ended = np.isfinite(ranges)
-    ends = ranges[ended, None] * np.stack([np.cos(angles[ended]), np.sin(angles[ended])], axis=-1) + shift
-    angles[ended], ranges[ended] = np.arctan2(ends[:, 1], ends[:, 0]), np.hypot(*ends.T)
+    returned = np.isfinite(ranges)
+    directions = np.stack([np.cos(angles[returned]), np.sin(angles[returned])], axis=-1)
+    end_points = ranges[returned, None] * directions + displacement
+    angles[returned], ranges[returned] = np.arctan2(end_points[:, 1], end_points[:, 0]), np.hypot(*end_points.T)
     bins = np.round(angles / (2 * np.pi / RANKED_HEADINGS)).astype(np.int64) % RANKED_HEADINGS
     words = panoramas.view(np.uint64)
-    words.flags.writeable = False  # as those of a file are: numba compiles again for others
-    beam_sums.rank_places(words, bins, _in_steps(ranges), int(_in_steps(np.array(view.range_max))), least, costs)
+    words.flags.writeable = False  # as arrays from a file are: numba would compile once more for others
+    least = np.empty(len(panoramas), np.uint16)
+    beam_sums.rank_places(words, bins, _in_steps(ranges), int(_in_steps(np.array(view.range_max))), least, misfits)
+    return least
 
 
 def _in_steps(ranges: Array) -> npt.NDArray[np.uint8]:
@@ -123,18 +125,18 @@ def _in_steps(ranges: Array) -> npt.NDArray[np.uint8]:
     return np.clip(np.round(ranges / RANGE_STEP_M), 1, MAX_RANGE_STEPS).astype(np.uint8)
 
 
-def _select(costs: npt.NDArray[np.uint16], count: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Places and headings of the ``count`` lowest costs (S, H), with at most two separate headings per place."""
-    best = np.sort(np.argsort(costs.min(axis=1), kind="stable")[:count])
+def _select(misfits: npt.NDArray[np.uint16], count: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Indices of place and heading of the ``count`` least misfits (S, H), at most two headings per place."""
+    best = np.sort(np.argsort(misfits.min(axis=1), kind="stable")[:count])
     rows = np.arange(len(best))
-    first = costs[best].argmin(axis=1)
-    rest = costs[best]
-    for offset in range(-3, 4):
-        rest[rows, (first + offset) % costs.shape[1]] = np.iinfo(np.uint16).max
+    first = misfits[best].argmin(axis=1)
+    rest = misfits[best]
+    for step in range(-MIN_HEADING_STEPS + 1, MIN_HEADING_STEPS):
+        rest[rows, (first + step) % misfits.shape[1]] = np.iinfo(np.uint16).max
     second = rest.argmin(axis=1)
     place = np.concatenate([best, best])
     heading = np.concatenate([first, second])
-    order = np.argsort(costs[place, heading], kind="stable")[:count]
+    order = np.argsort(misfits[place, heading], kind="stable")[:count]
     return place[order], heading[order]
 
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from services.estimator.precise.gauss_newton import (
     COARSE_SIGMA_M,
-    FOLLOWING_SCHEDULE_M,
     MEDIUM_SIGMA_M,
+    TRACKING_SCHEDULE_M,
     Prior,
     View,
 )
@@ -29,10 +29,11 @@ if TYPE_CHECKING:
     from services.estimator.precise.settings import PreciseSettings
 
 
-SEED_BEAMS = 75  # of a scan that is compared with the seeds
-SEED_SIGMA_M = 0.15  # typical error of a range at the nearest seed; added in quadrature to every beam's deviation
-# Added in the same way, step by step: in a descent from a seed, where more would take moved furniture for the map's,
-# and from a pose that may be half a metre off.
+SEED_EVIDENCE_BEAMS = 75  # or more, for the evidence at the ranked poses
+# Added in quadrature to every beam's deviation there, as these poses are a few centimetres and degrees off (a guess)
+SEED_SIGMA_M = 0.15
+# Added in the same way, at each step of a descent: from a seed, where larger deviations would match moved furniture to
+# the map's, and from a pose that may be half a metre off
 SEED_SCHEDULE_M = (MEDIUM_SIGMA_M, MEDIUM_SIGMA_M, 0.05, 0.05)
 NEAR_SCHEDULE_M = (COARSE_SIGMA_M, COARSE_SIGMA_M, MEDIUM_SIGMA_M, MEDIUM_SIGMA_M)
 
@@ -40,12 +41,13 @@ NEAR_SCHEDULE_M = (COARSE_SIGMA_M, COARSE_SIGMA_M, MEDIUM_SIGMA_M, MEDIUM_SIGMA_
 def search_everywhere(views: list[View], seeds: Seeds, settings: PreciseSettings) -> list[TrackedHypothesis]:
     """Returns the hypotheses that fit best in the whole map, best first.
 
-    ``views`` are the same scan with different errors of the map. Descends from those of the best seeds that have the
-    most evidence by surfaces: with few beams, and from the best results with all beams, for each view.
+    ``views`` are the same scan with different errors of the map. Ranks the seeds by their panoramas, and the best by
+    their evidence by surfaces. Descends from the best of these with few beams, and from the best results with all
+    beams, once per view.
     """
     view = views[0]
     starts = seeds.rank(view, settings.ranked_seeds)
-    fit = view.thinned(SEED_BEAMS).surface_evidence(starts, SEED_SIGMA_M).log_likelihood
+    fit = view.thinned(SEED_EVIDENCE_BEAMS).surface_evidence(starts, SEED_SIGMA_M).log_likelihood
     starts = starts[np.argsort(-fit, kind="stable")[: settings.search_starts]]
     few = view.thinned(settings.search_beams)
     poses, _ = few.descend(starts, None, SEED_SCHEDULE_M)
@@ -86,7 +88,7 @@ def search_around(view: View, starts: Array, prior: Prior, extra_starts: Array) 
     hypothesis = np.concatenate([np.arange(count), np.zeros(len(extra_starts), np.int64)])
     starts = np.concatenate([starts, extra_starts])
     repeated_prior = Prior(prior.mean[hypothesis], prior.information[hypothesis])
-    poses, evidence = view.descend(starts, repeated_prior, (*NEAR_SCHEDULE_M, *FOLLOWING_SCHEDULE_M))
+    poses, evidence = view.descend(starts, repeated_prior, (*NEAR_SCHEDULE_M, *TRACKING_SCHEDULE_M))
     of_first = np.flatnonzero(hypothesis == 0)
     log_likelihood = view.surface_evidence(poses).log_likelihood
     best = of_first[np.argmax((log_likelihood - repeated_prior.energy(poses))[of_first])]
@@ -98,18 +100,18 @@ def _best_hypotheses(
     view: View, poses: Array, evidence: Evidence, prior: Prior | None, seeds: Seeds, settings: PreciseSettings
 ) -> list[TrackedHypothesis]:
     """The hypotheses with most evidence by surfaces among ``poses`` (N, 3), best first."""
-    surfaces = view.surface_evidence(poses)
-    log_likelihood = surfaces.without(view.surfaces.small)
-    log_prior = -prior.energy(poses) if prior else np.zeros(len(poses))
-    hypotheses, kept = [], select_best(poses, log_likelihood + log_prior, settings.max_hypotheses)
+    surface_evidence = view.surface_evidence(poses)
+    log_likelihood = surface_evidence.without(view.surfaces.small)
+    log_pose_prior = -prior.energy(poses) if prior else np.zeros(len(poses))
+    hypotheses, kept = [], select_best(poses, log_likelihood + log_pose_prior, settings.max_hypotheses)
     for k, unobserved in zip(kept, unobserved_directions(view, poses[kept], evidence.curvature[kept]), strict=True):
         project_evidence(evidence, k, unobserved)
         hypothesis = hypothesis_from_search(poses[k], evidence, k, prior, seeds.volume, seeds.spread)
         hypotheses.append(
             replace(
                 hypothesis,
-                explained=float(surfaces.explained[k]),
-                log_evidence=view.log_prior + hypothesis.log_evidence + float(log_prior[k]),
+                explained=float(surface_evidence.explained[k]),
+                log_evidence=view.log_map_error_prior + hypothesis.log_evidence + float(log_pose_prior[k]),
                 scan_log_likelihood=float(log_likelihood[k]),
             )
         )

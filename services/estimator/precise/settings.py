@@ -19,7 +19,7 @@ class PreciseSettings:
     near_starts: int = 48  # poses from which a search near a given pose descends
     max_hypotheses: int = 8
 
-    # Following
+    # Tracking
     min_explained_fraction: float = 0.75  # if the map explains fewer of the beams, recent scans give the motion
 
     # Belief. The probabilities are guesses.

@@ -466,11 +466,11 @@ def test_errors_larger_than_assumed_are_improbable(assumed, improbable):
     here = np.array([3.0, CORRIDOR_Y, 0.0])
     made.restart(here, CLOSE)
     made.track(scene.observe(scene.clean(here[None])[0], 0.0))
-    view = replace(made._scan[0], log_prior=-9.0)
+    view = replace(made._scan[0], log_map_error_prior=-9.0)
     made._search_for_hypotheses([view])
     again = made._search_with_map_error(view, assumed, (here, CLOSE))
     assert again.map_error > view.map_error
-    assert again.log_prior == (-9.0 if improbable else 0.0)
+    assert again.log_map_error_prior == (-9.0 if improbable else 0.0)
 
 
 @pytest.mark.parametrize("seed", range(5))

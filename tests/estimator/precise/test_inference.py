@@ -383,7 +383,7 @@ def test_preselection(monkeypatch):
         ranges[: len(ranges) // 4] *= 0.5  # blocked
         exhaustive = seeds.rank(view(ranges), 30)
         with monkeypatch.context() as patch:
-            patch.setattr(global_seeds, "FULLY_RANKED_PLACES", len(seeds.places) // 3)
+            patch.setattr(global_seeds, "FINELY_SELECTED_PLACES", len(seeds.places) // 3)
             shared.append(len({*map(tuple, seeds.rank(view(ranges), 30))} & {*map(tuple, exhaustive)}) / 30)
     assert np.mean(shared) > 0.95
 

@@ -21,6 +21,7 @@ from lab.real_logs.drive import (
     KIDNAPPED,
     LASER,
     MAX_SEARCH_SCANS,
+    ODOMETRY,
     StretchJob,
     create_estimator,
     drive_at,
@@ -135,6 +136,21 @@ def test_odometry_of_a_kidnapping():
     assert hidden[:12] == pytest.approx(odom[:12])
     assert hidden[12] == pytest.approx(odom[11])
     assert se2.between(hidden[12], hidden[15]) == pytest.approx(se2.between(odom[12], odom[15]))
+    odom[[0, 11, 12]] = np.nan  # unknown
+    hidden = hide_kidnapping(odom, 12)
+    assert hidden[13] == pytest.approx(hidden[10])
+    assert np.isnan(hidden).all(axis=1).nonzero()[0].tolist() == [0, 11, 12]
+
+
+def test_unknown_odometry(folder, tmp_path):
+    drive = real_drive.drive(200)
+    drive = replace(drive, odom=np.where(np.arange(200)[:, None] % 50 < 5, np.nan, drive.odom))
+    real_drive.save(tmp_path / "gaps.npz", drive)
+    job = StretchJob(
+        str(tmp_path / "gaps.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), "precise", ODOMETRY, 100, 30,
+        model=str(folder / "before-precise.safetensors"),
+    )  # fmt: skip
+    assert real.summarise([one_trial(job)])["error_median_m"] < 0.05
 
 
 def test_time_of_a_kidnapping(folder):
@@ -160,7 +176,7 @@ def test_halves(count):
 def test_scans_of_training(tmp_path, count, exchanged):
     log = tmp_path / "drive.npz"
     real_drive.save(log, real_drive.drive(count))
-    first, second = split(drive_at(str(log), None))
+    first, second = split(drive_at(str(log), None, exchanged=False))
     learned, localised = (second, first) if exchanged else (first, second)
     job = StretchJob(str(log), "", None, "precise", LASER, 0, exchanged=exchanged)
     assert job.drive.poses[: job.learned] == pytest.approx(learned.poses)
@@ -178,7 +194,7 @@ def test_localised_half(folder):
     )  # fmt: skip
     found = real.summarise([one_trial(job)])  # by a model of these very scans
     assert found["error_median_m"] < 0.05
-    assert job.drive.poses[100] == pytest.approx(drive_at(where, mount).poses[0])
+    assert job.drive.poses[100] == pytest.approx(drive_at(where, mount, exchanged=False).poses[0])
     assert real.RealLogJob(folder / "drive.npz", "map.yaml", exchange=True).result == "real-drive_exchanged"
 
 

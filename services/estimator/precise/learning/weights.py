@@ -132,6 +132,7 @@ def _check_arrays(tensors: Tensors) -> None:
         or min(phi.shape) < 2
         or scales.shape != (int(np.prod(CLASSES)),)
         or places.shape[1:] != (2,)
+        or not len(places)
         or (panoramas is not None and panoramas.shape != (len(places), 2, RANKED_HEADINGS))
     ):
         raise ValueError("an array does not have the shape that a field needs")
