@@ -9,6 +9,14 @@ import sys
 from collections.abc import Callable
 
 
+def ending_signals() -> list[int]:
+    """The signals that end a process: SIGTERM, Ctrl-C, and that of a closed terminal, unless it is ignored (nohup)."""
+    numbers: list[int] = [signal.SIGTERM, signal.SIGINT]
+    if sys.platform != "win32" and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    return numbers
+
+
 def end_with_parent(parent: int, signal_number: int = signal.SIGTERM) -> None:
     """On Linux, make the kernel send ``signal_number`` to this process when its parent ends, even if it is killed.
 

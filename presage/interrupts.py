@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 
+from common.processes import ending_signals
+
 INTERRUPTS = [signal.SIGINT, signal.SIGTERM]
 if sys.platform != "win32":
     INTERRUPTS.append(signal.SIGHUP)
@@ -36,12 +38,7 @@ def interruptible() -> Iterator[None]:
     def interrupt(_signal: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    numbers = [
-        number
-        for number in INTERRUPTS
-        if number in {signal.SIGINT, signal.SIGTERM} or signal.getsignal(number) != signal.SIG_IGN
-    ]
-    with _handled_by(interrupt, numbers):
+    with _handled_by(interrupt, ending_signals()):
         yield
 
 

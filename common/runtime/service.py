@@ -17,6 +17,7 @@ from common.messages.definitions import Stamped
 from common.messages.requests import Reply, Request
 from common.messages.topics import Query, Topic
 from common.messages.wire import DecodeError
+from common.processes import ending_signals
 from common.runtime.config import ServiceSettings, load_settings
 from common.runtime.runnable import Runnable
 from common.runtime.service_loop import ServiceLoop
@@ -133,13 +134,13 @@ class _SignalHandler:
 
 
 def main(settings_class: type[S], make: Callable[[S], Service], argv: list[str] | None = None) -> None:
-    """Runs a service as a process until SIGTERM or Ctrl-C.
+    """Runs a service as a process until SIGTERM, Ctrl-C, or the end of its terminal.
 
     A UserError ends the process with status 2 and a one-line message.
     """
     handler = _SignalHandler()
-    signal.signal(signal.SIGTERM, handler)
-    signal.signal(signal.SIGINT, handler)
+    for number in ending_signals():
+        signal.signal(number, handler)
     begin_logging(settings_class.service, argv)
     try:
         settings = load_settings(settings_class, argv)

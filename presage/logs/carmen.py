@@ -71,7 +71,9 @@ def open_carmen(path: Path, reading: Reading) -> Log:
     """Opens a CARMEN log; raises UserError if it has no usable scans or an option does not fit it."""
     first_pass = _read_first_pass(path)
     if not first_pass.lasers:
-        raise UserError(f"{path}: a CARMEN log without a scan (no FLASER, ROBOTLASER1, RAWLASER1 lines)")
+        raise UserError(
+            f"{path}: a CARMEN log without scans: no lines such as FLASER, RLASER, ROBOTLASER1 or RAWLASER1"
+        )
     name = _choose_laser(path, first_pass.lasers, reading.scan_topic)
     if reading.odom_topic and (reading.odom_topic != "ODOM" or not len(first_pass.odom[0])):
         available = "ODOM lines" if len(first_pass.odom[0]) else "no ODOM lines"
@@ -195,8 +197,8 @@ def _mount(first_pass: _FirstPass, name: str, reading: Reading, notes: list[str]
         mount = np.array([float(first_pass.params.get(each, 0)) if side else 0.0 for each in names])
     except ValueError:
         mount = np.zeros(3)
-    if side == "rear":
-        mount[2] += np.pi
+    if side == "rear" and names[2] not in first_pass.params:  # logs older than this parameter, which is the whole angle
+        mount[2] = np.pi
     text = ",".join(f"{number:g}" for number in (*mount[:2], np.rad2deg(mount[2])))
     notes.append(f"assumed: the laser is mounted at {text} in base_link (change with --mount)")
     return mount, corrected, not first_pass.params.keys() & set(names)

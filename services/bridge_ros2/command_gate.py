@@ -6,6 +6,7 @@ The base needs a watchdog of its own, as ROS drivers have: if this process dies,
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Collection
 
 import numpy as np
 
@@ -33,7 +34,9 @@ class CommandGate:
         self.stopped = False  # the last command was slowed down because of an obstacle
         self._points = np.zeros((0, 2))  # of the last scan
         self._scan: tuple[int, float] | None = None  # stamp and reception time of the newest scan
-        self._periods: deque[float] = deque(maxlen=5)  # s between the last scans
+        # s between the last scans: of their stamps, and of their receptions, which is longer in a slow simulation
+        self._periods: deque[float] = deque(maxlen=5)
+        self._reception_periods: deque[float] = deque(maxlen=5)
         self._velocity: tuple[Array, float] | None = None  # from odometry, with its reception time
         self._command_stamp = -1
         self._command_at = -1e9  # when the last newer command was received
@@ -42,23 +45,19 @@ class CommandGate:
         self._stopped_at = self._stop_repeated_at = -1e9  # first and last stop after commands have ended
 
     @property
-    def _period(self) -> float:
-        """Median time between scans in s. Robust against a single gap or a change of the clock."""
-        return float(np.median(self._periods)) if self._periods else 0.0
-
-    @property
     def timeout(self) -> float:
         """Time in s without a newer command after which the robot is stopped. Longer for a slow scanner."""
-        return max(self.robot.command_timeout, 1.5 * self._period)
+        return max(self.robot.command_timeout, 1.5 * _median(self._periods), 1.5 * _median(self._reception_periods))
 
     def add_scan(self, scan: Scan, now: float) -> None:
         """Stores the scan's stamp and its obstacles."""
         if self._scan is not None:
-            before, _ = self._scan
+            before, received_at = self._scan
             if scan.stamp_ns < before:  # stamps went back: the next commands have smaller stamps too
                 self._command_stamp = -1
             else:
                 self._periods.append(min((scan.stamp_ns - before) * 1e-9, 1.0))
+                self._reception_periods.append(min(now - received_at, 1.0))
         self._scan = (scan.stamp_ns, now)
         velocity = self._current_velocity(now)
         corrected = self.self_filter.correct_and_mask(scan, np.zeros(3) if velocity is None else velocity)
@@ -84,8 +83,9 @@ class CommandGate:
         self.stopped = False
         if self.obstacle_stop:
             current = self._current_velocity(now)
-            reaction_time = max(safety.REACTION_TIME_S, 2 * self._period)
-            twist, self.stopped = safety.limit_velocity(twist, self._points, self.robot, current, reaction_time)
+            # If nothing else arrives, the robot is stopped after the timeout. The first beam of a scan is a period old.
+            hold = self.timeout + _median(self._periods) + (now - self._scan[1] if self._scan is not None else 0.0)
+            twist, self.stopped = safety.limit_velocity(twist, self._points, self.robot, current, hold)
         twist = np.where(np.abs(twist) < MIN_SPEED, 0.0, twist)
         if twist.any():
             if self.due(now) <= 0:  # a command repeated after the timeout
@@ -131,3 +131,8 @@ class CommandGate:
             return None
         self._stop_repeated_at = now
         return np.zeros(3)
+
+
+def _median(periods: Collection[float]) -> float:
+    """Median in s, robust against a single gap or a change of the clock; 0 if there are none."""
+    return float(np.median(list(periods))) if periods else 0.0

@@ -90,7 +90,7 @@ class Explorer:
 
         The exploration fails if it is another map, because the start is not known there. Returns whether that happened.
         """
-        is_another = self.active and planned.message.key_scans < self.map.message.key_scans
+        is_another = self.active and planned.is_another_than(self.map)
         if is_another:
             self._fail("mapping has started again: explore again")
         self._map_jumped |= planned.jumped_from(self.map)

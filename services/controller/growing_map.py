@@ -45,6 +45,10 @@ class PlannedMap:
         free_area_m2 = float(np.count_nonzero(message.grid.values == FREE)) * message.grid.resolution**2
         return cls(message, FreeSpaceGraph(FreeSpace.of_map(message.grid), radius), free_area_m2)
 
+    def is_another_than(self, before: PlannedMap) -> bool:
+        """Whether mapping started again after the version ``before``, so that poses in it mean nothing in this one."""
+        return self.message.key_scans < before.message.key_scans
+
     def jumped_from(self, before: PlannedMap) -> bool:
         """Whether a key scan of the version ``before`` has moved by more than `JUMP_M` in this one."""
         old, new = before.message, self.message

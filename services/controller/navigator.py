@@ -129,15 +129,19 @@ class Navigator:
             self._exploration_request = None
 
     def on_map(self, planned: PlannedMap) -> None:
-        """Uses a new version of the mapper's map for exploration, unless it has no key scans.
+        """Uses a new version of the mapper's map, unless it has no key scans. The caller passes it to the policy.
 
-        The caller passes it to the policy.
+        If mapping has started again, the goal is refused and an exploration fails.
         """
         if not len(planned.message.poses):
             return
-        self._map = planned
+        before, self._map = self._map, planned
         if self.explorer is not None and self.explorer.use_map(planned):
             self._cancel_goal()
+        if self.goal_state.active and before is not None and planned.is_another_than(before):
+            self._docking = self._ride = None
+            self.goal_state.refuse("mapping has started again: send the goal again")
+            self.policy.set_goal(None)
 
     def take_exploration_state(self) -> ExplorationState | None:
         """Returns the input for the choice of a viewpoint, or None if no choice is due.

@@ -152,6 +152,8 @@ class ControllerService(Service):
         elif isinstance(message, Goal):
             self._restored_goal = None
             self.navigator.on_goal(message)
+            if isinstance(self._wait, NoBelief):
+                self.navigator.goal_state.lose_belief("no {}: {}".format(*self._missing_input()))
             x, y, floor = message.pose.x, message.pose.y, message.map_id
             self.log.info("goal", x=x, y=y, floor=floor, cancel=message.cancel, explore=message.explore)
             self.publish(STATUS, self.navigator.status(self._last_stamp_ns))
@@ -279,15 +281,19 @@ class ControllerService(Service):
             self._process(self._wait.belief)
             return
         self._wait = NoBelief()
-        missing, question = "belief", "is the estimator running?"
-        if self.navigator.waits_for_scan:
-            missing, question = "scan", "is the simulation paused, or the scanner silent?"
+        missing, question = self._missing_input()
         reason = f"no {missing} for {self.settings.belief_timeout:g} s: {question}"
         # A robot that stands may well wait for a search of the whole map, as after `presage relocalise`.
         if self._last_answer is not None and self._last_answer.command.twist.array().any():
             self.log.warning("stopping the robot", reason=reason)
         self.counters["belief_timeouts"] += 1
         self._send(self.navigator.stop_without_belief(self._last_stamp_ns, reason))
+
+    def _missing_input(self) -> tuple[str, str]:
+        """What does not arrive, and the question that helps to find out why."""
+        if self.navigator.waits_for_scan:
+            return "scan", "is the simulation paused, or the scanner silent?"
+        return "belief", "is the estimator running?"
 
     def _use_map(self, planned: PlannedMap) -> None:
         assert self.geodesic is not None  # noqa: S101 - it plans in the map

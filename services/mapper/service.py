@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import ClassVar
 
@@ -156,15 +157,16 @@ def save_map(folder: Path, name: str, mapper: Mapper) -> Path:
         raise UserError(f"name {name!r}: give up to 64 letters, digits, - and _, and not the name of a shipped world")
     path = folder.resolve() / f"{name}.yaml"
     files = [path.with_suffix(suffix) for suffix in (".yaml", ".pgm", ".tum")]
-    if existing := next((file for file in files if file.exists()), None):
-        raise UserError(f"{existing} exists already: choose another name")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        if existing := next((file for file in files if file.exists()), None):
+            raise UserError(f"{existing} exists already: choose another name")
         write_grid(path.parent, name, mapper.draw())
         write_tum(path.with_suffix(".tum"), *mapper.trajectory())
     except OSError as error:
         for file in files:  # so that the name is free for the next attempt
-            file.unlink(missing_ok=True)
+            with suppress(OSError):
+                file.unlink()
         raise UserError(f"{path}: cannot be written ({error.strerror}): choose another folder with --maps") from None
     return path
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from typing import ClassVar
 
 from common.bus.inbox import OTHERS, Sample
@@ -47,6 +49,7 @@ class RecorderService(Service):
         self._opened_at = 0.0
         self._may_be_silent = True  # until a service or a message of another was noticed
         self._silence = ""  # why no messages arrive, as far as is known
+        self._failure = ""  # why the last recording ended by itself
 
     def open(self) -> None:
         """Begins to record, unless idle, and starts to collect the services' descriptions."""
@@ -68,7 +71,8 @@ class RecorderService(Service):
             self.loop.inbox.dropped[OTHERS] += 1
             self.counters["messages_rejected"] += 1
             return
-        self.recording.write(sample)
+        with self._surviving_failures():
+            self.recording.write(sample)
         self.counters["written"] += 1
         self.counters["written_bytes"] += len(sample.payload)
 
@@ -94,6 +98,7 @@ class RecorderService(Service):
     def _begin(self, *, numbered: bool) -> None:
         """Opens a new file, writes the known descriptions, and queries them again in case the world has changed."""
         self.recording = OpenRecording(self.options, self.inputs, self.loop.inbox, numbered=numbered)
+        self._failure = ""
         self._update_note()
         self.log.info("recording", file=self.recording.state().file)
         if self.descriptions is not None:
@@ -151,7 +156,21 @@ class RecorderService(Service):
         self._write_descriptions()
         self._warn_if_silent()
         if self.recording is not None:
-            self.recording.writer.flush()
+            with self._surviving_failures():
+                self.recording.writer.flush()
+
+    @contextmanager
+    def _surviving_failures(self) -> Iterator[None]:
+        """If recordings are started on request, ends only the recording, not the service, when a file fails."""
+        try:
+            yield
+        except UserError as error:
+            if not self.options.idle or self.recording is None:
+                raise
+            self.log.warning("the recording has ended", reason=str(error))
+            self._failure = str(error)
+            with suppress(UserError):  # the file cannot be completed either, and this was logged
+                self._end()
 
     def close(self) -> None:
         """Writes the messages that are still queued and completes the file."""
@@ -210,7 +229,10 @@ class RecorderService(Service):
     def _update_note(self) -> None:
         """Sets the note in the health message."""
         self.idle = self.recording is None
-        self.note = self._silence or ("not recording until a request starts it" if self.idle else "")
+        idle = (
+            f"the recording has ended: {self._failure}" if self._failure else "not recording until a request starts it"
+        )
+        self.note = self._silence or (idle if self.idle else "")
 
     def _write_descriptions(self) -> None:
         if self.descriptions is None:

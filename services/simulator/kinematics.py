@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Kinematics:
-    """Physics without an engine: the wheels reach every velocity within the limits at once, and do not slip.
+    """Physics without an engine: the robot moves at the velocity that `Actuator` computes, until a contact stops it.
 
     A step that would bring the robot's body nearer than its radius to a wall, a piece of furniture or a person is not
     taken, but the robot may turn. pybullet's robot slides along the wall instead.

@@ -246,6 +246,8 @@ class SimulatorService(Service):
         return Reply()
 
     def _pause(self, *, paused: bool) -> None:
+        if paused == self.paused:
+            return
         self.paused = paused
         self._update_note()
         self._next_step_s = time.monotonic()
@@ -281,7 +283,7 @@ class SimulatorService(Service):
             return Reply(ok=False, reason=f"the pace is {self.settings.pace}: {reason}; a speed needs --pace realtime")
         self.speed = factor
         self._update_clock_factor()
-        # A slow pace may have put the next step far ahead.
+        # At a low speed, the next step may be far ahead.
         self._next_step_s = min(self._next_step_s, time.monotonic() + self._period_s)
         self._update_note()
         self.log.info("speed", factor=factor)

@@ -159,8 +159,7 @@ class Simulation:
             return np.zeros(3)
         if not self.setup.obstacle_stop:
             return self._command[1]
-        # Each period ends with a velocity from which the robot can brake without contact. If no other velocity does, it
-        # brakes.
+        # After this period, the robot must still be able to brake without contact; else it brakes now.
         target, self._stopped = safety.limit_velocity(
             self._command[1], self._scan_points, self.setup.robot, self._actuator.velocity, self.period_ns * 1e-9
         )

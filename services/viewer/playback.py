@@ -65,8 +65,7 @@ class Playback:
         ``alive`` returns whether the replay's service is alive. Raises UserError if there is no such recording or it
         cannot be played.
         """
-        if name not in {path.name for path in self.folder.glob("*.mcap")}:
-            raise UserError(f"no recording {name!r} in {self.folder}")
+        self.check(name)
         with self._lock:
             self._end()
             wait_until(lambda: not alive() or self._leaving, STOP_TIMEOUT_S)
@@ -78,6 +77,11 @@ class Playback:
                 return
             reason = self._end() or f"it did not start within {START_TIMEOUT_S:g} s"
         raise UserError(f"{name} cannot be played: {reason}")
+
+    def check(self, name: str) -> None:
+        """Raises UserError if there is no such recording."""
+        if name not in {path.name for path in self.folder.glob("*.mcap")}:
+            raise UserError(f"no recording {name!r} in {self.folder}")
 
     def close(self) -> None:
         """Ends the replay, if there is one."""

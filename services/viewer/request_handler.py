@@ -125,6 +125,7 @@ class RequestHandler:
 
     async def _open(self, visitor: Visitor, name: str) -> ActionResult:
         context, robot = self.context, self.context.playback.robot
+        await self._in_thread(context.playback.check, name)
         try:
             await self._in_thread(context.playback.open, name, lambda: "replay" in context.roster.services(robot))
         finally:  # the recording that was open before is closed even if this one cannot be opened

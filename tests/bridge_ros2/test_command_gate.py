@@ -126,3 +126,36 @@ def test_time_set_back():
     gate.command(command(9000), 0.0)
     gate.add_scan(scan(100), 0.1)
     assert gate.command(command(100), 0.1) is not None
+
+
+@pytest.mark.parametrize("rate", [40, 15, 10, 5])
+@pytest.mark.parametrize("gap", [0.6, 0.4, 0.2])
+def test_commands_end_before_a_wall(rate, gap):
+    """The robot drives at a wall, and no command comes any more from ``gap`` m on; it brakes as gently as it states."""
+    robot, step_s, pipeline_s = Robot(), 1e-3, 0.02
+    gate, x, speed, wanted, wall = CommandGate(robot), 0.0, 0.0, 0.0, 3.0
+    for k in range(10_000):
+        now = k * step_s
+        gate.add_velocity(np.array([speed, 0, 0]), now)
+        if k % (1000 // rate) == 0:
+            gate.add_scan(scan(k, ahead=wall - x), now)
+            scanned = k
+        if now == pytest.approx(scanned * step_s + pipeline_s) and wall - x - robot.radius > gap:
+            sent = gate.command(command(scanned, vx=1.0), now)
+            wanted = wanted if sent is None else sent[0]
+        if gate.moving and gate.due(now) <= 0 and gate.stop_for_silence(now) is not None:
+            wanted = 0.0
+        speed += np.clip(wanted - speed, -robot.acceleration * step_s, robot.acceleration * step_s)
+        x += speed * step_s
+    assert speed == 0.0
+    assert 0.0 < wall - x - robot.radius < gap
+
+
+def test_simulation_slower_than_real_time():
+    """Commands come at the rate of the scans, which is lower than their stamps say."""
+    gate = driving()
+    for k in range(1, 20):
+        now = k / 5 / 0.6  # 5 Hz of simulated time
+        assert k < 3 or gate.due(now) > 0
+        gate.add_scan(scan(1000 + 200 * k), now)
+        gate.command(command(1000 + 200 * k), now)

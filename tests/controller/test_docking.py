@@ -90,3 +90,18 @@ def test_commands_under_way():
     ahead = command.motion_until_effect(300_000_000, 0.15)
     assert ahead == pytest.approx([0.05 * 0.2 + 0.1 * 0.4, 0, 0])
     assert not command.motion_until_effect(300_000_000, 0.0).any()
+
+
+@pytest.mark.parametrize("gap_s", [10.0, 2.0])
+def test_acceleration_after_a_gap(gap_s):
+    """While nothing is commanded, or when the clock steps, the base has not moved on to the next velocity."""
+    command, points, period_ns = VelocityCommand(Robot()), np.zeros((0, 2)), 66_666_667
+    for k in range(5):
+        command.limit(k * period_ns, np.array([0.2, 0.0, 0.0]), points)
+    before = command.velocity
+    command.limit(4 * period_ns + round(gap_s * 1e9), np.array([-1.0, 0.0, 0.0]), points)
+    assert np.hypot(*(command.velocity - before)[:2]) <= 2 * period_ns * 1e-9 + 1e-9
+    fresh = VelocityCommand(Robot())
+    fresh.limit(0, np.ones(3), points)
+    fresh.limit(round(gap_s * 1e9), np.array([1.0, 0.0, 0.0]), points)
+    assert fresh.velocity[0] <= Robot().command_timeout

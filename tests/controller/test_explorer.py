@@ -459,3 +459,18 @@ def test_a_viewpoint_that_did_not_move_with_the_map_is_not_given_up():
     robot.until(lambda _: robot.navigator.goal_state.phase is Phase.REFUSED)
     assert robot.navigator.explorer.viewpoint_due
     assert len(robot.navigator.take_exploration_state().unreachable) == 0
+
+
+def test_a_goal_in_a_map_that_began_again():
+    """Its coordinates mean another place now."""
+    robot = PerfectRobot()
+    robot.use_map(map_with(START, (3.0, 2.5, 0.0)))
+    robot.navigator.on_goal(goal(8, 2.5))
+    robot.until(lambda _: robot.pose[0] > START[0] + 0.5)
+    robot.use_map(map_with(START, (3.0, 2.5, 0.0), (4.0, 2.5, 0.0)))
+    assert robot.step().state == "navigating"
+    robot.use_map(map_with(START))
+    status = robot.step()
+    assert status.refused
+    assert "mapping has started again: send the goal again" in status.reason
+    assert robot.until(lambda _: not robot.navigator._command.velocity.any()).refused

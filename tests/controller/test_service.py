@@ -13,7 +13,7 @@ from common.errors import UserError
 from common.geometry.occupancy_grid import FREE, OccupancyGrid
 from common.messages.definitions import Map
 from common.messages.requests import PredictReply, Reply
-from common.messages.topics import BELIEF, CMD_VEL, MAP, MAX_BYTES, PREDICT, SCAN
+from common.messages.topics import BELIEF, CMD_VEL, GOAL, MAP, MAX_BYTES, PREDICT, SCAN, STATUS
 from common.runtime.service import ServiceLoop
 from services.controller import service as shell
 from services.controller.policies.active_localisation import CandidateViewpoints
@@ -116,6 +116,18 @@ def test_a_repeated_map_is_not_planned_in_again(monkeypatch):
     for message in (first, first.model_copy(update={"stamp_ns": 2, "seq": 1}), moved, first):
         service.on_message(MAP, message)
     assert planned == [first, moved, first]
+
+
+def test_goal_without_beliefs():
+    service, bus = ControllerService(ControllerSettings(world="", preset="paper")), FakeBus()
+    ServiceLoop(service, bus, Inbox())
+    service.open()
+    service.on_message(GOAL, goal(8, 2))
+    (status,) = (STATUS.message.decode(payload) for topic, payload in bus.sent if topic is STATUS)
+    assert (status.state, status.reason) == ("lost", "no belief: is the estimator running?")
+    service.on_message(SCAN, scan(0, POSE, ROOM))
+    service.on_message(BELIEF, belief(0, POSE))
+    assert service.navigator.goal_state.status(0, None).state == "navigating"
 
 
 @pytest.mark.parametrize("drives", [False, True])

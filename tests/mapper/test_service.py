@@ -119,3 +119,6 @@ def test_a_failed_save_leaves_the_name_free(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
     monkeypatch.undo()
     assert service.save_map(tmp_path, "here", mapper) == tmp_path / "here.yaml"
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    with pytest.raises(UserError, match="choose another folder with --maps"):
+        service.save_map(tmp_path / "file", "here", mapper)

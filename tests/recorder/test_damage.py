@@ -17,6 +17,9 @@ from rich.console import Console
 
 from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
+from common.messages.requests import RecordRequest
+from common.messages.topics import RECORDING
+from common.runtime.service import ServiceLoop
 from presage.recordings.info import collect_facts
 from presage.recordings.printing import info
 from services.recorder import recording
@@ -25,7 +28,9 @@ from services.recorder.files.writer import PROFILE, RecordingWriter
 from services.recorder.reader import read_recording
 from services.recorder.recording import OpenRecording
 from services.recorder.recover import recover
+from services.recorder.service import RecorderService
 from services.recorder.settings import RecorderSettings
+from tests.process_replay.harness import FakeBus
 from tests.recorder.sessions import on_full_disk
 from tests.recorder.test_recover import COMPRESSIONS, SENT, damaged, message, messages_in, write_chunks
 
@@ -114,6 +119,24 @@ def test_full_disk_from_the_beginning(tmp_path, monkeypatch):
     with pytest.raises(UserError, match=r"No space left.* it holds no message: free some space"):
         OpenRecording(RecorderSettings(directory=tmp_path), (), Inbox())
     assert list(tmp_path.iterdir()) == []
+
+
+def test_full_disk_of_a_recorder_on_request(tmp_path):
+    service = RecorderService(RecorderSettings(directory=tmp_path, idle=True, compression="none", chunk_size=1024))
+    loop = ServiceLoop(service, FakeBus(), Inbox())
+    service.open()
+    assert service.on_request(RECORDING, RecordRequest(action="start")).recording
+    on_full_disk(service.recording.writer.part, 40_000)
+    for number in range(200):
+        topic, payload = message(number)
+        service.on_sample(Sample(topic, topic.key("robot"), payload, number, number))
+    assert service.recording is None
+    assert "No space left" in service.note
+    service.on_timer()
+    assert service.on_request(RECORDING, RecordRequest(action="start")).recording
+    assert not service.note
+    service.close()
+    assert loop.failed == 0
 
 
 def test_clock_that_is_set(tmp_path, monkeypatch):

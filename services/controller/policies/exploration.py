@@ -3,9 +3,10 @@
 The candidates are tours: from the robot through viewpoints, from which a scan sees the frontier between known free and
 unknown space, and back to where exploration began. The expected free energy of a tour in nats is
 
-    G(tour) = NATS_PER_METRE * length - information about the map
+    G(tour) = NATS_PER_METRE * cost - information about the map
 
-A scan shows whether a frontier cell is free or occupied, which is worth ln 2, times `MISS_PROBABILITY` for each earlier
+The cost is the length of the path in m, where a metre near a wall counts for up to two. A scan shows whether a frontier
+cell is free or occupied, which is worth ln 2, times `MISS_PROBABILITY` for each earlier
 scan that should have shown it and did not. At `MIN_VIEWPOINT_NATS` a viewpoint is worth a detour of 150 m, so the tour
 has all that are worth a stop (up to `MAX_VIEWPOINTS`), by a short path (as Kulich, Faigl & Preucil 2011 choose goals).
 The robot drives only to its first viewpoint, as the next map has another frontier.
@@ -82,7 +83,7 @@ class ExplorationState:
     home: Array  # (2,) m in map, where the tour ends
     target: Array | None  # (2,) m in map, the viewpoint to which the robot drives now
     unreachable: Array  # (N, 2) m in map, viewpoints that were given up
-    goal_count: int = 0  # goals of users when the choice was requested; after another one, it is not used
+    goal_count: int = 0  # goals of users so far; if it has changed when the choice is made, the choice is not used
 
 
 @dataclass(frozen=True)
@@ -124,8 +125,9 @@ def choose_viewpoint(state: ExplorationState) -> Viewpoint | NoPath | None:
     min_clearance = known.min_clearance
     if frontier.nats.sum() >= MIN_VIEWPOINT_NATS and known.nearest_free(state.pose[:2], min_clearance) is None:
         return NoPath(
-            f"cannot plan a path from here: no place within {min_clearance:.2f} m of the robot is known to be free for "
-            f"{min_clearance:.2f} m around; drive the robot to where there is more room, and explore again"
+            f"cannot plan a path from here: there is no place within {min_clearance:.2f} m of the robot with "
+            f"{min_clearance:.2f} m of known free space around it; drive the robot to where there is more room, and "
+            "explore again"
         )
     candidates = find_candidates(state, frontier, known)
     selected = select_viewpoints(candidates.sees, frontier.nats, candidates.target)
@@ -259,7 +261,7 @@ def _cost_of(cost: Array, tour: Sequence[int]) -> float:
 
 
 def _travel_costs(graph: FreeSpaceGraph, places: Sequence[Array]) -> Array:
-    """Costs (N, N) m of the paths between places (2,) m; an unknown path counts as very long."""
+    """Costs (N, N) m of the paths between places (2,) m; a path to or from a place in unknown space is very long."""
     longest = 10.0 * sum(graph.grid.shape) * graph.grid.resolution
     cells = graph.grid.cell_of(np.array(places))
     rows = []
@@ -267,7 +269,7 @@ def _travel_costs(graph: FreeSpaceGraph, places: Sequence[Array]) -> Array:
         field = graph.cost_field(place, MAX_SHIFT_M)
         rows.append(np.full(len(cells), longest) if field is None else np.minimum(field.cost.ravel()[cells], longest))
     cost = np.array(rows)
-    return np.asarray(np.minimum(cost, cost.T))  # an end outside the known space costs inf, a start does not
+    return np.asarray(np.minimum(cost, cost.T))  # a path may begin, but not end, beside the known space
 
 
 def _opaque(free: FreeSpace) -> Mask:

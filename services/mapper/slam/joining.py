@@ -1,4 +1,4 @@
-"""Finds the pose in the map of a piece of the drive, after the robot was kidnapped.
+"""Finds the pose of a piece of the drive in the map, after the robot was kidnapped.
 
 Submaps of the piece are searched for in the whole map. The rest of the piece distinguishes places that look alike: it
 is joined only if two of its submaps agree on its pose, no submap contradicts it, and no other pose is as good. If a

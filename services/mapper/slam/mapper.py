@@ -70,7 +70,7 @@ class Mapper:
         return self._front_end.key_scans()
 
     def update(self, scans: KeyScanGraph) -> MapSnapshot:
-        """The map of the key scans, after loop closing if they complete a submap."""
+        """The map of the key scans. Loops are closed after every `KEY_SCANS_PER_SUBMAP` key scans."""
         back_end = self._back_end
         submaps_before = len(back_end.poses) // KEY_SCANS_PER_SUBMAP
         back_end.extend(scans)

@@ -125,7 +125,7 @@ def compare_submaps(first: Submap, surface: Surface, second: Submap, pose: Array
 
 
 def _count_contradicting(scans: PosedScans, elements: Elements) -> int:
-    """Number of elements through which scans saw, in connected lines, beam by beam, longer than a person is wide."""
+    """Number of elements through which scans saw, and that form connected lines longer than a person is wide."""
     points = elements.points[scans.see_through(elements)]
     if len(points) == 0:
         return 0

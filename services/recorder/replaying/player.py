@@ -11,7 +11,8 @@ from collections.abc import Collection, Iterable, Mapping
 
 from common.errors import UserError
 from common.messages.requests import PlayerReply, PlayerRequest
-from common.messages.topics import CMD_VEL, HEALTH, ROOT, TOPICS, Topic
+from common.messages.topics import CMD_VEL, DRIVE, GOAL, HEALTH, ROOT, TOPICS, Topic
+from common.runtime.service_monitor import SUBSTITUTES
 
 MAX_LAG_S = 1.0  # a replay that lags further behind continues from its position instead of catching up
 MAX_STEPS = 10_000  # in one request
@@ -153,8 +154,8 @@ def robot_of(key: str) -> str:
 def find_conflicts(keys: Mapping[str, Topic], alive: Mapping[str, Collection[str]]) -> str:
     """Explains which live services (``alive``, by robot) publish the same keys. Returns an empty string if none do.
 
-    Topics without a rate, such as `goal`, may have several publishers and never conflict. Velocity commands also
-    conflict with a live simulator, because it would execute them.
+    Topics without a rate, such as `status`, may have several publishers. What makes a live robot move conflicts, too:
+    velocity commands if there is a simulator or a bridge, goals and manual velocities if there is a controller.
     """
     found: dict[tuple[str, str], list[str]] = {}
     driven: list[str] = []
@@ -162,18 +163,20 @@ def find_conflicts(keys: Mapping[str, Topic], alive: Mapping[str, Collection[str
         robot = robot_of(key)
         services = set(alive.get(robot, ()))
         publisher = key.rsplit("/", 1)[-1] if topic.per_service else topic.publisher
-        for service in {publisher, "replay"} & services if topic.rate else ():
+        publishers = {publisher, SUBSTITUTES.get(publisher, publisher), "replay"}
+        for service in publishers & services if topic.rate else ():
             found.setdefault((robot, service), []).append(key)
-        if topic is CMD_VEL and "simulator" in services:
+        obeyed_by = {CMD_VEL: {"simulator", SUBSTITUTES["simulator"]}, GOAL: {"controller"}, DRIVE: {"controller"}}
+        if obeyed_by.get(topic, set()) & services:
             driven.append(key)
     reasons = [
         f"the {service} of {robot!r} is alive and publishes {', '.join(held)}"
         for (robot, service), held in sorted(found.items())
     ]
-    reasons += [f"{key} would drive the live simulator" for key in driven]
+    reasons += [f"{key} would drive the live robot" for key in driven]
     if not reasons:
         return ""
-    names = sorted({keys[key].name for held in found.values() for key in held} | {CMD_VEL.name for _ in driven})
+    names = sorted({keys[key].name for held in (*found.values(), driven) for key in held})
     return (
         f"conflict with a live publisher: {'; '.join(reasons)}; leave them out with --except {','.join(names)}, use "
         "other keys with --robot NAME, or publish anyway with --force"

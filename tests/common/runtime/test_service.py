@@ -166,7 +166,9 @@ def test_failing_timer(bus, process):
     assert wait_until(lambda: len(beside.commands) == 1, WAIT_TIMEOUT_S)
 
 
-@pytest.mark.parametrize(("number", "step_s"), [(signal.SIGTERM, 0), (signal.SIGINT, 0), (signal.SIGTERM, 1.0)])
+@pytest.mark.parametrize(
+    ("number", "step_s"), [(signal.SIGTERM, 0), (signal.SIGINT, 0), (signal.SIGHUP, 0), (signal.SIGTERM, 1.0)]
+)
 def test_signals(small, number, step_s):
     if step_s:
         small.goal(step_s)

@@ -184,7 +184,7 @@ def test_nothing_is_left_to_see():
 def test_too_little_room_to_plan():
     result = choose_viewpoint(exploration_state_of(CORRIDOR, radius=0.35))
     assert isinstance(result, NoPath)
-    assert "cannot plan a path from here: no place within 0.43 m" in result.reason
+    assert "cannot plan a path from here: there is no place within 0.43 m" in result.reason
     assert choose_viewpoint(exploration_state_of(CLOSED, radius=0.35)) is None  # nothing is left to see
 
 

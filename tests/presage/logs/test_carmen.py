@@ -158,6 +158,10 @@ def test_parameters_of_lasers(tmp_path, name, range_max):
     assert log.range_max == range_max
     assert log.mount[0] == {"FLASER": 0.3, "RLASER": -0.4, "LASER3": 0.0}[name]
     assert log.mount_assumed == (name == "LASER3")  # no PARAM states it
+    assert log.mount[2] == (np.pi if name == "RLASER" else 0.0)
+    params += ["PARAM robot_frontlaser_angular_offset 0.1 h 0", "PARAM robot_rearlaser_angular_offset 3.1 h 0"]
+    log, _ = read(write(tmp_path, [*params, line.format(1), line.format(2)]))
+    assert log.mount[2] == {"FLASER": 0.1, "RLASER": 3.1, "LASER3": 0.0}[name]
 
 
 def test_garbled_poses_cost_no_scan(tmp_path):
@@ -230,7 +234,7 @@ def test_refusals(tmp_path):
     without_odom = [line for line in carmen() if not line.startswith("ODOM")]
     for lines, odom_topic, why in (
         (cut, "", "too few usable scans: 3; left out: garbled lines: 9"),
-        (["ODOM 0 0 0 0 0 0 1 h 1"], "", "without a scan"),
+        (["ODOM 0 0 0 0 0 0 1 h 1"], "", "without scans"),
         (carmen(), "ODOMETRY", r"odom.topic ODOMETRY: .* only have ODOM, and this one has ODOM lines"),
         (without_odom, "ODOM", "no ODOM lines"),
     ):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from common.errors import UserError
 from common.messages.requests import PlayerRequest
-from common.messages.topics import BELIEF, CMD_VEL, GOAL, HEALTH, ODOM, SCAN, TOPICS
+from common.messages.topics import BELIEF, CMD_VEL, DRIVE, GOAL, HEALTH, ODOM, SCAN, TOPICS
 from services.recorder.replaying.player import (
     LOOP_GAP_S,
     MAX_LAG_S,
@@ -177,6 +177,14 @@ def test_conflicts():
 
 
 def test_conflicts_of_commands_and_goals():
-    assert "would drive the live simulator" in find_conflicts({CMD_VEL.key("r"): CMD_VEL}, {"r": {"simulator"}})
-    assert find_conflicts({CMD_VEL.key("r"): CMD_VEL}, {"r": {"estimator"}}) == ""
-    assert find_conflicts({GOAL.key("r"): GOAL}, {"r": {"simulator", "controller", "viewer"}}) == ""
+    for topic, service in (
+        (CMD_VEL, "simulator"),
+        (CMD_VEL, "bridge_ros2"),
+        (GOAL, "controller"),
+        (DRIVE, "controller"),
+    ):
+        conflict = find_conflicts({topic.key("r"): topic}, {"r": {service, "viewer"}})
+        assert f"{topic.key('r')} would drive the live robot" in conflict
+        assert f"--except {topic.name}," in conflict
+        assert find_conflicts({topic.key("r"): topic}, {"r": {"estimator", "viewer"}}) == ""
+    assert "the bridge_ros2 of 'r'" in find_conflicts({SCAN.key("r"): SCAN}, {"r": {"bridge_ros2"}})
