@@ -71,11 +71,21 @@ def search_near(
     starts = rng.multivariate_normal(pose, covariance, settings.near_starts)
     starts[0] = pose
     prior = Prior.repeated(len(starts), pose, covariance)
-    poses, _ = views[0].descend(starts, prior, NEAR_SCHEDULE_M)
-    fit = views[0].surface_evidence(poses, NEAR_SCHEDULE_M[-1]).log_likelihood - prior.energy(poses)
+    # More than the starts are off would lead all of them to the same minimum, which may be a wrong one.
+    largest = max(MEDIUM_SIGMA_M, _range_deviation(views[0], covariance))
+    schedule = tuple(min(each, largest) for each in NEAR_SCHEDULE_M)
+    poses, _ = views[0].descend(starts, prior, schedule)
+    fit = views[0].surface_evidence(poses, schedule[-1]).log_likelihood - prior.energy(poses)
     starts = poses[select_best(poses, fit, settings.search_results)]
     prior = Prior.repeated(len(starts), pose, covariance)
     return _best_first([_best_hypotheses(each, *each.descend(starts, prior), prior, seeds, settings) for each in views])
+
+
+def _range_deviation(view: View, covariance: Array) -> float:
+    """Standard deviation in m of the ranges that are expected from a pose with ``covariance`` (3, 3)."""
+    position = np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])
+    typical_range = np.median(view.ranges[view.returned]) if view.returned.any() else 0.0
+    return float(np.hypot(position, np.sqrt(covariance[2, 2]) * typical_range))
 
 
 def search_around(view: View, starts: Array, prior: Prior, extra_starts: Array) -> tuple[Array, Evidence]:
