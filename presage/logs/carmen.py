@@ -19,7 +19,7 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from common.robot.ranges import normalise_driver_ranges
 from presage.logs.carmen_lines import LINE_TYPE, LaserLine, is_laser, laser_line, pose_line
-from presage.logs.log import Log, LoggedScan, Reading
+from presage.logs.log import Clock, Log, LoggedScan, Reading
 from presage.logs.pose_track import PoseTrack
 from presage.logs.resampling import resample
 
@@ -52,6 +52,7 @@ FIRST_PASS_SCANS = 100  # scans of each laser from which the maximum range and t
 FRONT = ("FLASER", "ROBOTLASER1", "RAWLASER1")
 REAR = ("RLASER", "ROBOTLASER2", "RAWLASER2")
 POSE_LINES = ("ODOM", "TRUEPOS")
+CLOCKS: tuple[Clock, Clock] = ("sensor", "logger")  # in the order of the stamps of a line
 
 
 @dataclass
@@ -62,9 +63,9 @@ class _FirstPass:
     lasers: Counter[str] = field(default_factory=Counter)  # lines by name
     firsts: dict[str, list[LaserLine]] = field(default_factory=dict)  # the first lines of each laser
     mounts: dict[str, tuple[Array, Array]] = field(default_factory=dict)  # minimum and maximum of laser in base_link
-    # Poses by ipc stamp, and by logger stamp.
-    odom: tuple[PoseTrack, PoseTrack] = field(default_factory=lambda: (PoseTrack(), PoseTrack()))
-    true: tuple[PoseTrack, PoseTrack] = field(default_factory=lambda: (PoseTrack(), PoseTrack()))
+    # Poses by the sensor's stamps (ipc), and by the logger's.
+    odometry: dict[Clock, PoseTrack] = field(default_factory=lambda: {clock: PoseTrack() for clock in CLOCKS})
+    reference: dict[Clock, PoseTrack] = field(default_factory=lambda: {clock: PoseTrack() for clock in CLOCKS})
 
 
 def open_carmen(path: Path, reading: Reading) -> Log:
@@ -75,8 +76,8 @@ def open_carmen(path: Path, reading: Reading) -> Log:
             f"{path}: a CARMEN log without scans: no lines such as FLASER, RLASER, ROBOTLASER1 or RAWLASER1"
         )
     name = _choose_laser(path, first_pass.lasers, reading.scan_topic)
-    if reading.odom_topic and (reading.odom_topic != "ODOM" or not len(first_pass.odom[0])):
-        available = "ODOM lines" if len(first_pass.odom[0]) else "no ODOM lines"
+    if reading.odom_topic and (reading.odom_topic != "ODOM" or not len(first_pass.odometry["sensor"])):
+        available = "ODOM lines" if len(first_pass.odometry["sensor"]) else "no ODOM lines"
         raise UserError(
             f"{path}: odom_topic {reading.odom_topic}: a CARMEN log can only have ODOM, and this one has {available}"
         )
@@ -98,19 +99,19 @@ def open_carmen(path: Path, reading: Reading) -> Log:
         notes=notes,
         mount_assumed=assumed,
     )
-    odom = first_pass.odom[clock] if first.robot is None or reading.odom_topic == "ODOM" else None
-    true = first_pass.true[clock] if len(first_pass.true[clock]) and reading.reference is not False else None
-    if odom is None or len(odom):
-        log.odometry = f"{name}'s robot pose" if odom is None else "ODOM, interpolated"
-    if true is not None:
+    odometry = first_pass.odometry[clock] if first.robot is None or reading.odom_topic == "ODOM" else None
+    reference = first_pass.reference[clock] if reading.reference is not False else PoseTrack()
+    if odometry is None or len(odometry):
+        log.odometry = f"{name}'s robot pose" if odometry is None else "ODOM, interpolated"
+    if len(reference):
         log.reference = "the log's TRUEPOS"
     elif reading.reference and corrected:
         log.reference = f"{name}'s corrected pose"
     elif reading.reference:
         notes.append(f"no reference: the poses of {name} are odometry, and there are no TRUEPOS lines")
-    # Without known angles in the headers (the setting angles replaces them), other scans cannot be resampled.
-    fixed = reading.angles is not None or first.beams is None
-    log.read = lambda: _read_scans(log, first, clock, odom, true, name, fixed=fixed)
+    # Scans with other beams can be resampled only if the angles in their headers are used.
+    can_resample = reading.angles is None and first.beams is not None
+    log.read = lambda: _read_scans(log, first, clock, odometry, reference, name, can_resample=can_resample)
     return log
 
 
@@ -169,14 +170,14 @@ def _range_max(first_pass: _FirstPass, name: str, reading: Reading, notes: list[
     return range_max
 
 
-def _clock(lines: list[LaserLine], reading: Reading, notes: list[str]) -> int:
-    """Returns which stamps to use: 0 for those of ipc; 1 for those of the logger, also if ipc's do not advance."""
+def _clock(lines: list[LaserLine], reading: Reading, notes: list[str]) -> Clock:
+    """Returns whose stamps to use: the sensor's (ipc), or the logger's, also if the sensor's do not advance."""
     if reading.clock == "logger":
-        return 1
+        return "logger"
     if len(lines) > 1 and lines[0].ipc == lines[-1].ipc:
         notes.append("the ipc timestamps do not advance: the timestamps of the logger are used")
-        return 1
-    return 0
+        return "logger"
+    return "sensor"
 
 
 def _mount(first_pass: _FirstPass, name: str, reading: Reading, notes: list[str]) -> tuple[Array, bool, bool]:
@@ -185,11 +186,11 @@ def _mount(first_pass: _FirstPass, name: str, reading: Reading, notes: list[str]
     The poses were corrected by a mapping program if their offset from the odometry is not constant.
     """
     low, high = first_pass.mounts.get(name, (np.zeros(3), np.full(3, np.inf)))
-    fixed = bool((high - low <= 2 * MOUNT_TOLERANCE).all())
-    corrected = name in first_pass.mounts and not fixed
+    is_constant = bool((high - low <= 2 * MOUNT_TOLERANCE).all())
+    corrected = name in first_pass.mounts and not is_constant
     if reading.mount is not None:
         return reading.mount, corrected, False
-    if fixed:
+    if is_constant:
         return (low + high) / 2, corrected, False
     side = _side(name)
     names = [f"robot_{side}laser_{part}" for part in ("offset", "side_offset", "angular_offset")]
@@ -218,17 +219,18 @@ def _read_first_pass(path: Path) -> _FirstPass:
                 first_pass.params[words[1]] = words[2]
             elif words[0] in POSE_LINES:
                 pose, *times = pose_line(words)
-                for track, time in zip(first_pass.odom if words[0] == "ODOM" else first_pass.true, times, strict=True):
-                    track.add(round(time * 1e9), pose)
+                tracks = first_pass.odometry if words[0] == "ODOM" else first_pass.reference
+                for clock, time in zip(CLOCKS, times, strict=True):
+                    tracks[clock].add(round(time * 1e9), pose)
             elif is_laser(words[0]):
                 first_pass.lasers[words[0]] += 1
-                _note_laser(first_pass, words)
+                _record_laser(first_pass, words)
         except (ValueError, IndexError):  # malformed lines are counted when the scans are read
             continue
     return first_pass
 
 
-def _note_laser(first_pass: _FirstPass, words: list[str]) -> None:
+def _record_laser(first_pass: _FirstPass, words: list[str]) -> None:
     name = words[0]
     firsts = first_pass.firsts.setdefault(name, [])
     keep = len(firsts) < FIRST_PASS_SCANS
@@ -244,45 +246,53 @@ def _note_laser(first_pass: _FirstPass, words: list[str]) -> None:
 
 
 def _read_scans(
-    log: Log, first: LaserLine, clock: int, odom: PoseTrack | None, true: PoseTrack | None, name: str, *, fixed: bool
+    log: Log,
+    first: LaserLine,
+    clock: Clock,
+    odometry: PoseTrack | None,
+    reference: PoseTrack,
+    name: str,
+    *,
+    can_resample: bool,
 ) -> Iterator[LoggedScan]:
+    """Yields the scans. Without ``odometry``, that of the line is used; an empty ``reference`` is not."""
     resampled_scans = 0
     for words in _read_words(log.path):
         if words[0] != name:
             if not LINE_TYPE.match(words[0]):
-                log.left_out["garbled lines"] += 1
+                log.left_out["malformed lines"] += 1
             elif words[0] in POSE_LINES and not _is_pose(words):
-                log.left_out_other[f"garbled {words[0]} lines"] += 1
+                log.left_out_other[f"malformed {words[0]} lines"] += 1
             continue
         try:
             line = laser_line(words)
         except (ValueError, IndexError):
-            log.left_out["garbled lines"] += 1
+            log.left_out["malformed lines"] += 1
             continue
         measured = normalise_driver_ranges(line.ranges, 0.0, log.range_max)
-        ranges = _resample(first, line, measured, log.angles, fixed=fixed)
+        ranges = _resample(first, line, measured, log.angles, can_resample=can_resample)
         if ranges is None:
-            log.left_out["scans of other beams"] += 1
+            log.left_out["scans with other beam angles"] += 1
             continue
         resampled_scans += ranges is not measured
-        stamp = round((line.ipc, line.logger)[clock] * 1e9)
-        reference = None
-        if true is not None:
-            reference = true.at(stamp)
+        stamp = round((line.logger if clock == "logger" else line.ipc) * 1e9)
+        true_pose = None
+        if len(reference):
+            true_pose = reference.at(stamp)
         elif log.reference and line.laser is not None:
-            reference = se2.compose(line.laser, se2.inverse(log.mount))
-        yield LoggedScan(stamp, ranges, line.robot if odom is None else odom.at(stamp), reference)
+            true_pose = se2.compose(line.laser, se2.inverse(log.mount))
+        yield LoggedScan(stamp, ranges, line.robot if odometry is None else odometry.at(stamp), true_pose)
     log.note_resampled(resampled_scans)
 
 
-def _resample(first: LaserLine, line: LaserLine, ranges: Array, angles: Array, *, fixed: bool) -> Array | None:
+def _resample(first: LaserLine, line: LaserLine, ranges: Array, angles: Array, *, can_resample: bool) -> Array | None:
     """The line's ``ranges`` at the first line's ``angles``; an interlaced LMS shifts its beams by 0.25 deg each scan.
 
-    Returns None if the scan cannot be resampled; with ``fixed``, if its beams are not those of the first line.
+    Returns None if the scan cannot be resampled.
     """
     if line.beams == first.beams and len(ranges) == len(angles):
         return ranges
-    if fixed or line.beams is None or first.beams is None or line.beams.range_max != first.beams.range_max:
+    if not can_resample or line.beams is None or first.beams is None or line.beams.range_max != first.beams.range_max:
         return None
     return resample(ranges, line.beams.angles(), angles)
 

@@ -11,6 +11,8 @@ from typing import Literal
 from common.errors import UserError
 from common.geometry.se2 import Array
 
+Clock = Literal["sensor", "logger"]
+
 
 @dataclass(frozen=True)
 class Reading:
@@ -26,7 +28,7 @@ class Reading:
     reference_topic: str = ""
     angles: tuple[float, float] | None = None  # rad, first and last beam, for lines that do not state them
     range_max: float | None = None  # m
-    clock: Literal["sensor", "logger"] = "sensor"  # which stamps are used
+    clock: Clock = "sensor"  # whose stamps are used
 
     @property
     def is_default(self) -> bool:

@@ -55,7 +55,7 @@ class MapperService(Service):
         self._odometry_sync = OdometrySync()
         self._pool = ThreadPoolExecutor(1, "update")
         self._update: Future[MapSnapshot] | None = None  # running
-        self._update_ns = self._published_ns = -UPDATE_PERIOD_NS  # stamps of the last update and of the last map
+        self._update_ns = self._published_ns = 0  # stamps of the last update and of the last map
 
     def open(self) -> None:
         """Compiles the search now, so that no scan has to wait for it."""

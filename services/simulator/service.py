@@ -120,16 +120,16 @@ class SimulatorService(Service):
 
     def _use(self, setup: SimulationSetup, simulation: Simulation) -> None:
         self.setup, self.simulation = setup, simulation
-        self._update_clock_factor()
+        self._update_command_timeout()
 
-    def _update_clock_factor(self) -> None:
+    def _update_command_timeout(self) -> None:
         """Makes the command timeout longer if simulated time runs faster than the controller's clock.
 
         At pace fast, the timeout is as long as the age up to which commands are accepted.
         """
         robot = self.setup.robot
-        fast = robot.command_age / robot.command_timeout
-        self.simulation.clock_factor = fast if self.settings.pace == "fast" else max(1.0, self.speed)
+        longer = robot.command_timeout * max(1.0, self.speed)
+        self.simulation.command_timeout_s = robot.command_age if self.settings.pace == "fast" else longer
 
     def _on_liveliness(self, service: str, alive: bool) -> None:  # noqa: FBT001 - zenoh calls it, in its own thread
         if alive:
@@ -282,7 +282,7 @@ class SimulatorService(Service):
             reason = "each scan waits for its command" if self.lockstep else "it goes as fast as it can"
             return Reply(ok=False, reason=f"the pace is {self.settings.pace}: {reason}; a speed needs --pace realtime")
         self.speed = factor
-        self._update_clock_factor()
+        self._update_command_timeout()
         # At a low speed, the next step may be far ahead.
         self._next_step_s = min(self._next_step_s, time.monotonic() + self._period_s)
         self._update_note()

@@ -86,8 +86,8 @@ class Simulation:
         self._actuator = Actuator(robot, setup.slip, np.random.default_rng(slip_seed))
         self._command: tuple[int, Array] | None = None  # stamp and velocity of the latest command
         self._last_command_step = 0  # value of `steps` when a command with a new stamp last arrived
-        # How much faster simulated time may pass than the controller's clock; multiplies the command timeout.
-        self.clock_factor = 1.0
+        # s of simulated time; longer than the robot's if time passes faster than on the controller's clock
+        self.command_timeout_s = robot.command_timeout
         self._contact = self._stopped = False
         self._scan_points = np.zeros((0, 2))  # m in base_link
 
@@ -123,7 +123,7 @@ class Simulation:
     def advance(self) -> None:
         """Simulates one scan period."""
         silence_s = (self.steps - self._last_command_step) * self.period_ns * 1e-9
-        timed_out = silence_s >= self.setup.robot.command_timeout * self.clock_factor
+        timed_out = silence_s >= self.command_timeout_s
         target = np.zeros(3) if timed_out else self._target_velocity()
         before, measured = self._at_stamp().wheels, self._motion.now.wheels
         self._move_people(self.physics.pose())

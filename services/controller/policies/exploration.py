@@ -91,7 +91,7 @@ class Viewpoint:
     """A place from which a scan shows something new."""
 
     pose: Array  # (3,) in map, with the heading at which a scan shows most
-    nats: float  # expected information of a scan from there
+    information: float  # nats, expected of a scan from there
     tour: Array  # (V, 2) m in map, all viewpoints of the tour from this one on
 
 
@@ -107,7 +107,7 @@ class Frontier:
     """Unknown cells beside known free ones."""
 
     cells: Cells  # (F,) flat indices
-    nats: Array  # (F,) expected information of a scan of each
+    information: Array  # (F,) nats, expected of a scan of each
 
 
 @dataclass(frozen=True)
@@ -123,21 +123,21 @@ def choose_viewpoint(state: ExplorationState) -> Viewpoint | NoPath | None:
     """The first viewpoint of a short tour; None if returning at once has less expected free energy."""
     frontier, known = find_frontier(state), known_space(state.graph)
     min_clearance = known.min_clearance
-    if frontier.nats.sum() >= MIN_VIEWPOINT_NATS and known.nearest_free(state.pose[:2], min_clearance) is None:
+    if frontier.information.sum() >= MIN_VIEWPOINT_NATS and known.nearest_free(state.pose[:2], min_clearance) is None:
         return NoPath(
             f"cannot plan a path from here: there is no place within {min_clearance:.2f} m of the robot with "
             f"{min_clearance:.2f} m of known free space around it; drive the robot to where there is more room, and "
             "explore again"
         )
     candidates = find_candidates(state, frontier, known)
-    selected = select_viewpoints(candidates.sees, frontier.nats, candidates.target)
+    selected = select_viewpoints(candidates.sees, frontier.information, candidates.target)
     if not selected:
         return None
     cost = _travel_costs(known, [state.pose[:2], *candidates.places[selected], state.home])
     tour = shortest_tour(cost)
     if selected[0] == candidates.target:
         tour = _prefer_target(tour, cost)
-    information = float(frontier.nats[candidates.sees[selected].any(axis=0)].sum())
+    information = float(frontier.information[candidates.sees[selected].any(axis=0)].sum())
     returning_at_once = NATS_PER_METRE * cost[0, -1]
     if NATS_PER_METRE * _cost_of(cost, tour) - information >= returning_at_once:
         return None
@@ -157,8 +157,9 @@ def find_frontier(state: ExplorationState) -> Frontier:
     scans = np.concatenate([state.scans, state.arrivals])
     counts = np.repeat([1, ARRIVAL_SCANS], [len(state.scans), len(state.arrivals)])
     misses = counts @ (_in_sight(state, scans[:, :2], cells) & _in_sector(state, scans, cells))
-    nats = np.log(2) * MISS_PROBABILITY**misses
-    return Frontier(cells[nats >= MIN_CELL_NATS], nats[nats >= MIN_CELL_NATS])
+    information = np.log(2) * MISS_PROBABILITY**misses
+    kept = information >= MIN_CELL_NATS
+    return Frontier(cells[kept], information[kept])
 
 
 def known_space(graph: FreeSpaceGraph) -> FreeSpaceGraph:
@@ -192,14 +193,14 @@ def find_candidates(state: ExplorationState, frontier: Frontier, known: FreeSpac
     return CandidateViewpoints(places, sees, target)
 
 
-def select_viewpoints(sees: Mask, nats: Array, target: int | None = None) -> list[int]:
+def select_viewpoints(sees: Mask, information: Array, target: int | None = None) -> list[int]:
     """Indices of places that together see all cells worth a stop, chosen greedily by the information that each adds.
 
-    ``sees`` (P, F) is whether a place sees a cell, and ``nats`` (F,) are the information of the cells. The place
+    ``sees`` (P, F) is whether a place sees a cell, and ``information`` (F,) that of the cells in nats. The place
     ``target`` comes first if it is worth a stop by itself.
     """
     selected: list[int] = []
-    left = nats.copy()
+    left = information.copy()
     while len(selected) < MAX_VIEWPOINTS and len(sees):
         added = sees @ left
         best = int(np.argmax(added))
@@ -215,7 +216,7 @@ def select_viewpoints(sees: Mask, nats: Array, target: int | None = None) -> lis
 def shortest_tour(cost: Array) -> list[int]:
     """Order of the N places between the first and the last row of ``cost`` (N + 2, N + 2), numbered from 0.
 
-    By cheapest insertion, then by moving and reversing parts of the tour as long as that makes it shorter.
+    By cheapest insertion, then by 2-opt and Or-opt moves as long as they make it shorter.
     """
     count = len(cost) - 2
     tour: list[int] = []
@@ -296,11 +297,11 @@ def _in_sector(state: ExplorationState, poses: Array, cells: Cells) -> Mask:
 
 def _viewpoint(state: ExplorationState, tour: Array, frontier: Frontier, sees: Mask) -> Viewpoint:
     """The first place of a tour (V, 2) m as a viewpoint; it sees the frontier cells in the mask ``sees`` (F,)."""
-    place, cells, nats = tour[0], frontier.cells[sees], frontier.nats[sees]
-    middle = (nats[:, None] * (state.graph.grid.centres(cells) - place)).sum(axis=0)
+    place, cells, information = tour[0], frontier.cells[sees], frontier.information[sees]
+    middle = (information[:, None] * (state.graph.grid.centres(cells) - place)).sum(axis=0)
     towards_middle = np.arctan2(middle[1], middle[0]) - state.field_of_view.sector.centre
     headings = se2.wrap(towards_middle + np.linspace(0, 2 * np.pi, HEADINGS, endpoint=False))
     poses = np.column_stack([np.tile(place, (HEADINGS, 1)), headings])
-    shown = _in_sector(state, poses, cells) @ nats
+    shown = _in_sector(state, poses, cells) @ information
     best = int(np.argmax(shown))  # the first, towards the middle, if the scanner sees all around
     return Viewpoint(poses[best], float(shown[best]), tour)

@@ -30,7 +30,7 @@ class Elements:
 
     points: Array  # (K, 2) m
     normals: Array  # (K, 2) unit vectors towards free space
-    lengths: Array  # (K,) m along the surface, up to the neighbours
+    lengths: Array  # (K,) m, extent of each along its surface
 
     def transformed(self, pose: Array) -> Elements:
         """The elements in the parent frame of the frame with ``pose`` (3,)."""

@@ -19,7 +19,9 @@ NORMAL_DIFFERENCE_M = 0.3  # a difference of 1 between two unit normals counts a
 CORRESPONDENCE_RADII_M = (0.6, 0.6, 0.5, 0.4, 0.3, 0.2, 0.2, 0.2)  # largest distance, iteration by iteration
 RESIDUAL_M = 0.03  # standard deviation between corresponding elements, and scale of the Cauchy weights
 PRIOR_SCALE = 2.0  # standard deviations, scale of the prior's Cauchy weight: wheels slip
-PRIOR_INFLATION = 2.0  # factor on the deviations of the prior, because those of the elements are too large as well
+# Factor on the standard deviations of the prior. `RESIDUAL_M` is larger than the real noise; without this factor, the
+# prior would weigh too much.
+PRIOR_INFLATION = 2.0
 MATCHED_M = 0.15  # an element whose correspondence is nearer than this is matched
 MIN_CORRESPONDENCES = 10  # between elements and target; with fewer there is no match
 CORRELATED_ELEMENTS = 10.0  # number of elements that match or fail together, because they belong to one object
@@ -83,9 +85,9 @@ def register(surface: Surface, elements: Elements, start: Array, prior: PosePrio
         J = se2.displacement_jacobian(placed.points[paired] - pose[:2], normal)
         weight = 1 / (1 + (error / RESIDUAL_M) ** 2) / RESIDUAL_M**2
         H = (J.T * weight) @ J
-        off, squared = prior.difference(pose)
-        held = prior.information / PRIOR_INFLATION**2 / (1 + squared / PRIOR_SCALE**2)
-        step = np.linalg.solve(H + held + 1e-6 * np.eye(3), held @ off - (J.T * weight) @ error)
+        to_prior, squared = prior.difference(pose)
+        information = prior.information / PRIOR_INFLATION**2 / (1 + squared / PRIOR_SCALE**2)
+        step = np.linalg.solve(H + information + 1e-6 * np.eye(3), information @ to_prior - (J.T * weight) @ error)
         pose = pose + step
         pose[2] = se2.wrap(pose[2])
     matched = distance < MATCHED_M
@@ -93,7 +95,7 @@ def register(surface: Surface, elements: Elements, start: Array, prior: PosePrio
     missed[paired & matched] = error[matched[paired]]
     cost = np.log1p((missed / RESIDUAL_M) ** 2).sum() / 2 / CORRELATED_ELEMENTS
     cost += PRIOR_SCALE**2 * np.log1p(prior.difference(pose)[1] / PRIOR_SCALE**2) / 2
-    covariance = np.linalg.inv(H + held + 1e-6 * np.eye(3))
+    covariance = np.linalg.inv(H + information + 1e-6 * np.eye(3))
     return Registration(pose, H, covariance, float(matched.mean()), float(cost))
 
 

@@ -92,7 +92,7 @@ def test_frontier():
     x, y = state.graph.grid.centres(frontier.cells).T
     assert np.allclose(x, 5.65)
     assert np.allclose(np.sort(y), 0.85 + 0.1 * np.arange(8))
-    assert np.allclose(frontier.nats, np.log(2))
+    assert np.allclose(frontier.information, np.log(2))
     assert not len(find_frontier(exploration_state_of(CLOSED)).cells)
 
 
@@ -100,8 +100,8 @@ def test_frontier():
 def test_each_scan_that_saw_nothing_halves_the_information(yaw, halved):
     """Only scans that looked there count."""
     frontier = find_frontier(exploration_state_of(CORRIDOR, scans=[(1.2, 1.2, yaw)], sector=Sector(0.0, np.pi / 2)))
-    assert np.allclose(frontier.nats.max(), np.log(2))  # the cells beside the walls are not in full view
-    assert bool(np.isclose(frontier.nats.min(), np.log(2) / 2)) is halved
+    assert np.allclose(frontier.information.max(), np.log(2))  # the cells beside the walls are not in full view
+    assert bool(np.isclose(frontier.information.min(), np.log(2) / 2)) is halved
 
 
 def test_information_of_a_viewpoint_is_that_of_the_cells_it_sees():
@@ -146,7 +146,7 @@ def test_choice_is_the_first_place_of_the_tour_of_least_expected_free_energy():
     state = exploration_state_of(CROSSROADS, pose=(2.8, 2.0, 0.0))
     viewpoint = choose_viewpoint(state)
     assert viewpoint is not None
-    assert viewpoint.nats >= MIN_VIEWPOINT_NATS - 1.5
+    assert viewpoint.information >= MIN_VIEWPOINT_NATS - 1.5
     known = known_space(state.graph)
     stops = [state.pose[:2], *viewpoint.tour, state.home]
 
@@ -167,7 +167,7 @@ def test_heading_between_two_frontiers():
     """A narrow view from the corner of a bend shows one of the two ends, and nothing from between the headings."""
     bend = exploration_state_of(BEND, sector=Sector(0.3, np.pi / 5))
     viewpoint = choose_viewpoint(bend)
-    assert MIN_VIEWPOINT_NATS < viewpoint.nats < find_frontier(bend).nats.sum()
+    assert MIN_VIEWPOINT_NATS < viewpoint.information < find_frontier(bend).information.sum()
     other = choose_viewpoint(replace(bend, arrivals=viewpoint.pose[None]))
     assert abs(np.sin(other.pose[2] - viewpoint.pose[2])) > 0.5
 

@@ -458,7 +458,7 @@ def test_map_that_is_as_exact_as_assumed(seed):
     made.restart(*trial.start)
     found = [made.update(observation) for observation in trial.observations]
     assert found[0].state == "tracking"
-    assert min(each.probability for each in found) > 0.998  # below 0.4 and 0.7, while larger errors seemed more probable
+    assert min(each.probability for each in found) > 0.998  # below 0.4 if the larger errors are thought improbable
 
 
 def test_start_near_a_wrong_match():

@@ -164,7 +164,7 @@ def test_parameters_of_lasers(tmp_path, name, range_max):
     assert log.mount[2] == {"FLASER": 0.1, "RLASER": 3.1, "LASER3": 0.0}[name]
 
 
-def test_garbled_poses_cost_no_scan(tmp_path):
+def test_malformed_poses_cost_no_scan(tmp_path):
     lines = carmen()
     poses = [k for k, line in enumerate(lines) if line.startswith("ODOM")]
     lines[poses[2]] = "ODOM 1 2"
@@ -172,7 +172,7 @@ def test_garbled_poses_cost_no_scan(tmp_path):
     lines.insert(7, "TRUEPOS nan 0 0 0 0 0 1 h 1")
     log, scans = read(write(tmp_path, lines))
     assert len(scans) == SCANS
-    assert log.describe_left_out() == "garbled ODOM lines: 2, garbled TRUEPOS lines: 1"
+    assert log.describe_left_out() == "malformed ODOM lines: 2, malformed TRUEPOS lines: 1"
     assert not log.left_out
 
 
@@ -200,11 +200,11 @@ def test_unusable_scans_are_counted(tmp_path):
     lines.insert(9, "GPS 1 2 3 of no interest")
     log, sweeps = read(write(tmp_path, lines))
     assert dict(log.left_out) == {
-        "garbled lines": 2, "scans twice": 1, "scans older than the one before": 1, "scans of other beams": 1,
+        "malformed lines": 2, "scans twice": 1, "scans older than the one before": 1, "scans with other beam angles": 1,
     }  # fmt: skip
     assert len(sweeps) == SCANS - 4
     assert list(log.valid_scans())  # the counts are of the last pass
-    assert log.left_out["garbled lines"] == 2
+    assert log.left_out["malformed lines"] == 2
 
 
 def test_interlaced_scanner(tmp_path):
@@ -226,14 +226,14 @@ def test_interlaced_scanner(tmp_path):
     note = "the scanner is mounted upside down: the order of its beams is reversed"
     assert upside_down[0].notes == [note, log.notes[-1]]
     np.testing.assert_array_equal(upside_down[1][1].ranges, sweeps[1].ranges[::-1])
-    assert read(file, angles=(ANGLES[0], ANGLES[-1]))[0].left_out == {"scans of other beams": 6}
+    assert read(file, angles=(ANGLES[0], ANGLES[-1]))[0].left_out == {"scans with other beam angles": 6}
 
 
 def test_refusals(tmp_path):
     cut = [line[:80] if line.startswith("ROBOT") and k > 8 else line for k, line in enumerate(carmen())]
     without_odom = [line for line in carmen() if not line.startswith("ODOM")]
     for lines, odom_topic, why in (
-        (cut, "", "too few usable scans: 3; left out: garbled lines: 9"),
+        (cut, "", "too few usable scans: 3; left out: malformed lines: 9"),
         (["ODOM 0 0 0 0 0 0 1 h 1"], "", "without scans"),
         (carmen(), "ODOMETRY", r"odom.topic ODOMETRY: .* only have ODOM, and this one has ODOM lines"),
         (without_odom, "ODOM", "no ODOM lines"),
