@@ -104,12 +104,13 @@ class RequestHandler:
         if visitor.robot not in robots:
             robots.append(visitor.robot)
         hello = {
+            "type": "hello",
             "control": context.control_allowed,
             "version": context.version,
             "robots": robots,
             "robot": visitor.robot,
         }
-        visitor.queue_text(json.dumps({"type": "hello", **hello}), "hello")
+        visitor.queue_text(json.dumps(hello), "hello")
 
     def _watch(self, visitor: Visitor, robot: str) -> ActionResult:
         robots = self.context.roster.robots()
@@ -129,11 +130,10 @@ class RequestHandler:
         try:
             await self._in_thread(context.playback.open, name, lambda: "replay" in context.roster.services(robot))
         finally:  # the recording that was open before is closed even if this one cannot be opened
-            self.worlds.pop(robot, None)
-            self._world_texts.pop(robot, None)
+            self._forget_world(robot)
             context.on_new_recording(robot)
             if not context.playback.name:
-                self._on_closed("")
+                self._on_closed()
         for other in {visitor, *context.hub.watching(robot)}:
             self.show_robot(other, robot)
         await self._in_thread(self._show_position)
@@ -143,7 +143,7 @@ class RequestHandler:
         if not self.context.playback.name:
             raise UserError("no recording is open")
         await self._in_thread(self.context.playback.close)
-        self._on_closed("")
+        self._on_closed()
         return ActionResult(ok=True, reason="closed")
 
     # ---- the open recording; these methods run in a thread
@@ -163,7 +163,7 @@ class RequestHandler:
         return ActionResult(ok=True)
 
     def _show_position(self) -> None:
-        """Plays two steps of a paused recording, so that the page shows a scan together with its answers."""
+        """Plays two steps of a paused recording, so that the page shows a scan together with its belief and command."""
         self._player("step", 2)
 
     def _player(self, action: Any, value: float = 0.0) -> PlayerReply:
@@ -216,6 +216,10 @@ class RequestHandler:
         self._world_texts[robot] = json.dumps({"type": "world", **plain})
         self.context.hub.queue_text(robot, "world", self._world_texts[robot])
 
+    def _forget_world(self, robot: str) -> None:
+        self.worlds.pop(robot, None)
+        self._world_texts.pop(robot, None)
+
     def _world_of(self, robot: str) -> WorldReply | None:
         """The world of the simulator or of the recording, else the estimator's map; None if there is none yet."""
         query, services = self.context.control.query, self.context.roster.services(robot)
@@ -246,11 +250,10 @@ class RequestHandler:
                     text = json.dumps({"type": "player", **state.model_dump(mode="json"), "file": playback.name})
                     hub.queue_text(playback.robot, "player", text)
 
-    def _on_closed(self, reason: str) -> None:
+    def _on_closed(self, reason: str = "") -> None:
         """Shows visitors who watched the recording the robot again that they watched before."""
         playback, hub = self.context.playback, self.context.hub
-        self.worlds.pop(playback.robot, None)
-        self._world_texts.pop(playback.robot, None)
+        self._forget_world(playback.robot)
         for visitor in hub.watching(playback.robot):
             self.show_robot(visitor, visitor.live_robot or self.context.roster.robot)
             visitor.queue_text(json.dumps({"type": "closed", "reason": reason}))
