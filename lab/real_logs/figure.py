@@ -30,7 +30,8 @@ def draw(calibration: Calibration | None, rows: Sequence[dict[str, Any]], titles
             stamps = np.array(row["stamp_s"]) - row["stamp_s"][0]
             axes.plot(stamps, error, linewidth=0.9, color=colour, label=name)
             share = np.arange(1, len(error) + 1) / len(error)
-            cumulative.plot(np.sort(error), share, style, color=colour, label=f"{name}, {titles[task]}")
+            cumulative.plot(np.sort(error), share, style, color=colour)
+        cumulative.plot([], [], style, color="black", label=titles[task])  # the colours are those of the legend below
         drawing.log_metres(axes)
         axes.axhline(CORRECT_DISTANCE_M, color=drawing.BOUND, linestyle=":", linewidth=1)
         axes.set(xlabel="time (s)", ylabel="position error (m)", title=titles[task])
