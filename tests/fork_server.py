@@ -55,6 +55,7 @@ def _run(what: list[str], environment: dict[str, str], log: str, cwd: str) -> No
     """In the child: runs ``what``, the arguments of an interpreter, with its output in the file ``log``."""
     end_with_parent(os.getppid(), signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.default_int_handler)  # the fork server ignores it
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # ignored where the tests run under nohup
     multiprocessing.set_start_method(None, force=True)
     output = os.open(log, os.O_WRONLY | os.O_TRUNC)
     os.dup2(output, sys.stdout.fileno())
