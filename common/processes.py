@@ -8,13 +8,18 @@ import signal
 import sys
 from collections.abc import Callable
 
+INTERRUPTS: list[int] = [signal.SIGINT, signal.SIGTERM]  # end a process: Ctrl-C, `kill`, and a closed terminal
+if sys.platform != "win32":
+    INTERRUPTS.append(signal.SIGHUP)
 
-def ending_signals() -> list[int]:
-    """The signals that end a process: SIGTERM, Ctrl-C, and that of a closed terminal, unless it is ignored (nohup)."""
-    numbers: list[int] = [signal.SIGTERM, signal.SIGINT]
-    if sys.platform != "win32" and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
-        numbers.append(signal.SIGHUP)
-    return numbers
+
+def interrupts_to_handle() -> list[int]:
+    """`INTERRUPTS`, without SIGHUP where it is ignored, as under nohup.
+
+    A script's shell starts background commands with SIGINT ignored, but they should still end cleanly.
+    """
+    always = {signal.SIGINT, signal.SIGTERM}
+    return [number for number in INTERRUPTS if number in always or signal.getsignal(number) != signal.SIG_IGN]
 
 
 def end_with_parent(parent: int, signal_number: int = signal.SIGTERM) -> None:

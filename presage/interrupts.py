@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import signal
-import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 
-from common.processes import ending_signals
-
-INTERRUPTS = [signal.SIGINT, signal.SIGTERM]
-if sys.platform != "win32":
-    INTERRUPTS.append(signal.SIGHUP)
+from common.processes import INTERRUPTS, interrupts_to_handle
 
 
 @contextmanager
@@ -29,16 +24,12 @@ def _handled_by(handler: Callable[[int, FrameType | None], object] | int, number
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Makes `INTERRUPTS` raise KeyboardInterrupt in the block, so that it cleans up as after Ctrl-C.
-
-    A script's shell starts background commands with SIGINT ignored, which is undone here. SIGHUP stays ignored where
-    it is, as under nohup.
-    """
+    """Makes `interrupts_to_handle` raise KeyboardInterrupt in the block, so that it cleans up as after Ctrl-C."""
 
     def interrupt(_signal: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    with _handled_by(interrupt, ending_signals()):
+    with _handled_by(interrupt, interrupts_to_handle()):
         yield
 
 

@@ -43,6 +43,11 @@ def between(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
     return compose(inverse(a), b)
 
 
+def known_pose(poses: Array | None, index: int) -> Array | None:
+    """The pose (3,) at an index of ``poses`` (N, 3). Returns None if there are no poses, or this one is not finite."""
+    return None if poses is None or not np.isfinite(poses[index]).all() else poses[index]
+
+
 def difference(a: Array, b: Array) -> Array:
     """Componentwise a - b of poses (..., 3), with the angle wrapped."""
     off = a - b

@@ -17,7 +17,7 @@ from common.messages.definitions import Stamped
 from common.messages.requests import Reply, Request
 from common.messages.topics import Query, Topic
 from common.messages.wire import DecodeError
-from common.processes import ending_signals
+from common.processes import interrupts_to_handle
 from common.runtime.config import ServiceSettings, load_settings
 from common.runtime.runnable import Runnable
 from common.runtime.service_loop import ServiceLoop
@@ -139,7 +139,7 @@ def main(settings_class: type[S], make: Callable[[S], Service], argv: list[str] 
     A UserError ends the process with status 2 and a one-line message.
     """
     handler = _SignalHandler()
-    for number in ending_signals():
+    for number in interrupts_to_handle():
         signal.signal(number, handler)
     begin_logging(settings_class.service, argv)
     try:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from common.geometry import se2
 from lab.experiments.trials import run_key
 from lab.integrity.cases import IntegrityTrial
 from lab.integrity.maps import grid_of
@@ -76,7 +77,7 @@ def log_trial(case: LogCase) -> IntegrityTrial:
             drive.angles,
             drive.range_max,
             float(drive.stamps[k]),
-            drive.odom[k] if case.odometry and drive.odom is not None and np.isfinite(drive.odom[k]).all() else None,
+            se2.known_pose(drive.odom, k) if case.odometry else None,
         )
         for k, ranges in enumerate(drive.ranges)
     ]

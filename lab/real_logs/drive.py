@@ -103,13 +103,13 @@ def trial(job: StretchJob) -> dict[str, Any]:
         odom = None if odom is None else hide_kidnapping(odom, SCANS_BEFORE_KIDNAPPING)
     rows: dict[str, list[Any]] = {name: [] for name in ("stamp_s", "error_m", "yaw_error_rad", "state", "nees", "ms")}
     for i, k in enumerate(indices):
-        odom_pose = None if odom is None or np.isnan(odom[i]).any() else odom[i]
-        observation = Observation(drive.ranges[k], drive.angles, drive.range_max, float(clock[i]), odom_pose)
+        stamp, odom_pose = float(clock[i]), se2.known_pose(odom, i)
+        observation = Observation(drive.ranges[k], drive.angles, drive.range_max, stamp, odom_pose)
         began = time.process_time()
         posterior = estimator.update(observation)
         rows["ms"].append(round((time.process_time() - began) * 1e3, 2))
         error = se2.difference(posterior.pose, drive.poses[k])
-        rows["stamp_s"].append(round(float(clock[i]), 4))
+        rows["stamp_s"].append(round(stamp, 4))
         rows["error_m"].append(round(float(np.hypot(error[0], error[1])), 5))
         rows["yaw_error_rad"].append(round(abs(float(error[2])), 5))
         rows["state"].append(posterior.state)
@@ -139,8 +139,9 @@ def create_estimator(job: StretchJob) -> PoseEstimator:
         return _precise(job.map, job.model if job.estimator == "precise" else "exact")(geometry)
     settings = AMCL_SETTINGS if job.estimator == "amcl-defaults" else particle_settings(job.particles)
     x, y, yaw = map(float, drive.mount)
-    found = ParticleFilter(load_world(job.map), settings, (x, y, yaw), job.seed, sensor=_sensor(job.map, settings))
-    return ScanMatchedOdometry(found, geometry) if job.estimator == SCAN_MATCHING_FILTER else found
+    sensor = _sensor(job.map, settings)
+    particle_filter = ParticleFilter(load_world(job.map), settings, (x, y, yaw), job.seed, sensor=sensor)
+    return ScanMatchedOdometry(particle_filter, geometry) if job.estimator == SCAN_MATCHING_FILTER else particle_filter
 
 
 def particle_settings(changed: tuple[tuple[str, float], ...]) -> ParticleFilterSettings:

@@ -89,7 +89,7 @@ def tune(
     """
     quarter = half // 2
     stretches = TuningStretches(replace(job, map=str(_map_of_quarter(job, quarter, folder))), quarter, half)
-    search = CoordinateSearch(report)
+    search = CoordinateSearch(lambda title, done: report(f"{job.estimator}, {title}", done))
     laser = search.best(LASER, start, TRACKING_CANDIDATES, partial(stretches.tracking_score, LASER))
     odometry = start
     if job.drive.odom is not None:
@@ -151,7 +151,7 @@ class CoordinateSearch:
                 self._note(f"{title}, {name} {value:g}", changed_score)
                 if changed_score > best_score:
                     best, best_score = changed, changed_score
-                self._report(f"particle filter, {title}: {name}", len(self.tried) / self._total)
+                self._report(f"{title}: {name}", len(self.tried) / self._total)
         return best
 
     def _note(self, what: str, score: Score) -> None:

@@ -255,7 +255,7 @@ def _read_scans(
     *,
     can_resample: bool,
 ) -> Iterator[LoggedScan]:
-    """Yields the scans. Without ``odometry``, that of the line is used; an empty ``reference`` is not."""
+    """Yields the scans. The line's own poses are used if ``odometry`` is None, and if ``reference`` is empty."""
     resampled_scans = 0
     for words in _read_words(log.path):
         if words[0] != name:
@@ -276,12 +276,12 @@ def _read_scans(
             continue
         resampled_scans += ranges is not measured
         stamp = round((line.logger if clock == "logger" else line.ipc) * 1e9)
-        true_pose = None
+        reference_pose = None
         if len(reference):
-            true_pose = reference.at(stamp)
+            reference_pose = reference.at(stamp)
         elif log.reference and line.laser is not None:
-            true_pose = se2.compose(line.laser, se2.inverse(log.mount))
-        yield LoggedScan(stamp, ranges, line.robot if odometry is None else odometry.at(stamp), true_pose)
+            reference_pose = se2.compose(line.laser, se2.inverse(log.mount))
+        yield LoggedScan(stamp, ranges, line.robot if odometry is None else odometry.at(stamp), reference_pose)
     log.note_resampled(resampled_scans)
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from common.errors import UserError
+from common.geometry import se2
 from common.geometry.se2 import Array
 from common.robot.ranges import normalise_driver_ranges
 from presage.logs.log import Log, LoggedScan, Reading
@@ -85,10 +86,8 @@ def _read_scans(
 ) -> Iterator[LoggedScan]:
     for k, row in enumerate(ranges):
         stamp = None if stamps is None else round(float(stamps[k]) * 1e9)
-        pose, reference_pose = (
-            None if poses is None or not np.isfinite(poses[k]).all() else poses[k] for poses in (odom, reference)
-        )
-        yield LoggedScan(stamp, normalise_driver_ranges(row, 0.0, range_max), pose, reference_pose)
+        measured = normalise_driver_ranges(row, 0.0, range_max)
+        yield LoggedScan(stamp, measured, se2.known_pose(odom, k), se2.known_pose(reference, k))
 
 
 def _load_arrays(path: Path) -> dict[str, Array]:

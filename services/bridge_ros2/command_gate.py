@@ -6,7 +6,6 @@ The base needs a watchdog of its own, as ROS drivers have: if this process dies,
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection
 
 import numpy as np
 
@@ -133,6 +132,6 @@ class CommandGate:
         return np.zeros(3)
 
 
-def _median(periods: Collection[float]) -> float:
+def _median(periods: deque[float]) -> float:
     """Median in s, robust against a single gap or a change of the clock; 0 if there are none."""
-    return float(np.median(list(periods))) if periods else 0.0
+    return float(np.median(periods)) if periods else 0.0

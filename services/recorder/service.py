@@ -73,8 +73,8 @@ class RecorderService(Service):
             return
         with self._surviving_failures():
             self.recording.write(sample)
-        self.counters["written"] += 1
-        self.counters["written_bytes"] += len(sample.payload)
+            self.counters["written"] += 1
+            self.counters["written_bytes"] += len(sample.payload)
 
     def on_request(self, query: Query, request: Request) -> Reply:
         """Starts or stops a recording, and returns its state."""
@@ -153,11 +153,11 @@ class RecorderService(Service):
     def on_timer(self) -> None:
         """Writes new descriptions, checks the link and flushes the file."""
         self._flush_at = time.monotonic() + self.options.flush
-        self._write_descriptions()
-        self._warn_if_silent()
-        if self.recording is not None:
-            with self._surviving_failures():
+        with self._surviving_failures():
+            self._write_descriptions()
+            if self.recording is not None:
                 self.recording.writer.flush()
+        self._warn_if_silent()
 
     @contextmanager
     def _surviving_failures(self) -> Iterator[None]:

@@ -160,8 +160,7 @@ class People:
     def make_room(self, robot: Array, world: World | None = None) -> None:
         """Moves people who are in the way after the robot was put at ``robot`` (2,) m, or after furniture changed.
 
-        ``world`` is the world with the changed furniture. Raises UserError, and changes nothing, if there is no
-        room.
+        ``world`` is the world with the changed furniture. Raises UserError, and changes nothing, if there is no room.
         """
         grid = self._grid if world is None else WalkableGrid(world, self.radius)
         clear = np.hypot(*(self.places - robot).T) >= self._min_robot_distance

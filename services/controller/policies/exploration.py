@@ -6,10 +6,10 @@ unknown space, and back to where exploration began. The expected free energy of 
     G(tour) = NATS_PER_METRE * cost - information about the map
 
 The cost is the length of the path in m, where a metre near a wall counts for up to two. A scan shows whether a frontier
-cell is free or occupied, which is worth ln 2, times `MISS_PROBABILITY` for each earlier
-scan that should have shown it and did not. At `MIN_VIEWPOINT_NATS` a viewpoint is worth a detour of 150 m, so the tour
-has all that are worth a stop (up to `MAX_VIEWPOINTS`), by a short path (as Kulich, Faigl & Preucil 2011 choose goals).
-The robot drives only to its first viewpoint, as the next map has another frontier.
+cell is free or occupied, which is worth ln 2, times `MISS_PROBABILITY` for each earlier scan that should have shown it
+and did not. At `MIN_VIEWPOINT_NATS` a viewpoint is worth a detour of 150 m, so the tour has all that are worth a stop
+(up to `MAX_VIEWPOINTS`), by a short path (as Kulich, Faigl & Preucil 2011 choose goals). The robot drives only to its
+first viewpoint, as the next map has another frontier.
 
 Approximations: the viewpoints are chosen greedily by their information, as if the scanner saw all around; what lies
 beyond the frontier is not predicted; and a scan shows nothing of cells so far away that its beams are farther apart

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from services.estimator.shared.generative_models import GenerativeModel
 
 SEED_SPACING_M = 0.3  # between the places at which a search begins
-RANKED_HEADINGS = 120
+RANKED_HEADINGS = 120  # at each place, 3 degrees apart
 # Of the laser (9, 2) m, in its own frame, by a third of the spacing; the first is zero. A scan changes much over half
 # of the spacing, and comparing it as if the laser were displaced takes less memory than more panoramas.
 DISPLACEMENTS_M = 0.1 * np.stack(np.meshgrid([0, 1, -1], [0, 1, -1]), axis=-1).reshape(-1, 2)

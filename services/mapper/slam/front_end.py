@@ -393,8 +393,7 @@ def track_drive(drive: RawDrive, report: Callable[[float], None] = lambda _done:
     """Tracks the scans of a drive; reports the share that is done."""
     front_end = FrontEnd(drive.laser)
     for k, (stamp, ranges) in enumerate(zip(drive.stamps, drive.ranges, strict=True)):
-        odom = None if drive.odom is None or not np.isfinite(drive.odom[k]).all() else drive.odom[k]
-        front_end.add(float(stamp), ranges, odom)
+        front_end.add(float(stamp), ranges, se2.known_pose(drive.odom, k))
         report(k / len(drive.ranges))
     return front_end.tracked_drive()
 

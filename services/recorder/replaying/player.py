@@ -17,6 +17,12 @@ from common.runtime.service_monitor import SUBSTITUTES
 MAX_LAG_S = 1.0  # a replay that lags further behind continues from its position instead of catching up
 MAX_STEPS = 10_000  # in one request
 LOOP_GAP_S = 0.1  # pause between the end of a loop and its next pass
+# The services that move the robot as these topics say
+OBEYED_BY = {
+    CMD_VEL: frozenset({"simulator", SUBSTITUTES["simulator"]}),
+    GOAL: frozenset({"controller"}),
+    DRIVE: frozenset({"controller"}),
+}
 
 
 class Player:
@@ -154,7 +160,7 @@ def robot_of(key: str) -> str:
 def find_conflicts(keys: Mapping[str, Topic], alive: Mapping[str, Collection[str]]) -> str:
     """Explains which live services (``alive``, by robot) publish the same keys. Returns an empty string if none do.
 
-    Topics without a rate, such as `status`, may have several publishers. What makes a live robot move conflicts, too:
+    Topics without a rate, such as `plan`, may have several publishers. What makes a live robot move conflicts, too:
     velocity commands if there is a simulator or a bridge, goals and manual velocities if there is a controller.
     """
     found: dict[tuple[str, str], list[str]] = {}
@@ -166,8 +172,7 @@ def find_conflicts(keys: Mapping[str, Topic], alive: Mapping[str, Collection[str
         publishers = {publisher, SUBSTITUTES.get(publisher, publisher), "replay"}
         for service in publishers & services if topic.rate else ():
             found.setdefault((robot, service), []).append(key)
-        obeyed_by = {CMD_VEL: {"simulator", SUBSTITUTES["simulator"]}, GOAL: {"controller"}, DRIVE: {"controller"}}
-        if obeyed_by.get(topic, set()) & services:
+        if OBEYED_BY.get(topic, frozenset()) & services:
             driven.append(key)
     reasons = [
         f"the {service} of {robot!r} is alive and publishes {', '.join(held)}"

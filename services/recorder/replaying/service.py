@@ -18,7 +18,7 @@ from common.errors import UserError
 from common.log import logger, set_up_logging
 from common.messages.requests import PlayerReply
 from common.messages.topics import SCAN, TOPICS
-from common.processes import ending_signals
+from common.processes import interrupts_to_handle
 from common.runtime.config import ServiceSettings, load_settings
 from common.runtime.heartbeat import Heartbeat
 from services.recorder.reader import read_recording
@@ -101,7 +101,7 @@ class ReplayHeartbeat:
 def main(argv: list[str] | None = None) -> None:
     """Replays until SIGTERM, Ctrl-C or the end of its terminal. Exits with status 0, or with 2 after a UserError."""
     stop = threading.Event()
-    for number in ending_signals():
+    for number in interrupts_to_handle():
         signal.signal(number, lambda *_: stop.set())
     try:
         settings = load_settings(ReplaySettings, argv)
