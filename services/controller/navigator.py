@@ -312,7 +312,8 @@ class Navigator:
     @property
     def waits_for_scan(self) -> bool:
         """Whether every scan was answered: the simulation may be paused. Otherwise the estimator is late."""
-        return self._scan is not None and self._scan.stamp_ns == self._command.stamp_ns
+        answered_ns = self._command.stamp_ns  # newer than the last scan if only the estimator got the one after it
+        return self._scan is not None and answered_ns is not None and self._scan.stamp_ns <= answered_ns
 
     def stop_without_belief(self, stamp_ns: int, reason: str) -> Answer:
         """Returns the command to stop and its status, for when no belief came in time.

@@ -118,6 +118,23 @@ def test_a_repeated_map_is_not_planned_in_again(monkeypatch):
     assert planned == [first, moved, first]
 
 
+def test_reason_after_a_belief_without_its_scan(monkeypatch):
+    """The scanner has fallen silent, even if the last scan came to the estimator only."""
+    clock = Clock()
+    monkeypatch.setattr(shell, "time", clock)
+    service, bus = ControllerService(ControllerSettings(world="", preset="paper")), FakeBus()
+    ServiceLoop(service, bus, Inbox())
+    service.open()
+    service.on_message(SCAN, scan(0, POSE, ROOM))
+    service.on_message(BELIEF, belief(PERIOD_NS, POSE))
+    service.on_message(GOAL, goal(8, 2))
+    for _ in range(2):  # the scan does not come, and no further belief
+        clock.now += service.due()
+        service.on_timer()
+    last = [STATUS.message.decode(payload) for topic, payload in bus.sent if topic is STATUS][-1]
+    assert "no scan" in last.reason
+
+
 def test_goal_without_beliefs():
     service, bus = ControllerService(ControllerSettings(world="", preset="paper")), FakeBus()
     ServiceLoop(service, bus, Inbox())
