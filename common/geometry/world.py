@@ -239,10 +239,8 @@ class World(WorldPart):
         """The reason why a robot of ``radius`` m cannot stand at a point (2,) or pose (3,), or None if it can."""
         if self.has_room(place, radius):
             return None
-        clearance = float(self.clearance(place[:2])[0])
-        what = "is inside a wall or outside" if clearance < 0 else f"is {clearance:.2f} m from a wall of"
-        where = place_text(self.floors, place)
-        return f"{where} {what} {self.name!r}; the robot needs {radius:g} m around it"
+        problem = lack_of_room(float(self.clearance(place[:2])[0]), radius)
+        return f"{place_text(self.floors, place)} in {self.name} {problem}"
 
     def clearances(self, x: Array, y: Array) -> Array:
         """(len(y), len(x)) `clearance` in m at the nodes x, y of a lattice in map, ascending."""
@@ -395,6 +393,13 @@ class _Area:
 
 def _box_around(floors: list[Floor]) -> list[tuple[float, float]]:
     return corners_of(bounds_of([corner for floor in floors for corner in floor.boundary]))
+
+
+def lack_of_room(clearance: float, radius: float) -> str:
+    """What is wrong with a place for a robot of ``radius`` m, ``clearance`` m from the edge of free space."""
+    if clearance < 0:
+        return "is inside something, or off the map"
+    return f"is {clearance:.2f} m from a wall, and the robot needs {radius:g} m around it"
 
 
 def known_worlds() -> list[str]:

@@ -18,7 +18,7 @@ from common.messages.definitions import Belief, Goal, Map, Odom, Pose, Scan, Twi
 from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS
 from lab.benchmarks.mapping import trajectory_errors
-from services.controller.growing_map import PlannedMap
+from services.controller.growing_map import PlanningMap
 from services.controller.navigator import Navigator
 from services.controller.policies.exploration import ExplorationState, NoPath, Viewpoint
 from services.controller.policies.planner import GeodesicPolicy
@@ -57,7 +57,7 @@ class RobotWithMapper:
         self._choose, self._policy = choose, GeodesicPolicy(robot, None)
         self._navigator = Navigator(robot, chosen_policy=self._policy)
         self._mapper: Mapper | None = None  # built for the first scan
-        self._map: PlannedMap | None = None
+        self._map: PlanningMap | None = None
         self._map_stamp_ns = -MAP_PERIOD_NS
 
     def step(self, odom: Odom, scan: Scan) -> Twist:
@@ -92,7 +92,7 @@ class RobotWithMapper:
 
     def _use_map(self, message: Map) -> None:
         self.run.map = message
-        planned = PlannedMap.of(message, self._policy.robot.radius)
+        planned = PlanningMap.of(message, self._policy.robot.radius)
         self._policy.use_map(planned.graph, jumped=self._map is not None and planned.jumped_from(self._map))
         self._map = planned
         self._navigator.on_map(planned)

@@ -33,6 +33,7 @@ from lab.paper.teleports import StepSizes, travel
 from presage.plotting import style as drawing
 from services.controller.navigator import Navigator
 from services.controller.policies.paper_action import ActionParameters
+from services.controller.policies.straight_line import StraightLinePolicy
 from services.estimator.paper import weights
 from services.estimator.paper.decoder import PaperModel, use_one_core
 from services.estimator.paper.estimator import PaperEstimator
@@ -129,7 +130,7 @@ def _run_velocity(job: StepSizeJob, world: World, ends: StartAndGoal) -> dict[st
     pose, goal = (*ends.start, job.field.heading), np.array([*ends.goal, job.field.heading])
     model, card = _model(job.field)
     perception = PaperEstimator(model, card, Descent(beta=steps.beta), np.array(pose))
-    navigator = Navigator(Robot(), ActionParameters(gamma=steps.gamma), world)
+    navigator = Navigator(Robot(), world, StraightLinePolicy(Robot(), ActionParameters(gamma=steps.gamma), world))
     navigator.on_goal(Goal(stamp_ns=0, pose=Pose.of(goal)))
     simulation = Simulation(SimulationSetup(world, scanner, Robot(), pose, job.seed * 100_003 + job.index))
     errors, contacts = [], 0

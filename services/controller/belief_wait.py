@@ -4,7 +4,7 @@ To process a belief means to wait for predicted scans if the policy needs them, 
 
 | state | new belief | scan | predicted scans | deadline |
 |---|---|---|---|---|
-| NoBelief | process it | answer the scan, if the robot is driven by hand | - | - |
+| NoBelief | process it | answer the scan, if the robot is driven by hand or still moves | - | - |
 | Answered | process it | - | - | stop the robot: NoBelief |
 | AwaitsScan | process the waiting one, then the new one | process, if it is not older | - | process |
 | AwaitsPredictions | process it in place of the waiting one | - | answer | stop the robot: NoBelief |
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class NoBelief:
-    """No belief has come yet, or none within `belief_timeout`. The robot stands, or is driven by hand."""
+    """No belief has come yet, or none within `belief_timeout`. The robot stops, or is driven by hand."""
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ LINE_LENGTH_M = 0.6  # of the straight approach, which the robot drives exactly
 LINE_SPEED = 0.2  # m/s
 SETTLING_TIME_S = 0.3  # time constant of the arrival; longer than scan period, latency and braking time together
 CONVERGENCE_M = 0.1  # a differential base corrects its lateral error over a few times this distance
-MAX_LATERAL_ERROR_M = 0.1  # if the robot is farther from the line, it drives to the line's start again
+MAX_LINE_ERROR_M = 0.1  # a robot that is farther from the line, at its side or beyond an end, drives to its start again
 MAX_ALIGN_ERROR_RAD = 0.03  # heading error with which the robot may start to follow the line
 STANDING_TIME_S = 1.0  # time at rest before the robot counts as arrived, because the belief lags behind slow motion
 # The robot stops correcting an error below this share of the tolerance, so that noise does not keep it moving.
@@ -100,22 +100,22 @@ class Docking:
             if abs(turn) > MAX_ALIGN_ERROR_RAD:
                 return np.array([0.0, 0.0, turn_rate(turn, self.robot, hold)])
             self.phase = DockingPhase.LINE
-        if not -MAX_LATERAL_ERROR_M < along < LINE_LENGTH_M + MAX_LATERAL_ERROR_M or abs(across) > MAX_LATERAL_ERROR_M:
+        if not -MAX_LINE_ERROR_M < along < LINE_LENGTH_M + MAX_LINE_ERROR_M or abs(across) > MAX_LINE_ERROR_M:
             self.phase = DockingPhase.DRIVE
         if self.phase is DockingPhase.DRIVE:
             return None
         is_off = abs(turn) > TARGET_SHARE * (self.yaw_tolerance or np.inf)
-        final_turn = turn_rate(turn, self.robot, hold) if is_off else 0.0
+        turn_command = turn_rate(turn, self.robot, hold) if is_off else 0.0
         if self.robot.drive == "holonomic":
             velocity = self._holonomic_velocity(along, across)
-            return np.array([*se2.rotate(self.direction - pose[2], velocity), final_turn])
+            return np.array([*se2.rotate(self.direction - pose[2], velocity), turn_command])
         speed = self._speed(along)
-        if speed > 0:  # yaw'' = -2 yaw' / C - y / C^2 over the distance: critically damped
-            final_turn = speed * (across / CONVERGENCE_M + 2 * turn) / CONVERGENCE_M
-        elif speed == 0 and final_turn == 0 and not self.arrived(pose):
+        if speed > 0:  # with y' = yaw along the line, y'' = -2 y' / C - y / C^2: critically damped, so no overshoot
+            turn_command = speed * (across / CONVERGENCE_M + 2 * turn) / CONVERGENCE_M
+        elif speed == 0 and turn_command == 0 and not self.arrived(pose):
             self.phase = DockingPhase.DRIVE  # the robot stands beside the goal
             return None
-        return np.array([-speed if self.backwards else speed, 0.0, final_turn])
+        return np.array([-speed if self.backwards else speed, 0.0, turn_command])
 
     def _holonomic_velocity(self, along: float, across: float) -> Array:
         """Velocity (2,) m/s along and across the line, with which the robot gets onto the line before the goal."""

@@ -35,7 +35,7 @@ from services.controller.policies.recovery import MAX_GAP_NS
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from services.controller.goal_state import GoalState
-    from services.controller.growing_map import AnchoredPose, PlannedMap
+    from services.controller.growing_map import AnchoredPose, PlanningMap
     from services.controller.policies.exploration import ExplorationState, FieldOfView, NoPath, Viewpoint
 
 PAUSE_NS = 2_000_000_000  # how long the robot stands at a goal of a user before it goes on exploring
@@ -44,13 +44,13 @@ STALLED_M, STALLED_RAD = 0.2, 0.5
 VIEWPOINT_TOLERANCE_M = 0.1
 MAX_SPEED_FACTOR = 1.5  # a belief that moves faster than the robot can, by this factor, has jumped with the map
 RETURN_TOLERANCE_M = 0.01  # of the goal at the start, so that the robot stands within 2 cm of it
-AT_START_M = 0.1  # a robot that cannot plan this close to the start gains no room by returning
+AT_START_M = 0.1  # if no path can be planned this close to the start, returning does not help: the exploration fails
 
 
 class Explorer:
     """One exploration: chooses the robot's goals."""
 
-    def __init__(self, seq: int, pose: Array, planned: PlannedMap) -> None:
+    def __init__(self, seq: int, pose: Array, planned: PlanningMap) -> None:
         """Begins at a pose (3,) in a map; ``seq`` is the number of the request."""
         self.seq, self.map = seq, planned
         self.phase: Literal["exploring", "returning", "finished", "failed"] = "exploring"
@@ -85,12 +85,12 @@ class Explorer:
         """Where exploration began, (3,) in the present map; None while that is not connected to it."""
         return next(iter(self.map.locate([self._home])), None)
 
-    def use_map(self, planned: PlannedMap) -> bool:
+    def use_map(self, planned: PlanningMap) -> bool:
         """Uses a new version of the map, in which another viewpoint may be better.
 
         The exploration fails if it is another map, because the start is not known there. Returns whether that happened.
         """
-        is_another = self.active and planned.is_another_than(self.map)
+        is_another = self.active and planned.mapping_restarted_since(self.map)
         if is_another:
             self._fail("mapping has started again: explore again")
         self._map_jumped |= planned.jumped_from(self.map)
@@ -101,7 +101,7 @@ class Explorer:
         """Pauses the exploration, because a user has set a goal."""
         self.goal, self.paused, self._user_goal_over_since_ns = None, True, None
 
-    def move(self, pose: Array, stamp_ns: int, max_speed: float, *, tracking: bool) -> None:
+    def update_pose(self, pose: Array, stamp_ns: int, max_speed: float, *, tracking: bool) -> None:
         """Updates the robot's pose (3,), which is in the map only if the belief is in state `tracking`.
 
         The robot drives at most at ``max_speed`` m/s.

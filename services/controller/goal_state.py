@@ -9,7 +9,7 @@
 | NAVIGATING, BLOCKED | `update_progress`: the robot backs off, or has stood before an obstacle for 2 s | BLOCKED |
 | BLOCKED | `update_progress`: the robot has moved, or nothing is in the way | NAVIGATING |
 | NAVIGATING, BLOCKED | `reach` | REACHED |
-| NAVIGATING, BLOCKED | `refuse` | REFUSED |
+| NAVIGATING, BLOCKED, UNLOCALISED | `refuse` | REFUSED |
 | NAVIGATING, BLOCKED, UNLOCALISED | `suspend` | NAVIGATING |
 | REACHED | `suspend` | IDLE |
 """

@@ -32,7 +32,7 @@ class AnchoredPose:
 
 
 @dataclass(frozen=True)
-class PlannedMap:
+class PlanningMap:
     """A map, and the graph of the paths through it."""
 
     message: Map
@@ -40,16 +40,16 @@ class PlannedMap:
     free_area_m2: float
 
     @classmethod
-    def of(cls, message: Map, radius: float) -> PlannedMap:
+    def of(cls, message: Map, radius: float) -> PlanningMap:
         """Prepares a map for planning with a robot of ``radius`` m."""
         free_area_m2 = float(np.count_nonzero(message.grid.values == FREE)) * message.grid.resolution**2
         return cls(message, FreeSpaceGraph(FreeSpace.of_map(message.grid), radius), free_area_m2)
 
-    def is_another_than(self, before: PlannedMap) -> bool:
+    def mapping_restarted_since(self, before: PlanningMap) -> bool:
         """Whether mapping started again after the version ``before``, so that poses in it mean nothing in this one."""
         return self.message.key_scans < before.message.key_scans
 
-    def jumped_from(self, before: PlannedMap) -> bool:
+    def jumped_from(self, before: PlanningMap) -> bool:
         """Whether a key scan of the version ``before`` has moved by more than `JUMP_M` in this one."""
         old, new = before.message, self.message
         _, in_old, in_new = np.intersect1d(old.numbers, new.numbers, assume_unique=True, return_indices=True)

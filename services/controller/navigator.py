@@ -20,7 +20,6 @@ from services.controller.goal_state import GoalState, Phase
 from services.controller.lifts import LiftRide, plan_ride
 from services.controller.manual_drive import ManualDrive
 from services.controller.policies.decision import Decision, Policy
-from services.controller.policies.goal_check import wall_refusal
 from services.controller.policies.motion_model import STEP_S, delay_until_effect, is_moving, turn_rate
 from services.controller.policies.paper_action import ActionParameters
 from services.controller.policies.straight_line import StraightLinePolicy
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
     from common.geometry.floors import Floor
     from common.geometry.se2 import Array
     from common.geometry.world import World
-    from services.controller.growing_map import PlannedMap
+    from services.controller.growing_map import PlanningMap
     from services.controller.policies.exploration import ExplorationState, NoPath, Viewpoint
 
 MAX_RECENT_SCANS = 60  # 4 s at 15 Hz: longer than a search of the whole map takes on a slow computer
@@ -51,26 +50,25 @@ class Navigator:
     """
 
     robot: Robot = field(default_factory=Robot)
-    parameters: ActionParameters = field(default_factory=ActionParameters)  # of preset `paper`
     world: World | None = None  # the map; None while the mapper builds it, or if preset `paper` drives without a map
-    chosen_policy: Policy | None = None  # defaults to the straight-line policy, preset `paper`
+    chosen_policy: Policy | None = None  # defaults to preset `paper`
     self_filter: SelfFilter = NO_FILTER
 
     def __post_init__(self) -> None:
-        self.policy: Policy = self.chosen_policy or StraightLinePolicy(self.robot, self.parameters, self.world)
+        self.policy: Policy = self.chosen_policy or StraightLinePolicy(self.robot, ActionParameters(), self.world)
         self.decision = Decision()  # what the policy decided on the latest belief
         self.goal_state = GoalState()
         self._command = VelocityCommand(self.robot)
         self._manual = ManualDrive()
         self._docking: Docking | None = None  # if the goal has an approach direction
         self._ride: LiftRide | None = None  # while the goal is on another floor
-        self._map: PlannedMap | None = None  # the mapper's, if there is one
+        self._map: PlanningMap | None = None  # the mapper's, if there is one
         self._pose: Array | None = None  # (3,) base_link in map, of the latest belief in state `tracking`
         self._tracking = False  # whether the latest belief is in that state
         self._floor: Floor | None = None  # of the robot when the destination was chosen; None if it was unknown
-        self.explorer: Explorer | None = None  # None after it was cancelled, or when a goal follows its end
+        self.explorer: Explorer | None = None  # None before the first, after a cancel, and once a goal follows its end
         self._exploration_request: Goal | None = None  # waits for the first map and a pose in it
-        self._goal_count = 0  # goals of users so far; a viewpoint that was requested before the last is not used
+        self._goal_count = 0  # goals and cancels so far; a viewpoint chosen before the latest is discarded
         self._recent_scans: deque[Scan] = deque(maxlen=MAX_RECENT_SCANS)  # the latest last
         self._scan_points = np.zeros((0, 2))  # m in base_link
 
@@ -103,7 +101,7 @@ class Navigator:
 
     def _explore(self, request: Goal) -> None:
         self._cancel_goal()
-        if self.chosen_policy is None:
+        if isinstance(self.policy, StraightLinePolicy):
             reason = "preset paper cannot explore: use preset geodesic, and start with `presage up --mapping`"
             self.goal_state.start(request, reason)
             return
@@ -128,7 +126,7 @@ class Navigator:
             self.explorer = Explorer(self._exploration_request.seq, self._pose, self._map)
             self._exploration_request = None
 
-    def on_map(self, planned: PlannedMap) -> None:
+    def on_map(self, planned: PlanningMap) -> None:
         """Uses a new version of the mapper's map, unless it has no key scans. The caller passes it to the policy.
 
         If mapping has started again, the goal is refused and an exploration fails.
@@ -138,7 +136,7 @@ class Navigator:
         before, self._map = self._map, planned
         if self.explorer is not None and self.explorer.use_map(planned):
             self._cancel_goal()
-        if self.goal_state.active and before is not None and planned.is_another_than(before):
+        if self.goal_state.active and before is not None and planned.mapping_restarted_since(before):
             self._docking = self._ride = None
             self.goal_state.refuse("mapping has started again: send the goal again")
             self.policy.set_goal(None)
@@ -227,7 +225,7 @@ class Navigator:
         def refusal_at(place: Array) -> str | None:
             if self.world is not None and self.world.floors and self._present_floor() != self.world.floor_at(place):
                 # The policy can check paths only on the robot's floor.
-                return wall_refusal(self.world, place, self.robot.radius)
+                return self.world.placement_error(place, self.robot.radius)
             return self.policy.refusal(place)
 
         if self._docking is None:
@@ -264,7 +262,7 @@ class Navigator:
             self._pose = pose
         self._begin_exploration()
         if self.explorer is not None:
-            self.explorer.move(pose, belief.stamp_ns, self.robot.max_speed, tracking=self._tracking)
+            self.explorer.update_pose(pose, belief.stamp_ns, self.robot.max_speed, tracking=self._tracking)
         self.policy.observe(self._scan_of(belief), belief)
         self._follow_floor()
         if manual_twist is not None:

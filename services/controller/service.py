@@ -31,10 +31,11 @@ from services.controller.background_job import BackgroundJob
 from services.controller.belief_wait import Answered, AwaitsPredictions, AwaitsScan, BeliefWait, NoBelief
 from services.controller.navigator import Answer, Navigator
 from services.controller.policies.paper_action import ActionParameters
+from services.controller.policies.straight_line import StraightLinePolicy
 from services.controller.settings import ControllerSettings
 
 if TYPE_CHECKING:
-    from services.controller.growing_map import PlannedMap
+    from services.controller.growing_map import PlanningMap
     from services.controller.policies.exploration import ExplorationState, NoPath, Viewpoint
     from services.controller.policies.geodesic_field import CostField
     from services.controller.policies.planner import GeodesicPolicy
@@ -86,12 +87,12 @@ class ControllerService(Service):
 
     def __init__(self, settings: ControllerSettings) -> None:
         super().__init__(settings)
-        self.navigator = Navigator(self_filter=settings.build_self_filter())
+        self.navigator: Navigator  # made by `open`
         self.geodesic: GeodesicPolicy | None = None  # the policy if the preset is `geodesic`
         self._last_map: Map | None = None  # from the mapper
         self._restored_goal: Goal | None = None  # of the previous controller instance; waits for the mapper's first map
-        self._map: PlannedMap | None = None  # the mapper's, if the policy plans in it
-        self._map_job: BackgroundJob[PlannedMap] = BackgroundJob(self._wake)
+        self._map: PlanningMap | None = None  # the mapper's, if the policy plans in it
+        self._map_job: BackgroundJob[PlanningMap] = BackgroundJob(self._wake)
         self._viewpoint_job: BackgroundJob[tuple[Viewpoint | NoPath | None, ExplorationState]] = BackgroundJob(
             self._wake
         )
@@ -119,8 +120,8 @@ class ControllerService(Service):
 
             keep_heading = settings.heading == "keep"
             self.geodesic = GeodesicPolicy(robot, world, keep_heading=keep_heading, epistemic=settings.epistemic)
-        parameters = ActionParameters(gamma=settings.gamma)
-        self.navigator = Navigator(robot, parameters, world, self.geodesic, self.navigator.self_filter)
+        policy = self.geodesic or StraightLinePolicy(robot, ActionParameters(gamma=settings.gamma), world)
+        self.navigator = Navigator(robot, world, policy, settings.build_self_filter())
         # Declare the publishers now: the first message on a key that was just declared may be lost.
         for topic in (STATUS, CMD_VEL, PLAN, PREFERENCE):
             self.loop.bus.publisher(topic, self.name)
@@ -164,11 +165,11 @@ class ControllerService(Service):
 
     def _plan_in(self, message: Map, radius: float) -> None:
         """Prepares a map for planning in a thread, unless it is the last one again, repeated for late subscribers."""
-        from services.controller.growing_map import PlannedMap
+        from services.controller.growing_map import PlanningMap
 
         last, self._last_map = self._last_map, message
         if last is None or message.model_copy(update={"stamp_ns": last.stamp_ns, "seq": last.seq}) != last:
-            self._map_job.submit(lambda: PlannedMap.of(message, radius))
+            self._map_job.submit(lambda: PlanningMap.of(message, radius))
 
     def close(self) -> None:
         """Waits for the background threads."""
@@ -295,7 +296,7 @@ class ControllerService(Service):
             return "scan", "is the simulation paused, or the scanner silent?"
         return "belief", "is the estimator running?"
 
-    def _use_map(self, planned: PlannedMap) -> None:
+    def _use_map(self, planned: PlanningMap) -> None:
         assert self.geodesic is not None  # noqa: S101 - it plans in the map
         self.geodesic.use_map(planned.graph, jumped=self._map is not None and planned.jumped_from(self._map))
         self._map = planned

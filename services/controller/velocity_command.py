@@ -34,8 +34,8 @@ class VelocityCommand:
     def limit(self, stamp_ns: int, desired: Array, points: Array) -> tuple[CmdVel, bool]:
         """Returns the command for a desired velocity (3,), and whether obstacle ``points`` (K, 2) m reduced it."""
         period_s = 0.0 if self.stamp_ns is None else max(0.0, (stamp_ns - self.stamp_ns) * 1e-9)
-        # After a pause, or a step of the clock, the base has not followed the commands meanwhile.
-        longest = self._period_s if self._stopped else 2 * self._period_s or self.robot.command_timeout
+        # After a pause or a jump of the clock, stamps are far apart, but the base accelerated for two periods at most.
+        longest = self._period_s if self._stopped else (2 * self._period_s or self.robot.command_timeout)
         period_s = min(period_s, longest)
         self.stamp_ns, self._period_s, self._stopped = stamp_ns, period_s, False
         possible, too_low = self._in_pulses(safety.clip_twist(desired, self.robot))

@@ -10,7 +10,7 @@ from common.geometry.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from common.messages.definitions import Drive, Map, Twist
 from common.robot.robot import Robot
 from services.controller.goal_state import Phase
-from services.controller.growing_map import PlannedMap
+from services.controller.growing_map import PlanningMap
 from services.controller.navigator import Navigator
 from services.controller.policies.exploration import NoPath, Viewpoint
 from services.controller.policies.planner import GeodesicPolicy
@@ -21,10 +21,10 @@ SCANS_PER_S = 15
 GRID = OccupancyGrid.of(np.full((100, 200), FREE, np.uint8), 0.05, (0.0, 0.0, 0.0))
 
 
-def map_with(*poses, connected=()) -> PlannedMap:
+def map_with(*poses, connected=()) -> PlanningMap:
     """A map with these key scans; ``connected`` as in the message."""
     message = Map(stamp_ns=0, grid=GRID, poses=np.array(poses, float), connected=np.array(connected, np.uint8))
-    return PlannedMap.of(message, 0.27)
+    return PlanningMap.of(message, 0.27)
 
 
 class PerfectRobot:
@@ -38,7 +38,7 @@ class PerfectRobot:
             self.use_map(map_with(START))
         self.step()
 
-    def use_map(self, planned: PlannedMap) -> None:
+    def use_map(self, planned: PlanningMap) -> None:
         self.policy.use_map(planned.graph, jumped=False)
         self.navigator.on_map(planned)
 
@@ -115,7 +115,7 @@ def test_exploration_waits_for_the_first_map():
 def test_a_map_without_key_scans_is_no_map_to_explore():
     robot = PerfectRobot(mapped=False)
     robot.navigator.on_goal(goal(0, 0, explore=True, seq=5))
-    empty = PlannedMap.of(Map(stamp_ns=0, grid=GRID, poses=np.zeros((0, 3))), 0.27)
+    empty = PlanningMap.of(Map(stamp_ns=0, grid=GRID, poses=np.zeros((0, 3))), 0.27)
     robot.use_map(empty)
     assert robot.step().reason == "waiting for the mapper's first map"
     robot.use_map(map_with(START))
@@ -316,7 +316,7 @@ def test_a_way_back_that_stays_refused_fails():
     shut = GRID.values.copy()
     shut[:, 70:76] = OCCUPIED
     grid = OccupancyGrid.of(shut, 0.05, (0.0, 0.0, 0.0))
-    robot.use_map(PlannedMap.of(Map(stamp_ns=0, grid=grid, poses=np.array([START])), 0.27))
+    robot.use_map(PlanningMap.of(Map(stamp_ns=0, grid=grid, poses=np.array([START])), 0.27))
     robot.explore(None)
     count, status = robot.scans, robot.step()
     while status.exploration.phase == "returning":
@@ -455,7 +455,7 @@ def test_a_viewpoint_that_did_not_move_with_the_map_is_not_given_up():
     values[40:60, 105:135] = OCCUPIED  # at the viewpoint's old coordinates
     grid = OccupancyGrid.of(values, GRID.resolution, (0.0, 0.0, 0.0))
     moved = Map(stamp_ns=0, grid=grid, poses=np.array([START]) + np.array([1.0, 0.0, 0.0]))
-    robot.use_map(PlannedMap.of(moved, 0.27))
+    robot.use_map(PlanningMap.of(moved, 0.27))
     robot.until(lambda _: robot.navigator.goal_state.phase is Phase.REFUSED)
     assert robot.navigator.explorer.viewpoint_due
     assert len(robot.navigator.take_exploration_state().unreachable) == 0

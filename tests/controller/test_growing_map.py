@@ -7,7 +7,7 @@ import numpy as np
 from common.geometry.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from common.messages.definitions import Map
 from common.robot.robot import Robot
-from services.controller.growing_map import PlannedMap
+from services.controller.growing_map import PlanningMap
 from services.controller.policies.free_space import FreeSpace
 from services.controller.policies.planner import GeodesicPolicy
 from tests.controller.driving import PERIOD_NS, belief, scan
@@ -29,7 +29,7 @@ def half_known(x_known: float, *, poses=((1.0, 1.0, 0.0),), connected=()) -> Map
 
 def planner_in(message: Map) -> GeodesicPolicy:
     policy = GeodesicPolicy(Robot(), None)
-    policy.use_map(PlannedMap.of(message, 0.27).graph, jumped=False)
+    policy.use_map(PlanningMap.of(message, 0.27).graph, jumped=False)
     return policy
 
 
@@ -46,7 +46,7 @@ def test_free_space_of_a_growing_map():
 def test_no_map_no_goal():
     policy = GeodesicPolicy(Robot(), None)
     assert "no map yet" in (policy.refusal(NEAR) or "")
-    policy.use_map(PlannedMap.of(half_known(3.0), 0.27).graph, jumped=False)
+    policy.use_map(PlanningMap.of(half_known(3.0), 0.27).graph, jumped=False)
     assert policy.refusal(NEAR) is None
     assert "the map so far is 0.10 m from a wall" in (policy.refusal(np.array([1.0, 0.1])) or "")
     assert "off the map" in (policy.refusal(np.array([9.0, 1.0])) or "")
@@ -83,7 +83,7 @@ def test_a_new_map_renews_the_plan():
     closed = half_known(6.0).grid.values.copy()
     closed[:, 60:64] = OCCUPIED
     message = half_known(6.0).model_copy(update={"grid": OccupancyGrid.of(closed, CELL, (-0.1, -0.1, 0.0))})
-    policy.use_map(PlannedMap.of(message, 0.27).graph, jumped=False)
+    policy.use_map(PlanningMap.of(message, 0.27).graph, jumped=False)
     policy.observe(scan(2 * PERIOD_NS, pose, seen), belief(2 * PERIOD_NS, pose))
     decision = policy.decide(belief(2 * PERIOD_NS, pose), np.zeros(3), np.zeros(3))
     assert decision.refused
@@ -102,7 +102,7 @@ def test_obstacles_move_to_a_new_map_unless_it_jumped():
     larger = half_known(6.0).grid
     cells = np.pad(larger.values, 10, constant_values=UNKNOWN)
     message = half_known(6.0).model_copy(update={"grid": OccupancyGrid.of(cells, CELL, (-0.6, -0.6, 0.0))})
-    graph = PlannedMap.of(message, 0.27).graph
+    graph = PlanningMap.of(message, 0.27).graph
     policy.use_map(graph, jumped=False)
     np.testing.assert_allclose(policy.obstacles.points(), before, atol=1e-9)
     policy.use_map(graph, jumped=True)
@@ -111,9 +111,9 @@ def test_obstacles_move_to_a_new_map_unless_it_jumped():
 
 def test_a_loop_closure_is_a_jump():
     poses = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
-    before = PlannedMap.of(half_known(6.0, poses=poses[:2]), 0.27)
+    before = PlanningMap.of(half_known(6.0, poses=poses[:2]), 0.27)
     after = [
-        PlannedMap.of(half_known(6.0, poses=each), 0.27)
+        PlanningMap.of(half_known(6.0, poses=each), 0.27)
         for each in (poses, poses + np.array([0.0, 0.1, 0.0]), poses[:1])
     ]
     assert [each.jumped_from(before) for each in after] == [False, True, True]
@@ -122,15 +122,15 @@ def test_a_loop_closure_is_a_jump():
 def test_another_piece_as_the_map_is_a_jump():
     """Key scans are compared by their numbers, which leave out those of other pieces."""
     poses = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
-    before = PlannedMap.of(half_known(6.0, poses=poses[:2], connected=[1, 0, 1]), 0.27)
+    before = PlanningMap.of(half_known(6.0, poses=poses[:2], connected=[1, 0, 1]), 0.27)
     for connected, jumped in (([1, 0, 1, 1], False), ([0, 1, 1, 1], True), ([1, 1, 0, 1], True), ([1, 1, 1], True)):
-        assert PlannedMap.of(half_known(6.0, poses=poses, connected=connected), 0.27).jumped_from(before) is jumped
+        assert PlanningMap.of(half_known(6.0, poses=poses, connected=connected), 0.27).jumped_from(before) is jumped
 
 
 def test_anchored_poses_move_with_the_map():
     first, turned = [[0.0, 0.0, 0.0], [2.0, 1.0, 0.0]], [[0.0, 0.0, 0.0], [2.0, 1.5, np.pi / 2], [4.0, 1.0, 0.0]]
-    anchored = PlannedMap.of(half_known(6.0, poses=first, connected=[1, 0, 1]), 0.27).anchor(np.array([3.0, 1.0, 0.5]))
-    moved = PlannedMap.of(half_known(6.0, poses=turned, connected=[1, 0, 1, 1]), 0.27)
+    anchored = PlanningMap.of(half_known(6.0, poses=first, connected=[1, 0, 1]), 0.27).anchor(np.array([3.0, 1.0, 0.5]))
+    moved = PlanningMap.of(half_known(6.0, poses=turned, connected=[1, 0, 1, 1]), 0.27)
     np.testing.assert_allclose(moved.locate([anchored]), [[2.0, 2.5, 0.5 + np.pi / 2]])
-    other = PlannedMap.of(half_known(6.0, poses=turned, connected=[0, 1, 0, 1, 1]), 0.27)
+    other = PlanningMap.of(half_known(6.0, poses=turned, connected=[0, 1, 0, 1, 1]), 0.27)
     assert other.locate([anchored]).shape == (0, 3)

@@ -11,7 +11,7 @@ from common.geometry.occupancy_grid import FREE, OccupancyGrid
 from common.messages.definitions import Map, Status
 from common.messages.topics import GOAL, STATUS
 from common.robot.robot import Robot
-from services.controller.growing_map import PlannedMap
+from services.controller.growing_map import PlanningMap
 from services.controller.lifts import RIDE_LENGTH_M, LiftRide, plan_ride
 from services.controller.navigator import Navigator
 from services.controller.policies.planner import GeodesicPolicy
@@ -266,7 +266,7 @@ def test_goal_is_resumed_while_mapping(replaced, monkeypatch):
     if replaced:
         service.on_message(GOAL, goal(3, 1, seq=8))
     grid = OccupancyGrid.of(np.full((80, 120), FREE, np.uint8), 0.05, (0.0, 0.0, 0.0))
-    service._use_map(PlannedMap.of(Map(stamp_ns=0, grid=grid, poses=np.array([START], float)), 0.27))
+    service._use_map(PlanningMap.of(Map(stamp_ns=0, grid=grid, poses=np.array([START], float)), 0.27))
     goal_state = service.navigator.goal_state
     assert goal_state.goal.seq == (8 if replaced else 7)
     assert replaced or goal_state.active

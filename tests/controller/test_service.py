@@ -16,14 +16,14 @@ from common.messages.requests import PredictReply, Reply
 from common.messages.topics import BELIEF, CMD_VEL, GOAL, MAP, MAX_BYTES, PREDICT, SCAN, STATUS
 from common.runtime.service import ServiceLoop
 from services.controller import service as shell
-from services.controller.policies.active_localisation import CandidateViewpoints
+from services.controller.policies.active_localisation import ViewpointPaths
 from services.controller.service import ControllerService
 from services.controller.settings import ControllerSettings
 from tests.controller.driving import PERIOD_NS, belief, goal, room, scan
 from tests.process_replay.harness import FakeBus
 
 ROOM, POSE = room(10, 4), np.array([2.0, 2.0, 0.0])
-PATHS = CandidateViewpoints(POSE[None], np.ones(1), POSE[None], np.ones(1))
+PATHS = ViewpointPaths(POSE[None], np.ones(1), POSE[None], np.ones(1))
 
 
 class Clock:

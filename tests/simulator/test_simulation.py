@@ -144,7 +144,7 @@ def test_teleport(make):
     odom, truth, _ = simulation.observe()
     assert odom.pose == before.pose
     assert truth.pose.array() == pytest.approx([6.0, 2.0, 1.0])
-    for pose, error in (([7.9, 2, 0], "0.10 m from a wall"), ([9, 9, 0], "inside a wall or outside")):
+    for pose, error in (([7.9, 2, 0], "0.10 m from a wall"), ([9, 9, 0], "inside something, or off the map")):
         with pytest.raises(UserError, match=error):
             simulation.teleport(np.array(pose, float))
     assert simulation.observe()[1].pose == truth.pose
@@ -181,5 +181,5 @@ def test_impossible_furniture_is_refused(make, action, name, center, error):
 
 
 def test_start_in_a_wall_raises_a_user_error(make):
-    with pytest.raises(UserError, match=r"start \(0\.10, 3\.00\) is 0\.10 m from a wall of 'hall'"):
+    with pytest.raises(UserError, match=r"start \(0\.10, 3\.00\) in hall is 0\.10 m from a wall, and the robot needs"):
         make(start=(0.1, 3.0, 0.0))

@@ -26,7 +26,7 @@ NO_SESSION = ("--connect", "tcp/127.0.0.1:9")  # the discard port, on which noth
         (("up", "--config", "{tmp}/wrong.yaml", "--port", "0"), "speed: unknown key"),
         (("up", "--world", "maze", "--estimator", "paper", "--port", "0"), "presage train --world maze"),
         (("demo", "--world", "{tmp}/bad.yaml"), "bad.yaml: not valid YAML"),
-        (("demo", "--goal", "6.8", "3.95"), "goal (6.80, 3.95) is inside a wall or outside 'corridor'"),
+        (("demo", "--goal", "6.8", "3.95"), "goal (6.80, 3.95) in corridor is inside something, or off the map"),
         (("demo", "--goal", "nan", "1"), "two finite numbers"),
         (("demo", "--unknown", "--goal", "1", "1"), "leave out --goal and --estimator"),
         (("demo", "--out", "/dev/null/x"), "/dev/null/x: cannot be written to"),

@@ -3,7 +3,7 @@
 The candidates are paths to viewpoints: places from which a scan may distinguish the possible poses. With several
 possible poses, the expected free energy of a path in nats is
 
-    G(path) = NATS_PER_METRE * (cost to the place + cost from there to the goal)
+    G(path) = NATS_PER_METRE * (cost to the viewpoint + cost from there to the goal)
               + entropy of a beam there - novelty * information of a scan there
 
 The cost to the goal and the entropy are means over the possible poses. The information is how well predicted scans
@@ -49,18 +49,18 @@ MIN_WEIGHT = 1e-3  # lighter hypotheses are ignored: a belief can be `tracking` 
 # excluded; without this limit, to exclude an improbable one would not be worth a metre of driving.
 MIN_COUNTED_WEIGHT = 0.05
 MAX_HYPOTHESES = 6  # scans are predicted for each
-PLACE_SPACING_M = 1.0  # of the places that are compared
+VIEWPOINT_SPACING_M = 1.0  # of the viewpoints that are compared
 # Limits of the cost of the path to a viewpoint: 1 per metre where nothing is near and scans give the pose, else more.
 MIN_PATH_COST_M, MAX_PATH_COST_M = 0.8, 12.0
-MAX_PLACES = 60
-CHOICE_PERIOD_NS = 1_000_000_000  # minimum time between two choices of a place
+MAX_VIEWPOINTS = 60
+CHOICE_PERIOD_NS = 1_000_000_000  # minimum time between two choices of a viewpoint
 MAX_SPEED = 0.5  # m/s, because it is not known what is behind and beside the robot
 INITIAL_WAIT_NS = 1_000_000_000  # time for the estimator to localise before the robot moves
 CORRELATION_LENGTH_M = 1.0  # scans from places this far apart are nearly independent
 MAX_VISITED = 100  # positions kept, VISITED_SPACING_M apart
 VISITED_SPACING_M = 0.25
-STALLED_NS = 3_000_000_000  # after this time without progress, the robot gives up the place
-REACHED_M = 0.1  # a place nearer than this was reached
+STALLED_NS = 3_000_000_000  # after this time without progress, the robot gives up the viewpoint
+REACHED_M = 0.1  # a viewpoint nearer than this was reached
 PROGRESS_M, PROGRESS_RAD = 0.25, 0.5  # a motion or turn by this is progress; turning to and fro by less is not
 MAX_USEFUL_DISTANCE_M = 5.0  # more free distance than this is no advantage
 HALF_WINDOW_RAD = 0.35  # the free distance in a direction is the shortest range this far to either side of it
@@ -71,7 +71,7 @@ NOMINAL_SIGMA_M = 0.02  # standard deviation of a beam at which its entropy coun
 
 
 @dataclass(frozen=True)
-class CandidateViewpoints:
+class ViewpointPaths:
     """Paths to viewpoints, compared under one belief. The first hypothesis is the best one."""
 
     hypotheses: Array  # (K, 3) base_link in map
@@ -91,7 +91,7 @@ class VisitedPlaces:
         self.positions = np.zeros((1, 2))  # (V, 2) m
         self._stamp_ns: int | None = None
 
-    def move(self, stamp_ns: int, velocity: Array) -> Array:
+    def integrate(self, stamp_ns: int, velocity: Array) -> Array:
         """Integrates the latest command (3,) up to a stamp; returns the motion (3,) since the stamp before."""
         seconds = 0.0 if self._stamp_ns is None else max(0.0, (stamp_ns - self._stamp_ns) * 1e-9)
         motion = velocity * seconds
@@ -121,7 +121,7 @@ class StallTimer:
         self._progress_ns: int | None = None  # stamp of the last progress; None before the first one
         self._stamp_ns = 0
 
-    def move(self, stamp_ns: int, motion: Array) -> None:
+    def add_motion(self, stamp_ns: int, motion: Array) -> None:
         """Processes the motion (3,) since the stamp before."""
         self._stamp_ns, self._pose = stamp_ns, se2.between(motion, self._pose)
         moved = np.hypot(*self._pose[:2]) > self._progress_m or abs(self._pose[2]) > PROGRESS_RAD
@@ -166,19 +166,20 @@ class ActiveLocaliser:
         self.graph = graph
         area = float((graph.free.clearance > 0).sum()) * graph.grid.resolution**2
         # Entropy of an unknown pose, at the resolution of poses.
-        self._unknown_entropy = float(np.log(max(1.0, 2 * np.pi * area / np.sqrt(np.linalg.det(efe.RESOLUTION)))))
+        resolved = float(np.sqrt(np.linalg.det(efe.RESOLUTION_COVARIANCE)))  # m² rad
+        self._unknown_entropy = float(np.log(max(1.0, 2 * np.pi * area / resolved)))
 
     def reset(self) -> None:
         """Forgets everything. Call it when the pose is known, or the goal has changed."""
         self._visited, self._stall_timer = VisitedPlaces(), StallTimer(self.robot.max_speed)
         self._requested_ns: int | None = None  # stamp of the last search for candidates
-        self._paths: CandidateViewpoints | None = None  # result of that search; None if the map has no path
+        self._paths: ViewpointPaths | None = None  # result of that search; None if the map has no path
         self._prediction_failure = ""  # why the last request was not answered
         self._viewpoint: tuple[Array, dict[str, float]] | None = None  # (3,) in base_link, and its expected free energy
-        self._field: tuple[Array, CostField | None] | None = None  # a place (2,) m in map and its field
+        self._field: tuple[Array, CostField | None] | None = None  # a viewpoint (2,) m in map and its field
         self._unknown_since_ns: int | None = None  # stamp since which there are no likely hypotheses
 
-    def prediction_request(self, belief: Belief) -> CandidateViewpoints | None:
+    def prediction_request(self, belief: Belief) -> ViewpointPaths | None:
         """Candidate paths; scans must be predicted for their end poses and passed to `use_predictions`.
 
         Returns None if no predictions are needed now.
@@ -192,22 +193,22 @@ class ActiveLocaliser:
             self._viewpoint = None
         return self._paths
 
-    def _candidate_paths(self, poses: Array, weights: Array) -> CandidateViewpoints | None:
+    def _candidate_paths(self, poses: Array, weights: Array) -> ViewpointPaths | None:
         """Paths from the best of the hypotheses (K, 3), also to the present viewpoint; None if the map has none."""
-        field = self.graph.cost_field(poses[0][:2], self.min_point_distance + PLACE_SPACING_M)
+        field = self.graph.cost_field(poses[0][:2], self.min_point_distance + VIEWPOINT_SPACING_M)
         if field is None or not field.reaches(poses[0][:2]):
             return None
-        displacements, path_costs = self._candidate_places(field, poses[0])
+        displacements, path_costs = self._candidate_viewpoints(field, poses[0])
         if self._viewpoint is not None:
             present, _ = self._viewpoint
             cost = field.cost_from(se2.compose(poses[0], present)[:2])
             if np.isfinite(cost):
                 displacements = np.concatenate([present[None], displacements])
                 path_costs = np.concatenate([[cost], path_costs])
-        return CandidateViewpoints(poses, weights, displacements, path_costs) if len(path_costs) else None
+        return ViewpointPaths(poses, weights, displacements, path_costs) if len(path_costs) else None
 
     def use_predictions(self, reply: PredictReply, range_max: float, cost_to_goal: Callable[[Array], Array]) -> None:
-        """Chooses a place with the predictions for the last request.
+        """Chooses a viewpoint with the predictions for the last request.
 
         ``cost_to_goal`` returns the cost (...,) m of the paths to the goal from places (..., 2) m in map.
         """
@@ -230,12 +231,12 @@ class ActiveLocaliser:
 
     def decide(self, belief: Belief, scan: Scan, points: Array, velocity: Array, field_of_view: Sector) -> Decision:
         """Chooses a velocity; ``points`` (K, 2) m in base_link are obstacles."""
-        motion = self._visited.move(belief.stamp_ns, velocity)
-        self._stall_timer.move(belief.stamp_ns, motion)
+        motion = self._visited.integrate(belief.stamp_ns, velocity)
+        self._stall_timer.add_motion(belief.stamp_ns, motion)
         if self._viewpoint is not None:
             self._viewpoint = (se2.between(motion, self._viewpoint[0]), self._viewpoint[1])
-            # A further scan from a place that was reached gives no information. If it were kept, the robot would stay
-            # until another place is worth its path.
+            # A further scan from where it has arrived gives no information. If it kept the viewpoint, the robot would
+            # stay until another one is worth its path.
             if np.hypot(*self._viewpoint[0][:2]) < REACHED_M:
                 self._viewpoint = None
         self._recovery.restart_timer()  # here, progress decides when the robot backs off
@@ -260,7 +261,7 @@ class ActiveLocaliser:
         return self._drive_to_open_space(belief, scan, surroundings, velocity)
 
     def _tell_apart(self, stamp_ns: int, poses: Array, surroundings: Surroundings, velocity: Array) -> Decision:
-        """Drives to the place that was chosen to tell the hypotheses (K, 3) apart, or waits until there is one."""
+        """Drives to the viewpoint that was chosen to tell the hypotheses (K, 3) apart, or waits until there is one."""
         self._unknown_since_ns = None
         if self._viewpoint is not None:
             self._give_up_if_stalled(stamp_ns, self._viewpoint[0][:2])
@@ -281,12 +282,12 @@ class ActiveLocaliser:
             self._visited.add(place)
             self._recovery.begin(stamp_ns)
 
-    def _candidate_places(self, field: CostField, pose: Array) -> tuple[Array, Array]:
-        """Displacements (M, 3) in base_link of the places around a hypothesis (3,), and costs (M,) m of the paths.
+    def _candidate_viewpoints(self, field: CostField, pose: Array) -> tuple[Array, Array]:
+        """Displacements (M, 3) in base_link of the viewpoints around a hypothesis (3,), and costs (M,) m of the paths.
 
         The ``field`` leads to the hypothesis.
         """
-        step = max(1, round(PLACE_SPACING_M / self.graph.grid.resolution))
+        step = max(1, round(VIEWPOINT_SPACING_M / self.graph.grid.resolution))
         rows, columns = np.meshgrid(*(np.arange(step // 2, n, step) for n in field.cost.shape), indexing="ij")
         cells = (rows * field.cost.shape[1] + columns).ravel()
         cost = field.cost.ravel()[cells]
@@ -295,8 +296,8 @@ class ActiveLocaliser:
             near = np.hypot(*(self.graph.grid.centres(cells) - pose[:2]).T) < MAX_PATH_COST_M
             is_candidate = (cost > MIN_PATH_COST_M) & np.isfinite(cost) & near
         cells, cost = cells[is_candidate], cost[is_candidate]
-        # Thin out to MAX_PLACES, evenly over the costs.
-        selected = np.argsort(cost, kind="stable")[:: max(1, -(-len(cost) // MAX_PLACES))]
+        # Thin out to MAX_VIEWPOINTS, evenly over the costs.
+        selected = np.argsort(cost, kind="stable")[:: max(1, -(-len(cost) // MAX_VIEWPOINTS))]
         cells, cost = cells[selected], cost[selected]
         # Paths of the field lead to the hypothesis, so a cell's next cell is the previous one on the way there.
         places, previous = self.graph.grid.centres(cells), self.graph.grid.centres(field.next_cell[cells])
@@ -306,16 +307,16 @@ class ActiveLocaliser:
     def _drive_to(
         self,
         pose: Array,
-        place: Array,
+        viewpoint: Array,
         terms: dict[str, float],
         surroundings: Surroundings,
         velocity: Array,
         count: int,
     ) -> Decision:
-        """Drives from the first of ``count`` hypotheses towards a place (3,) in base_link."""
-        target = se2.compose(pose, place)[:2]
+        """Drives from the first of ``count`` hypotheses towards a viewpoint (3,) in base_link."""
+        target = se2.compose(pose, viewpoint)[:2]
         if self._field is None or np.hypot(*(self._field[0] - target)) > 2 * self.graph.grid.resolution:
-            self._field = (target, self.graph.cost_field(target, self.min_point_distance + PLACE_SPACING_M))
+            self._field = (target, self.graph.cost_field(target, self.min_point_distance + VIEWPOINT_SPACING_M))
         field = self._field[1]
         path = field.path(pose[:2]) if field is not None else np.zeros((0, 2))
         where = self.graph.free.place_text(target, decimals=1)
@@ -372,7 +373,7 @@ class ActiveLocaliser:
 
 
 def path_energy(
-    paths: CandidateViewpoints,
+    paths: ViewpointPaths,
     ranges: Array,
     sigma: Array,
     range_max: float,

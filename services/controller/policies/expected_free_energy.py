@@ -22,8 +22,9 @@ if TYPE_CHECKING:
 
 NATS_PER_METRE = 0.02  # of -ln p(s) per metre to go: 10 m of driving cost as much as 0.2 nats
 PROBABILITY_PRECISION = 5000.0  # a motion that ends 1 cm nearer to the goal is e times as probable
-# Resolution of the pose at which information counts: half of what the estimator calls localised, 0.2 m and 5 degrees.
-RESOLUTION = np.diag([0.1, 0.1, np.deg2rad(2.5)]) ** 2
+# Covariance of a pose that is known well enough: information beyond it does not count. The standard deviations are half
+# of what the estimator calls localised, 0.2 m and 5 degrees.
+RESOLUTION_COVARIANCE = np.diag([0.1, 0.1, np.deg2rad(2.5)]) ** 2
 # Standard deviation, in m and rad, that a metre without scans adds to a position and a heading. It is as far as the
 # robot could have got, which is what an estimator without odometry assumes.
 DRIFT_PER_METRE = 1.0
@@ -75,7 +76,7 @@ def expected_square(value: Array, deviation: float) -> Array:
 
 
 def remaining_entropy(covariance: Array, information: Array) -> Array:
-    """Entropy (...,) in nats of a pose after scans with an ``information`` (..., 3, 3), beyond that of `RESOLUTION`.
+    """Entropy (...,) in nats beyond `RESOLUTION_COVARIANCE`, of a pose after scans with ``information`` (..., 3, 3).
 
     ``covariance`` (..., 3, 3) is that of the pose before. The result is 0 for a pose known better than the resolution.
     """
@@ -83,10 +84,10 @@ def remaining_entropy(covariance: Array, information: Array) -> Array:
 
 
 def _relative_covariance(covariance: Array, information: Array) -> Array:
-    """Covariance (..., 3, 3) after scans with an ``information`` (..., 3, 3), in units of `RESOLUTION`."""
+    """Covariance (..., 3, 3) after scans with an ``information`` (..., 3, 3), in units of `RESOLUTION_COVARIANCE`."""
     both = np.broadcast_shapes(covariance.shape, information.shape)
     posterior = np.linalg.solve(np.eye(3) + covariance @ information, np.broadcast_to(covariance, both))
-    return np.asarray(posterior / np.diag(RESOLUTION)[:, None])
+    return np.asarray(posterior / np.diag(RESOLUTION_COVARIANCE)[:, None])
 
 
 def entropy(weights: Array) -> float:

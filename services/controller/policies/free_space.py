@@ -39,13 +39,13 @@ class Grid:
         return cls((x0, y0), resolution, (rows, columns))
 
     @property
-    def cells(self) -> int:
+    def cell_count(self) -> int:
         """Number of cells."""
         return self.shape[0] * self.shape[1]
 
     def centres(self, cells: npt.ArrayLike | None = None) -> Array:
         """Centres (N, 2) m in map of the cells with these flat indices. Defaults to all cells, row by row."""
-        rows, columns = np.divmod(np.arange(self.cells) if cells is None else np.asarray(cells), self.shape[1])
+        rows, columns = np.divmod(np.arange(self.cell_count) if cells is None else np.asarray(cells), self.shape[1])
         return np.stack([columns + 0.5, rows + 0.5], axis=-1) * self.resolution + self.origin
 
     def cell_of(self, points: Array) -> npt.NDArray[np.intp]:

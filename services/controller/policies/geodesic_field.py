@@ -49,10 +49,10 @@ class FreeSpaceGraph:
         self._graph = _edges(free.clearance >= self.min_clearance, self.grid.resolution)
         self._length = self._graph.data.copy()
         self._to = self._graph.indices
-        self._from = np.repeat(np.arange(self.grid.cells), np.diff(self._graph.indptr))
+        self._from = np.repeat(np.arange(self.grid.cell_count), np.diff(self._graph.indptr))
         self._opposite = np.empty_like(self._from)  # for each edge, the index of the edge in the opposite direction
         self._opposite[np.lexsort((self._to, self._from))] = np.lexsort((self._from, self._to))
-        self._near_obstacles = np.zeros(self.grid.cells, bool)  # cells whose cost temporary obstacles may change
+        self._near_obstacles = np.zeros(self.grid.cell_count, bool)  # cells whose cost temporary obstacles may change
         self.cost_per_metre = np.zeros(self.grid.shape)
         self._extra_cost_per_metre = UNKNOWN_COST * free.unknown.ravel()  # the part that does not depend on clearance
         self._update_weights(~self._near_obstacles)
@@ -62,7 +62,7 @@ class FreeSpaceGraph:
     def set_obstacles(self, points: Array) -> None:
         """Replaces the temporary obstacles by ``points`` (K, 2) m in map."""
         range_m, before = self.min_clearance + WALL_COST_RANGE_M, self._near_obstacles
-        self.clearance, self._near_obstacles = self.free.clearance, np.zeros(self.grid.cells, bool)
+        self.clearance, self._near_obstacles = self.free.clearance, np.zeros(self.grid.cell_count, bool)
         if len(points):
             self._near_obstacles[self.grid.cell_of(points)] = True
             occupied = self._near_obstacles.reshape(self.grid.shape)
@@ -74,9 +74,9 @@ class FreeSpaceGraph:
         self._update_weights(before | self._near_obstacles)
 
     def set_extra_cost_per_metre(self, cost: Array) -> None:
-        """Sets an additional cost (cells,) of a metre in each cell."""
+        """Replaces the additional cost (cells,) of a metre in each cell, also that of unknown cells."""
         self._extra_cost_per_metre = cost
-        self._update_weights(np.ones(self.grid.cells, bool))
+        self._update_weights(np.ones(self.grid.cell_count, bool))
 
     @property
     def lengths(self) -> csr_matrix:
@@ -107,7 +107,7 @@ class FreeSpaceGraph:
             and self.grid.inside(point)
         ):
             return here  # no other cell's centre is nearer to a point inside this cell
-        cells = np.arange(self.grid.cells) if np.isinf(within) else self.grid.cells_near(point, within)
+        cells = np.arange(self.grid.cell_count) if np.isinf(within) else self.grid.cells_near(point, within)
         cells = cells[clearance[cells] >= self.min_clearance]
         if component is not None:
             cells = cells[self.component[cells] == component]

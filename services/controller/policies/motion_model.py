@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from common.robot.robot import Robot
 
 HOLD_S = 0.4  # how long most motions hold their action; the next scan leads to a new decision
-STEP_S = 1 / 15  # time step of predicted motion: the scan period of the shipped scanner
+STEP_S = 1 / 15  # time step of predicted motion, in s, and the period of a scanner that does not state its own
 SHORT_HOLDS_S = STEP_S * np.arange(1, 6)  # of motions that stop at the target, or end their turn in its direction
 TURN_ACCELERATION_SHARE = 0.4  # share of the acceleration that a turn during motion may use
 NEAR_LOOKAHEAD_M = 0.5  # nearer than this, the robot no longer turns to a lookahead point that lies ahead
@@ -51,13 +51,13 @@ def _velocities(current: Array, motions: Array, times: Array, robot: Robot) -> A
     accelerating = np.minimum(times, hold[:, None])  # (N, T) s until then
     turning = np.minimum(times, turn_hold[:, None])
     change = actions - current
-    progress = np.minimum(1.0, robot.acceleration * accelerating / _linear(change)[:, None])  # share of the change
+    share = np.minimum(1.0, robot.acceleration * accelerating / _speed_or_tiny(change)[:, None])  # of the change
     max_turn_change = robot.turn_acceleration * turning
     velocity = np.empty((len(actions), len(times), 3))
-    velocity[..., :2] = current[:2] + change[:, None, :2] * progress[..., None]
+    velocity[..., :2] = current[:2] + change[:, None, :2] * share[..., None]
     velocity[..., 2] = current[2] + np.clip(change[:, None, 2], -max_turn_change, max_turn_change)
     # Then braking.
-    share_left = np.maximum(0.0, 1 - robot.acceleration * (times - accelerating) / _linear(velocity))
+    share_left = np.maximum(0.0, 1 - robot.acceleration * (times - accelerating) / _speed_or_tiny(velocity))
     velocity[..., :2] *= share_left[..., None]
     turn_left = np.abs(velocity[..., 2]) - robot.turn_acceleration * (times - turning)
     if robot.drive == "differential":  # it brakes on its arc, if it can brake its turn as fast
@@ -82,12 +82,12 @@ def _integrate(velocity: Array, robot: Robot) -> Array:
 def _standing_times(current: Array, motions: Array, robot: Robot) -> Array:
     """Times (N,) s after which the robot stands, apart from a turn on the spot."""
     hold, change = motions[:, 3], motions[:, :3] - current
-    share = np.minimum(1.0, robot.acceleration * hold[:, None] / _linear(change)[:, None])
+    share = np.minimum(1.0, robot.acceleration * hold[:, None] / _speed_or_tiny(change)[:, None])
     top_speed = np.hypot(*(current[:2] + change[:, :2] * share).T)
     return np.asarray(hold + top_speed / robot.acceleration)
 
 
-def _linear(velocity: Array) -> Array:
+def _speed_or_tiny(velocity: Array) -> Array:
     """Speeds (...,) m/s of velocities (..., 3), at least 1e-12, so that one can divide by them."""
     return np.asarray(np.maximum(np.hypot(velocity[..., 0], velocity[..., 1]), 1e-12))
 
@@ -147,7 +147,7 @@ def turn_to_lookahead(action: Array, lookahead: Array, robot: Robot, *, may_turn
     bearing = float(se2.wrap(np.arctan2(lookahead[1], lookahead[0]) - forward))
     if np.hypot(*lookahead) < NEAR_LOOKAHEAD_M and abs(bearing) < np.pi / 3:
         return np.array([action[0], action[1], 0.0])
-    # A base that turns keeps its velocity in map only by a change of that in base_link, which takes acceleration.
+    # While the base turns, its velocity in base_link must rotate back to stay constant in map; that takes acceleration.
     max_turn = TURN_ACCELERATION_SHARE * robot.acceleration / max(float(np.hypot(action[0], action[1])), 1e-3)
     turn = float(np.clip(turn_rate(bearing, robot), -max_turn, max_turn))
     return np.array([*se2.rotate(-turn * STEP_S / 2, action[:2]), turn])
@@ -164,8 +164,8 @@ def candidate_motions(current: Array, lookahead: Array, robot: Robot) -> Array:
     speeds = np.unique([*(robot.max_speed * np.array([0.08, 0.2, 0.4, 0.7, 1.0])), braking_speed(distance, robot)])
     fan = _holonomic_fan(speeds, bearing) if robot.drive == "holonomic" else _arcs(speeds, bearing, distance, robot)
     held = np.pad(np.concatenate([np.zeros((1, 3)), current[None], fan]), ((0, 0), (0, 2)), constant_values=HOLD_S)
-    late = [(stopping_action(current, lookahead, robot, hold), hold) for hold in SHORT_HOLDS_S]
-    motions = [[*action, hold, hold] for action, hold in late if action is not None]
+    stopping = [(stopping_action(current, lookahead, robot, hold), hold) for hold in SHORT_HOLDS_S]
+    motions = [[*action, hold, hold] for action, hold in stopping if action is not None]
     if robot.drive == "differential":
         rates = [(turn_rate(bearing, robot, hold), hold) for hold in SHORT_HOLDS_S]
         motions += [[v, 0.0, rate, HOLD_S, hold] for rate, hold in rates for v in [0.0, *speeds]]

@@ -138,7 +138,7 @@ class PoseBelief:
         )
         ambiguity = np.sum(metres * self.scans.ambiguity_grid.interpolate(self.scans.ambiguity, points), axis=1)
         information = self.scans.information[self.scans.information_grid.cell_of(se2.transform(self.pose, ends))]
-        information = information * seconds / motion_model.STEP_S
+        information = information * seconds / self.scans.scan_period
         present = efe.remaining_entropy(self.covariance, np.zeros((3, 3)))
         return ambiguity, present - efe.remaining_entropy(self.covariance, information)
 

@@ -11,21 +11,15 @@ import numpy as np
 import numpy.typing as npt
 
 from common.geometry import se2
+from common.geometry.world import lack_of_room
 from common.robot.scan_geometry import ALL_ROUND, Sweep
 from common.runtime import safety
 from services.controller.policies import expected_free_energy as efe
-from services.controller.policies.active_localisation import ActiveLocaliser, CandidateViewpoints
+from services.controller.policies.active_localisation import ActiveLocaliser, ViewpointPaths
 from services.controller.policies.decision import Decision, DecisionState
 from services.controller.policies.free_space import NO_MAP, FreeSpace
 from services.controller.policies.geodesic_field import WALL_COST_RANGE_M, CostField, FreeSpaceGraph
-from services.controller.policies.goal_check import near_wall, wall_refusal
-from services.controller.policies.motion_model import (
-    STEP_S,
-    is_moving,
-    stopping_distance,
-    turn_rate,
-    turn_to_lookahead,
-)
+from services.controller.policies.motion_model import is_moving, stopping_distance, turn_rate, turn_to_lookahead
 from services.controller.policies.motion_selection import PoseBelief, Surroundings, least_distance, select_motion
 from services.controller.policies.obstacles import MAX_RANGE_M, TemporaryObstacles
 from services.controller.policies.recovery import BACKING_OFF, MAX_GAP_NS, STUCK_AFTER_NS, Recovery, back_off
@@ -114,11 +108,11 @@ class GeodesicPolicy:
     def _wall_refusal(self, goal: Array) -> str | None:
         """The reason why the robot cannot stand at a goal (2,) m, or None if it can."""
         if self.world is not None:
-            return wall_refusal(self.world, goal, self.robot.radius)
+            return self.world.placement_error(goal, self.robot.radius)
         clearance = float(self.free.clearance_at(goal)) if self.free.grid.inside(goal) else -1.0
         if clearance >= self.robot.radius:
             return None
-        return self._refusal_text(goal, near_wall(clearance))
+        return self._refusal_text(goal, lack_of_room(clearance, self.robot.radius))
 
     def use_map(self, graph: FreeSpaceGraph, *, jumped: bool) -> None:
         """Plans in a new version of the mapper's map.
@@ -152,11 +146,11 @@ class GeodesicPolicy:
         """Computes, with the first scan, how informative scans are in each place; uninformative places cost more."""
         if not self.epistemic or self._information is not None:
             return
-        self._information = ScanInformation.of(self.graph, scan, 1 / (STEP_S * self.robot.max_speed))
+        self._information = ScanInformation.of(self.graph, scan, self.robot.max_speed)
         self.graph.set_extra_cost_per_metre(self._information.ambiguity.ravel() / efe.NATS_PER_METRE)
 
     def observe(self, scan: Scan | None, belief: Belief) -> None:
-        """Updates the scanner's field of view, and while tracking the obstacles and the component of the graph."""
+        """Stores the scan and its field of view; while tracking, also obstacles and the robot's part of the graph."""
         if scan is not None:
             self._field_of_view = Sweep.of(scan).sector(scan.mount.yaw)
             self._scan = scan
@@ -214,7 +208,7 @@ class GeodesicPolicy:
             self._reachable_from = self._component
         return refusal
 
-    def prediction_request(self, belief: Belief) -> CandidateViewpoints | None:
+    def prediction_request(self, belief: Belief) -> ViewpointPaths | None:
         """Paths at whose ends scans must be predicted before `decide_unlocalised`; None if none are needed."""
         if self._goal is None or not self.epistemic:
             return None

@@ -21,6 +21,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from services.controller.policies import expected_free_energy as efe
 from services.controller.policies.free_space import Grid
+from services.controller.policies.motion_model import STEP_S
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -47,16 +48,19 @@ class ScanInformation:
     information: Array
     ambiguity_grid: Grid  # fine
     ambiguity: Array  # (rows, columns of ambiguity_grid) nats, charged once for each metre driven
+    scan_period: float  # s
 
     @classmethod
-    def of(cls, graph: FreeSpaceGraph, scan: Scan, scans_per_metre: float) -> ScanInformation:
+    def of(cls, graph: FreeSpaceGraph, scan: Scan, max_speed: float) -> ScanInformation:
         """The expected information of scans by the scanner of ``scan``, whose ranges are not used.
 
-        ``scans_per_metre`` is the number of scans on each metre driven.
+        The ambiguity is that of a robot at its ``max_speed`` m/s, which scans least often on a metre.
         """
+        scan_period = scan.scan_time or STEP_S
         grid = _coarse_grid(graph.grid)
         information = _information(graph.free, _places_with_room(graph.free, grid, graph.radius), scan)
-        return cls(grid, information, graph.grid, _ambiguity(graph, grid, scans_per_metre * information))
+        ambiguity = _ambiguity(graph, grid, information / (max_speed * scan_period))
+        return cls(grid, information, graph.grid, ambiguity, scan_period)
 
 
 def _information(free: FreeSpace, places: Array, scan: Scan) -> Array:
@@ -78,7 +82,7 @@ def _information(free: FreeSpace, places: Array, scan: Scan) -> Array:
 
 
 def _ambiguity(graph: FreeSpaceGraph, grid: Grid, information: Array) -> Array:
-    """Entropy (rows, columns) in nats of the pose beyond `efe.RESOLUTION` in each cell of a graph.
+    """Entropy (rows, columns) in nats of the pose beyond `efe.RESOLUTION_COVARIANCE` in each cell of a graph.
 
     ``information`` (cells of the coarse ``grid``, 3, 3) is that of all scans taken on a metre. The heading, and the
     directions in which the position is known better and worse, are treated separately.
@@ -88,11 +92,11 @@ def _ambiguity(graph: FreeSpaceGraph, grid: Grid, information: Array) -> Array:
     motion_variance = efe.DRIFT_PER_METRE**2
     # Each metre adds the motion's variance, and the scans reduce it: stationary variance of a scalar Kalman filter.
     stationary = (np.sqrt(motion_variance**2 + 4 * motion_variance * scan_variances) - motion_variance) / 2
-    entropy = np.zeros(graph.grid.cells)
-    for variance, resolution in zip(stationary.T, np.diag(efe.RESOLUTION), strict=True):
+    entropy = np.zeros(graph.grid.cell_count)
+    for variance, resolution_variance in zip(stationary.T, np.diag(efe.RESOLUTION_COVARIANCE), strict=True):
         deviation = grid.interpolate(np.sqrt(variance).reshape(grid.shape), graph.grid.centres())
         deviation = _propagate_deviation(graph, deviation)
-        entropy += np.log1p(deviation**2 / resolution) / 2
+        entropy += np.log1p(deviation**2 / resolution_variance) / 2
     return entropy.reshape(graph.grid.shape)
 
 
@@ -115,7 +119,7 @@ def _propagate_deviation(graph: FreeSpaceGraph, deviation: Array) -> Array:
 
 def _coarse_grid(grid: Grid) -> Grid:
     """A grid over the same area, with cells of `CELL_M`, or larger ones in a large map."""
-    size = max(CELL_M, grid.resolution * float(np.sqrt(grid.cells / MAX_CELLS)))
+    size = max(CELL_M, grid.resolution * float(np.sqrt(grid.cell_count / MAX_CELLS)))
     rows, columns = (int(np.ceil(n * grid.resolution / size)) for n in grid.shape)
     return Grid(grid.origin, size, (rows, columns))
 

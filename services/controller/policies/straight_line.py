@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from services.controller.policies.decision import Decision, DecisionState
-from services.controller.policies.goal_check import wall_refusal
 from services.controller.policies.paper_action import (
     ActionParameters,
     next_action,
@@ -34,7 +33,7 @@ class StraightLinePolicy:
 
     def refusal(self, goal: Array) -> str | None:
         """The reason why a goal (2,) m in map cannot be reached: a wall within the robot's radius. None if it can."""
-        return None if self.world is None else wall_refusal(self.world, goal, self.robot.radius)
+        return None if self.world is None else self.world.placement_error(goal, self.robot.radius)
 
     def set_goal(self, goal: Array | None) -> None:
         """Sets the goal (2,) m in map, and the sum of equation 4 to zero."""

@@ -199,7 +199,9 @@ def test_place_text():
     assert place_text(TOWER.floors, TOWER.to_map((-3.004, 0.5, 2), "first")) == "(-3.00, 0.50) on floor 'first'"
     assert place_text(TOWER.floors, TOWER.to_map((-1e-9, 0.5), "first"), decimals=1) == "(0.0, 0.5) on floor 'first'"
     assert place_text(TOWER.floors, (9, 1)) == "(9.00, 1.00)"
-    assert "(-3.90, 0.00) on floor 'first' is 0.10 m" in TOWER.placement_error(TOWER.to_map((-3.9, 0), "first"), 0.2)
+    assert "(-3.90, 0.00) on floor 'first' in tower is 0.10 m" in TOWER.placement_error(
+        TOWER.to_map((-3.9, 0), "first"), 0.2
+    )
 
 
 @pytest.mark.parametrize("places", [[9, 1], [9, 1, 0.5], [[1, 1], [9, 1]]])

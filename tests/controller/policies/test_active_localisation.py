@@ -40,24 +40,24 @@ def test_time_for_progress():
     """It counts from when the robot may drive: not while it waits or backs off. A turn by half a radian is progress."""
     timer = StallTimer()
     assert not timer.expired
-    timer.move(0, np.zeros(3))
-    timer.move(4_000_000_000, np.zeros(3))
+    timer.add_motion(0, np.zeros(3))
+    timer.add_motion(4_000_000_000, np.zeros(3))
     assert timer.expired
     timer.restart()
     assert not timer.expired
-    timer.move(6_000_000_000, np.array([0.0, 0.0, 0.6]))
-    timer.move(8_000_000_000, np.array([0.1, 0.0, 0.0]))
+    timer.add_motion(6_000_000_000, np.array([0.0, 0.0, 0.6]))
+    timer.add_motion(8_000_000_000, np.array([0.1, 0.0, 0.0]))
     assert not timer.expired
-    timer.move(9_500_000_000, np.array([0.1, 0.0, 0.0]))
+    timer.add_motion(9_500_000_000, np.array([0.1, 0.0, 0.0]))
     assert timer.expired
-    timer.move(9_600_000_000, np.array([0.1, 0.0, 0.0]))
+    timer.add_motion(9_600_000_000, np.array([0.1, 0.0, 0.0]))
     assert not timer.expired
 
 
 def test_slow_robot_makes_progress():
     timer = StallTimer(max_speed=0.05)
     for k in range(100):
-        timer.move(k * 100_000_000, np.array([0.005, 0.0, 0.0]))
+        timer.add_motion(k * 100_000_000, np.array([0.005, 0.0, 0.0]))
         assert not timer.expired
 
 

@@ -12,7 +12,7 @@ from common.geometry import se2
 from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS
 from services.controller.policies import expected_free_energy as efe
-from services.controller.policies.active_localisation import CandidateViewpoints, VisitedPlaces, path_energy
+from services.controller.policies.active_localisation import ViewpointPaths, VisitedPlaces, path_energy
 from services.controller.policies.expected_free_energy import entropy, place_information
 from services.controller.policies.free_space import FreeSpace, Grid
 from services.controller.policies.geodesic_field import FreeSpaceGraph
@@ -125,7 +125,7 @@ def test_identical_rooms():
     moves = se2.between(here, np.column_stack([places, np.full(len(places), here[2])]))
     goal = np.array([4.5, 3.0])  # in the first room
     for first, second in ((here, here + twin), (here + twin, here)):
-        paths = CandidateViewpoints(np.array([first, second]), np.array([0.5, 0.5]), moves, lengths)
+        paths = ViewpointPaths(np.array([first, second]), np.array([0.5, 0.5]), moves, lengths)
         poses = se2.compose(paths.poses().reshape(-1, 3), np.array(scanner.mount))
         ranges = world.ray_distances(poses, scanner.angles()).reshape(2, len(places), 61)
         gain = gain_of(ranges)
@@ -146,7 +146,9 @@ def test_visited_places():
     visited, far = VisitedPlaces(), np.array([[0.0, 0.0], [3.0, 0.0], [-3.0, 0.0]])
     assert visited.novelty(far) == pytest.approx([0, 0.99, 0.99], abs=0.01)
     for number in range(50):  # 3 m ahead, then it turns round
-        visited.move(number * 10**9 // 15, np.array([1.0, 0, 0]) if number < 46 else np.array([0, 0, np.pi * 15 / 4]))
+        visited.integrate(
+            number * 10**9 // 15, np.array([1.0, 0, 0]) if number < 46 else np.array([0, 0, np.pi * 15 / 4])
+        )
     assert visited.novelty(far) == pytest.approx([0, 0, 0.99], abs=0.02)
     visited.add(far[2])
     assert visited.novelty(far)[2] == pytest.approx(0)
@@ -177,7 +179,7 @@ def test_one_step_and_a_known_pose():
 @pytest.mark.parametrize(("deviation", "noise"), [(0.3, 0.1), (0.05, 0.2), (0.2, 0.01)])
 def test_pose_information(deviation, noise):
     """The gain by measuring x is the mutual information of the measurement and the blurred x, by enumeration."""
-    blur = np.sqrt(efe.RESOLUTION[0, 0])
+    blur = np.sqrt(efe.RESOLUTION_COVARIANCE[0, 0])
     x = np.linspace(-4, 4, 801) * np.hypot(deviation, max(noise, blur))
     joint = np.exp(-(x**2) / (2 * deviation**2))[:, None] * np.exp(-((x - x[:, None]) ** 2) / (2 * noise**2))
     blurred = np.exp(-((x - x[:, None]) ** 2) / (2 * blur**2)) @ joint  # (x at the resolution, measurement)
@@ -220,7 +222,7 @@ def test_information_of_scans():
 
 
 def information_of(world, observed):
-    return ScanInformation.of(FreeSpaceGraph(FreeSpace.of(world), 0.27), observed, 15.0)
+    return ScanInformation.of(FreeSpaceGraph(FreeSpace.of(world), 0.27), observed, 1.0)
 
 
 def test_ambiguity_of_the_pose():
@@ -228,17 +230,17 @@ def test_ambiguity_of_the_pose():
     world = room(8, 6, box(4, 2.5, 0.2, 5))  # the way round the wall leads past y = 5
     graph = FreeSpaceGraph(FreeSpace.of(world, 0.2), 0.27)
     grid = Grid((0.0, 0.0), 1.0, (6, 8))
-    rng, count = np.random.default_rng(1), grid.cells
+    rng, count = np.random.default_rng(1), grid.cell_count
     information = np.zeros((count, 3, 3))
     for cell in rng.choice(count, 6, replace=False):
         factor = rng.standard_normal((3, 5)) * np.array([30.0, 30.0, 60.0])[:, None]
         information[cell] = factor @ factor.T
     left = np.linalg.inv(information + np.eye(3) / UNKNOWN_VARIANCE)
     scan_variances = np.column_stack([np.linalg.eigvalsh(left[:, :2, :2]), left[:, 2, 2]])
-    expected = np.zeros(graph.grid.cells)
+    expected = np.zeros(graph.grid.cell_count)
     centres = graph.grid.centres()
     distances = dijkstra(graph.lengths)
-    for variance, resolution in zip(scan_variances.T, np.diag(efe.RESOLUTION), strict=True):
+    for variance, resolution in zip(scan_variances.T, np.diag(efe.RESOLUTION_COVARIANCE), strict=True):
         staying = np.zeros(count)
         for k in range(count):  # a metre of drift, then the scans of a metre, until it stays the same
             for _ in range(2000):
@@ -254,8 +256,12 @@ def test_ambiguity_of_the_pose():
 def test_out_of_sight():
     """In a hall with a range of 2 m, a metre costs more the farther the walls are out of sight; near them, little."""
     hall = room(12, 9, *(box(x, y, 0.5, 0.6, "") for x in range(1, 12, 2) for y in (0.3, 8.7)))
-    short = information_of(hall, scan(0, [6.0, 1.5, 0.0], hall).model_copy(update={"range_max": 2.0}))
+    observed = scan(0, [6.0, 1.5, 0.0], hall).model_copy(update={"range_max": 2.0})
+    short = information_of(hall, observed)
     near, edge, middle = short.ambiguity_grid.interpolate(
         short.ambiguity, np.array([[6.0, 1.3], [6.0, 3.4], [6.0, 4.5]])
     )
     assert near < 0.01 < edge < middle
+    seldom = information_of(hall, observed.model_copy(update={"scan_time": 1.0}))
+    # Where scans tell most, the entropy is proportional to the time between them: here 1 s instead of 1/15 s.
+    assert seldom.ambiguity.min() == pytest.approx(15 * short.ambiguity.min(), rel=0.05)

@@ -38,7 +38,7 @@ def exploration_state_of(
     drawn = np.array([list(row) for row in rows.split()])[::-1].repeat(8, axis=0).repeat(8, axis=1)
     grid = Grid((0.0, 0.0), CELL, drawn.shape)
     centres, walls = grid.centres(), grid.centres(np.flatnonzero(drawn == "#"))
-    clearance = np.full(grid.cells, 9.0)
+    clearance = np.full(grid.cell_count, 9.0)
     if len(walls):
         clearance = np.abs(centres[:, None] - walls).max(axis=2).min(axis=1) - CELL / 2
     graph = FreeSpaceGraph(FreeSpace(grid, clearance.reshape(grid.shape), drawn == "?"), radius)

@@ -45,7 +45,7 @@ def test_interpolation_is_exact_for_a_plane(x, y):
     values = (2 * centres[:, 0] - 3 * centres[:, 1] + 1).reshape(grid.shape)
     inner = np.clip([x, y], [0.05, 0.05], [9.95, 5.95])  # beyond the outermost centres it is constant
     assert grid.interpolate(values, np.array([x, y])) == pytest.approx(2 * inner[0] - 3 * inner[1] + 1)
-    assert grid.cell_of(centres).tolist() == list(range(grid.cells))
+    assert grid.cell_of(centres).tolist() == list(range(grid.cell_count))
 
 
 @pytest.mark.parametrize(

@@ -162,7 +162,9 @@ def test_nearest_reachable_place():
     policy = GeodesicPolicy(Robot(), TWO_ROOMS)
     nearest = "; the nearest place that can be reached is ("
     assert f"(5.00, 2.50) in room is inside something, or off the map{nearest}" in policy.refusal(np.array([5.0, 2.5]))
-    assert f"is 0.20 m from a wall{nearest}0.35, 2." in policy.refusal(np.array([0.2, 2.5]))
+    assert f"is 0.20 m from a wall, and the robot needs 0.27 m around it{nearest}0.35, 2." in policy.refusal(
+        np.array([0.2, 2.5])
+    )
     # In the other room: refused as soon as it is known in which room the robot is.
     other = np.array([8.0, 2.5])
     assert policy.refusal(other) is None
