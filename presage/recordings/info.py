@@ -154,6 +154,6 @@ def _replace_by_checked(facts: TopicFacts, checked: _PayloadCheck) -> None:
     span = (checked.last.get(key, 0) - checked.first.get(key, 0)) * 1e-9
     facts.rate_hz = (checked.message_counts.written[key] - 1) / span if span > 0 else None
     if is_numbered(key):
-        numbers = checked.message_counts.lost(key)
+        numbers = checked.message_counts.sequence_totals(key)
         facts.gaps, facts.missing, facts.restarts = numbers.gaps, numbers.missing, numbers.restarts
         facts.reordered = numbers.reordered

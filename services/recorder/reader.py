@@ -22,7 +22,7 @@ from common.messages.wire import DecodeError
 from common.robot.robot import Robot
 from common.robot.scanner import Scanner
 from common.yaml_text import NOT_YAML, parse_yaml
-from services.recorder.files.chunks import MAGIC, records_of
+from services.recorder.files.chunks import MAGIC, unpacked_records
 from services.recorder.files.index import messages_in_order, summary_of
 from services.recorder.files.writer import PROFILE
 
@@ -268,7 +268,7 @@ def _records(recording: Recording, stream: BinaryIO, *, chunks: bool = True) -> 
     try:
         for record in StreamReader(stream, emit_chunks=True, validate_crcs=True, record_size_limit=size).records:
             if chunks and isinstance(record, Chunk):
-                yield from records_of(record)
+                yield from unpacked_records(record)
             else:
                 yield record
     except OSError:

@@ -23,7 +23,7 @@ from common.versions import versions
 from services.recorder.files.message_counts import KeyCounts, MessageCounts, as_metadata
 from services.recorder.files.parts import PartLimits, PartsWriter
 from services.recorder.files.writer import UNFINISHED_SUFFIX, NameTakenError, RecordingWriter, is_being_written
-from services.recorder.session_description import DescriptionReply, MetadataRecord, records_of
+from services.recorder.session_description import DescriptionReply, MetadataRecord, description_records
 from services.recorder.settings import RecorderSettings
 
 
@@ -74,9 +74,9 @@ class OpenRecording:
 
     def missing(self) -> int:
         """Messages that were published and never received, by their sequence numbers."""
-        return sum(self.message_counts.lost(key).missing for key in self.message_counts.sequences)
+        return sum(self.message_counts.sequence_totals(key).missing for key in self.message_counts.sequences)
 
-    def lost(self) -> int:
+    def not_in_file(self) -> int:
         """Upper bound of the messages that were queued but are not in the file, after writing failed."""
         arrived, dropped, oversized = (sum(counts.values()) for counts in self._since(self._inbox.received_counts()))
         return arrived - dropped - oversized - self.writer.saved
@@ -147,8 +147,8 @@ def file_path(options: RecorderSettings) -> Path:
 
 
 def write_description(writer: RecordingWriter | PartsWriter, service: str, reply: DescriptionReply) -> None:
-    """Writes a service's reply as the metadata and attachments of `records_of`."""
-    for record in records_of(service, reply):
+    """Writes a service's reply as the metadata and attachments of `description_records`."""
+    for record in description_records(service, reply):
         if isinstance(record, MetadataRecord):
             writer.metadata(record.name, record.values)
         else:

@@ -116,7 +116,7 @@ class RecorderService(Service):
         self._update_note()
         for key, written in recording.message_counts.written.items():
             self._written[key] += written
-            self._missing[key] += recording.message_counts.lost(key).missing
+            self._missing[key] += recording.message_counts.sequence_totals(key).missing
         writer = recording.writer
         try:
             files = writer.finish()
@@ -127,7 +127,7 @@ class RecorderService(Service):
                     "recording is incomplete",
                     file=str(writer.part.active) if writer.part.active.exists() else "none",
                     messages=writer.saved,
-                    lost=recording.lost(),
+                    lost=recording.not_in_file(),
                     dropped=dropped,
                     missing=missing,
                 )
@@ -143,7 +143,8 @@ class RecorderService(Service):
         written, missing = self._written[key], self._missing[key]
         if self.recording is not None:
             message_counts = self.recording.message_counts
-            written, missing = written + message_counts.written.get(key, 0), missing + message_counts.lost(key).missing
+            written += message_counts.written.get(key, 0)
+            missing += message_counts.sequence_totals(key).missing
         return {"written": written, "missing": min(missing, MAX_COUNT)}
 
     def due(self) -> float | None:

@@ -111,7 +111,7 @@ def test_losses_on_a_full_disk(tmp_path):
     session.writer.finish()
     recovered = recover(part.active).messages.total()
     assert recovered > 0
-    assert (session.writer.saved, session.lost()) == (recovered, 200 - recovered)
+    assert (session.writer.saved, session.not_in_file()) == (recovered, 200 - recovered)
 
 
 def test_full_disk_from_the_beginning(tmp_path, monkeypatch):

@@ -74,7 +74,7 @@ def mcap_writer(stream: BinaryIO, compression: str, chunk_size: int) -> tuple[Wr
     return writer, chunk
 
 
-def records_of(chunk: Chunk) -> list[McapRecord]:
+def unpacked_records(chunk: Chunk) -> list[McapRecord]:
     """The schemas, channels and messages of a chunk, after checking its checksum.
 
     Raises ValueError, or the decompressor's own error, if the chunk is damaged or too large.
@@ -83,7 +83,7 @@ def records_of(chunk: Chunk) -> list[McapRecord]:
 
 
 def uncompressed(chunk: Chunk) -> bytes:
-    """The uncompressed records of a chunk, at most `MAX_CHUNK_BYTES`. Raises the errors of `records_of`.
+    """The uncompressed records of a chunk, at most `MAX_CHUNK_BYTES`. Raises the errors of `unpacked_records`.
 
     mcap's own decompression has no limit, and a file of 200 kB can unpack to chunks of gigabytes.
     """
