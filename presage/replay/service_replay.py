@@ -81,7 +81,7 @@ def run_service_replay(options: ServiceReplayOptions, console: Console) -> Repla
     if recording.warning:
         print(f"warning: {recording.warning}", file=sys.stderr)
     robot = robot_of(recording)
-    scans = recording.counts()[SCAN.key(robot)]
+    scans = recording.counts[SCAN.key(robot)]
     if not scans:
         raise UserError(f"{options.file}: no scan in it")
     if "log" in recording.metadata:

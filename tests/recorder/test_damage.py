@@ -60,6 +60,14 @@ def test_info_of_a_damaged_index(tmp_path):
     assert messages_in(bad) == SENT
 
 
+def test_index_damaged_after_opening(tmp_path):
+    path, _ = write_chunks(tmp_path, closed=True)
+    recording = read_recording(path)
+    recording.path = damaged(path, path.stat().st_size - 60)
+    assert list(recording.payloads()) == []
+    assert "its index is damaged" in recording.problem
+
+
 def bomb(path, compression, stated):
     """A recording whose only chunk unpacks to 256 MiB of zeros; ``stated`` replaces its stated size."""
     size, piece = 1 << 28, bytes(1 << 20)

@@ -43,10 +43,10 @@ def test_round_trip(tmp_path_factory, entries, compression, flushes):
     path = writer.finish()
     recording = read_recording(path)
     wanted = [(key, payload, published, received) for (_, key), payload, published, received in entries]
-    found = [(r.key, r.payload, r.published_ns, r.logged_ns) for r in recording.raw]
+    found = [(r.key, r.payload, r.published_ns, r.logged_ns) for r in recording.payloads()]
     assert found == sorted(wanted, key=lambda w: w[3])
     assert recording.complete
-    assert recording.counts() == writer.written
+    assert recording.counts == writer.written
     with path.open("rb") as stream:
         messages = make_reader(stream, validate_crcs=True).iter_messages(log_time_order=False)
         assert [(channel.topic, m.data, m.publish_time, m.log_time) for _, channel, m in messages] == wanted
