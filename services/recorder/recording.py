@@ -116,7 +116,7 @@ def parts_of(options: RecorderSettings, *, numbered: bool = False) -> Callable[[
             with suppress(NameTakenError) if try_next_number else nullcontext():
                 if several and not chosen:
                     check_no_parts(path)
-                writer = RecordingWriter(file, options.compression, options.chunk_size)
+                writer = RecordingWriter(file, options.compression)
                 chosen.append(path)
                 return writer
         raise AssertionError

@@ -102,9 +102,9 @@ def test_huge_chunk(tmp_path, compression, stated):
         tracemalloc.stop()
 
 
-def test_losses_on_a_full_disk(tmp_path):
+def test_losses_on_a_full_disk(tmp_path, small_chunks):
     inbox = Inbox()
-    session = OpenRecording(RecorderSettings(directory=tmp_path, compression="none", chunk_size=1024), (), inbox)
+    session = OpenRecording(RecorderSettings(directory=tmp_path, compression="none"), (), inbox)
     part = on_full_disk(session.writer.part, 40_000)
     for number in range(200):
         topic, payload = message(number)
@@ -129,8 +129,8 @@ def test_full_disk_from_the_beginning(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_full_disk_of_a_recorder_on_request(tmp_path):
-    service = RecorderService(RecorderSettings(directory=tmp_path, idle=True, compression="none", chunk_size=1024))
+def test_full_disk_of_a_recorder_on_request(tmp_path, small_chunks):
+    service = RecorderService(RecorderSettings(directory=tmp_path, idle=True, compression="none"))
     loop = ServiceLoop(service, FakeBus(), Inbox())
     service.open()
     assert service.on_request(RECORDING, RecordRequest(action="start")).recording

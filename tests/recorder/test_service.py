@@ -156,7 +156,9 @@ def test_invalid_settings(process, args, message):
 
 
 LIMITED = """
-import resource, runpy, sys
+import functools, resource, runpy, sys
+from services.recorder import recording
+recording.RecordingWriter = functools.partial(recording.RecordingWriter, chunk_size=20_000)
 resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))  # acts like a full disk
 sys.argv = ["recorder", *sys.argv[1:]]
 runpy.run_module("services.recorder", run_name="__main__")
@@ -165,8 +167,7 @@ runpy.run_module("services.recorder", run_name="__main__")
 
 def test_full_disk(process, bus, tmp_path, logs):
     (tmp_path / "limited.py").write_text(LIMITED)
-    small = ("--compression", "none", "--chunk-size", "20000")
-    running = process(tmp_path / "limited.py", "--directory", str(logs), *small)
+    running = process(tmp_path / "limited.py", "--directory", str(logs), "--compression", "none")
     running.wait_for("ready")
     sent = publish(bus, 400)
     assert running.wait() == 2, running.output

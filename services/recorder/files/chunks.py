@@ -14,7 +14,8 @@ from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType, Writer
 
 COMPRESSION = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
-MAX_CHUNK_BYTES = 1 << 24  # the recorder writes at most half of this
+CHUNK_BYTES = 1 << 18  # the recorder ends a chunk when it is this large; a crash loses at most one chunk
+MAX_CHUNK_BYTES = 1 << 24  # read at most; far more than CHUNK_BYTES, which one message and declarations may exceed
 MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of every file
 PREFIX = Struct("<BQ")  # first bytes of every record: opcode and length (MCAP specification, "Records")
 # Private in mcap 1.6, whose writer declares each channel in one chunk only and has no option to repeat declarations.

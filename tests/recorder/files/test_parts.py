@@ -56,8 +56,8 @@ def test_parts_by_time(tmp_path_factory, count, seconds):
     assert payloads == [truth(number) for number in range(count)]
 
 
-def test_parts_by_size(tmp_path):
-    writer = writer_in(tmp_path, PartLimits(size=20_000), compression="none", chunk_size=1024)
+def test_parts_by_size(tmp_path, small_chunks):
+    writer = writer_in(tmp_path, PartLimits(size=20_000), compression="none")
     for number in range(500):
         writer.write(TRUTH, KEY, truth(number), number, number)
     files = writer.finish()
@@ -65,8 +65,8 @@ def test_parts_by_size(tmp_path):
     assert all(20_000 <= file.stat().st_size < 30_000 for file in files[:-1])
 
 
-def test_what_each_part_repeats_does_not_count_for_its_size(tmp_path):
-    writer = writer_in(tmp_path, PartLimits(size=20_000), compression="none", chunk_size=1024)
+def test_what_each_part_repeats_does_not_count_for_its_size(tmp_path, small_chunks):
+    writer = writer_in(tmp_path, PartLimits(size=20_000), compression="none")
     writer.attachment("model", bytes(30_000), "application/octet-stream", 1)
     for number in range(500):
         writer.write(TRUTH, KEY, truth(number), number, number)
