@@ -9,9 +9,9 @@ import shlex
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
-from contextlib import nullcontext, suppress
+from collections.abc import Iterable
 from datetime import datetime, timezone
+from functools import partial
 from pathlib import Path
 
 from common.bus.inbox import OTHERS, Inbox, Sample
@@ -31,19 +31,21 @@ class OpenRecording:
     """A recording that is being written. Every method raises UserError if writing fails."""
 
     def __init__(
-        self, options: RecorderSettings, topics: Iterable[Topic], inbox: Inbox, *, numbered: bool = False
+        self, options: RecorderSettings, topics: Iterable[Topic], inbox: Inbox, *, may_rename: bool = False
     ) -> None:
-        """Opens the file. ``numbered`` is passed to `parts_of`.
+        """Opens the file. ``may_rename`` appends a number to a name chosen by the user if it is taken.
 
         The metadata known so far is written first, so that it is readable even in a file that is never finished.
         """
         self.message_counts = MessageCounts()
         self._inbox, self._before, self._began = inbox, inbox.handled_counts(), time.monotonic()
-        # Log times are wall time at the opening and monotonic time from there: a clock that is set does not bend them.
+        # Log times are wall time at the opening and monotonic time from there, so that setting the system clock does
+        # not change the times between messages.
         self._clock_ns = time.time_ns() - time.monotonic_ns()
         self._logged_ns = 0  # log time of the last message
+        path, first = open_first_part(options, may_rename=may_rename)
         limits = PartLimits(int(options.split_size * 1e6), options.split_minutes * 60)
-        writer = self.writer = PartsWriter(parts_of(options, numbered=numbered), limits, self._counters)
+        writer = self.writer = PartsWriter(first, partial(open_part, options, path), limits, self._counters)
         try:
             writer.metadata("presage", {"robot": options.robot, "command": shlex.join(sys.argv), **versions()})
             writer.metadata("config:recorder", {"config": json.dumps(options.effective())})
@@ -98,30 +100,30 @@ class OpenRecording:
         return {"counters": as_metadata(self._counts())}
 
 
-def parts_of(options: RecorderSettings, *, numbered: bool = False) -> Callable[[int], RecordingWriter]:
-    """Returns a function that opens part k: NAME.mcap, or NAME-001.mcap, NAME-002.mcap, ... if the recording is split.
+def open_first_part(options: RecorderSettings, *, may_rename: bool = False) -> tuple[Path, RecordingWriter]:
+    """Opens the first part under a free name. Returns the path without the number of a part, and the writer.
 
-    If the name is taken, a generated name, or any name with ``numbered``, gets a number appended. A name chosen by the
-    user raises NameTakenError.
+    If the name is taken, a number is appended to a generated name, or to any with ``may_rename``. Otherwise raises
+    NameTakenError.
     """
-    first, several = file_path(options), bool(options.split_size or options.split_minutes)
-    chosen: list[Path] = []  # the name that was free for the first part
+    wanted = file_path(options)
+    for number in itertools.count(1):
+        path = wanted if number == 1 else wanted.with_stem(f"{wanted.stem}-{number}")
+        try:
+            return path, open_part(options, path, 1)
+        except NameTakenError:
+            if options.file and not may_rename:
+                raise
+    raise AssertionError
 
-    def open_part(part: int) -> RecordingWriter:
-        for number in itertools.count(1):
-            path = first if number == 1 else first.with_stem(f"{first.stem}-{number}")
-            path = chosen[0] if chosen else path
-            file = path.with_stem(f"{path.stem}-{part:03d}") if several else path
-            try_next_number = (numbered or not options.file) and not chosen
-            with suppress(NameTakenError) if try_next_number else nullcontext():
-                if several and not chosen:
-                    check_no_parts(path)
-                writer = RecordingWriter(file, options.compression)
-                chosen.append(path)
-                return writer
-        raise AssertionError
 
-    return open_part
+def open_part(options: RecorderSettings, path: Path, part: int) -> RecordingWriter:
+    """Opens NAME.mcap, or NAME-001.mcap, NAME-002.mcap, ... if the recording is split. Raises NameTakenError."""
+    if options.split_size or options.split_minutes:
+        if part == 1:
+            check_no_parts(path)
+        path = path.with_stem(f"{path.stem}-{part:03d}")
+    return RecordingWriter(path, options.compression)
 
 
 def check_no_parts(path: Path) -> None:

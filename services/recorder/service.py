@@ -57,7 +57,7 @@ class RecorderService(Service):
         self.loop.inbox.capacity = INBOX_CAPACITY
         warn_about_unfinished(options.directory, self.log)
         if not options.idle:
-            self._begin(numbered=False)
+            self._begin(may_rename=False)
         self._update_note()
         self._opened_at = time.monotonic()
         self._flush_at = self._opened_at + options.flush
@@ -84,7 +84,7 @@ class RecorderService(Service):
         if request.action == "start":
             if self.recording is not None:
                 return state.model_copy(update={"ok": False, "reason": f"already recording, into {state.file}"})
-            self._begin(numbered=True)
+            self._begin(may_rename=True)
         elif request.action == "stop":
             if self.recording is None:
                 return state.model_copy(update={"ok": False, "reason": "not recording"})
@@ -95,9 +95,9 @@ class RecorderService(Service):
     def _state(self) -> RecordReply:
         return self._ended if self.recording is None else self.recording.state()
 
-    def _begin(self, *, numbered: bool) -> None:
+    def _begin(self, *, may_rename: bool) -> None:
         """Opens a new file, writes the known descriptions, and queries them again in case the world has changed."""
-        self.recording = OpenRecording(self.options, self.inputs, self.loop.inbox, numbered=numbered)
+        self.recording = OpenRecording(self.options, self.inputs, self.loop.inbox, may_rename=may_rename)
         self._failure = ""
         self._update_note()
         self.log.info("recording", file=self.recording.state().file)
