@@ -14,7 +14,7 @@ from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
 
-from common.bus.inbox import OTHERS, Inbox, Sample
+from common.bus.inbox import Inbox, Sample, is_message_counter
 from common.errors import UserError
 from common.log import Logger
 from common.messages.requests import RecordReply
@@ -94,7 +94,7 @@ class OpenRecording:
     def _since(self, now: tuple[Counter[str], ...]) -> list[dict[str, int]]:
         """Counts by key since the recording began, without requests, which the inbox counts by query name."""
         since = [after - before for after, before in zip(now, self._before, strict=True)]
-        return [{key: n for key, n in counts.items() if "/" in key or key == OTHERS} for counts in since]
+        return [{key: n for key, n in counts.items() if is_message_counter(key)} for counts in since]
 
     def _counters(self) -> dict[str, dict[str, str]]:
         return {"counters": as_metadata(self._counts())}

@@ -31,10 +31,10 @@ class RecorderService(Service):
     queries: ClassVar[tuple[Query, ...]] = (RECORDING,)
     keep_all: ClassVar[bool] = True
 
-    def __init__(self, settings: RecorderSettings, *, remote: bool = True) -> None:
-        """Opens no file yet: `open` or a request does. Without ``remote`` the query `recording` is not served."""
+    def __init__(self, settings: RecorderSettings, *, serve_requests: bool = True) -> None:
+        """Opens no file yet: `open` or a request does. ``serve_requests``: serve the query `recording`."""
         super().__init__(settings)
-        if not remote:
+        if not serve_requests:
             self.queries = ()  # type: ignore[misc]
         self.options = settings
         self.inputs = parse_topics(settings.topics)  # type: ignore[misc]
@@ -47,8 +47,8 @@ class RecorderService(Service):
         self._missing: Counter[str] = Counter()  # by key, in completed recordings
         self._flush_at = 0.0
         self._opened_at = 0.0
-        self._may_be_silent = True  # until a service or a message of another was noticed
-        self._silence = ""  # why no messages arrive, as far as is known
+        self._checks_reception = True  # until another service, or a message of one, was found
+        self._reception_problem = ""  # why no messages arrive, as far as is known
         self._failure = ""  # why the last recording ended by itself
 
     def open(self) -> None:
@@ -158,7 +158,7 @@ class RecorderService(Service):
             self._write_descriptions()
             if self.recording is not None:
                 self.recording.writer.flush()
-        self._warn_if_silent()
+        self._warn_if_nothing_arrives()
 
     @contextmanager
     def _surviving_failures(self) -> Iterator[None]:
@@ -192,25 +192,25 @@ class RecorderService(Service):
                 self._end()
             descriptions.join()
 
-    def _warn_if_silent(self) -> None:
+    def _warn_if_nothing_arrives(self) -> None:
         """Warns once if the router is not reached or the robot has no services, and logs when that has changed."""
-        if not self._may_be_silent:
+        if not self._checks_reception:
             return
-        silence, advice = self._find_silence()
-        if silence == self._silence:
+        problem, advice = self._find_reception_problem()
+        if problem == self._reception_problem:
             return
-        if silence:
-            self.log.warning(silence, advice=advice)
+        if problem:
+            self.log.warning(problem, advice=advice)
         else:
             self.log.info("messages can arrive now", robot=self.options.robot)
-        self._silence = silence
+        self._reception_problem = problem
         self._update_note()
 
-    def _find_silence(self) -> tuple[str, str]:
+    def _find_reception_problem(self) -> tuple[str, str]:
         """Why no messages arrive, and what to do; both empty if they do, or if it is too early to tell."""
         open_for, connect = time.monotonic() - self._opened_at, self.options.link().connect
         if self._has_messages_of_others() or (self.descriptions is not None and self.descriptions.present):
-            self._may_be_silent = False
+            self._checks_reception = False
             return "", ""
         if connect and not self.loop.bus.linked():
             if open_for < LINK_WARNING_DELAY_S:
@@ -233,7 +233,7 @@ class RecorderService(Service):
         idle = (
             f"the recording has ended: {self._failure}" if self._failure else "not recording until a request starts it"
         )
-        self.note = self._silence or (idle if self.idle else "")
+        self.note = self._reception_problem or (idle if self.idle else "")
 
     def _write_descriptions(self) -> None:
         if self.descriptions is None:
