@@ -71,12 +71,9 @@ def replay_options(
     loop: bool,
     force: bool,
     paused: bool = False,
-    stay: bool = False,
 ) -> ReplayOptions:
     """Options of the replay from those of the command line; raises UserError if the robot's name is not allowed."""
     if robot:
         checked_robot(robot)
     names, without = names_of(only), names_of(leave_out)
-    return ReplayOptions(
-        names or None, without, 1.0 if rate is None else rate, start, end, loop, robot, force, paused, stay
-    )
+    return ReplayOptions(names or None, without, 1.0 if rate is None else rate, start, end, loop, robot, force, paused)
