@@ -12,6 +12,7 @@ from common.bus.inbox import OTHERS, Sample
 from common.errors import UserError
 from common.messages.requests import RecordReply, RecordRequest, Reply, Request
 from common.messages.topics import HEALTH, RECORDING, TOPICS, Query, Topic
+from common.names import split_names
 from common.runtime.service import Service
 from services.recorder.files.message_counts import MAX_COUNT
 from services.recorder.recording import OpenRecording, warn_about_unfinished
@@ -247,7 +248,7 @@ class RecorderService(Service):
 def parse_topics(names: str) -> tuple[Topic, ...]:
     """Topics of the comma-separated names. Defaults to all recorded topics; raises UserError for an unknown name."""
     recorded = {topic.name: topic for topic in TOPICS if topic.recorded}
-    wanted = [part.strip() for part in names.split(",") if part.strip()]
+    wanted = split_names(names)
     if unknown := [name for name in wanted if name not in recorded]:
         raise UserError(f"no topic {', '.join(unknown)}: choose from {', '.join(recorded)}")
     return tuple(recorded[name] for name in dict.fromkeys(wanted)) if wanted else tuple(recorded.values())

@@ -254,8 +254,3 @@ def replay(
     if recording.problem and recording.indexed:  # damage inside a finished file is only found while reading
         print(f"warning: {recording.warning}", file=sys.stderr)
     return running.counts
-
-
-def names_of(text: str) -> frozenset[str]:
-    """Set of the comma-separated names in ``text``."""
-    return frozenset(part.strip() for part in text.split(",") if part.strip())
