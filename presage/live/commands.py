@@ -264,8 +264,7 @@ def relocalise(link: Link, pose: Pose | None, console: Console, *, heading_known
         if not reply.ok:
             raise UserError(f"refused: {reply.reason}")
         heading = f", {np.rad2deg(pose.yaw):g} deg" if pose and heading_known else ""
-        start = f"{_place(pose, floor)}{heading}" if pose else "the initial pose, or anywhere if none was given"
-        console.print(f"localising again from {start}")
+        console.print(f"localising again from {_place(pose, floor)}{heading}" if pose else "localising again")
         messages = LatestMessages(bus, BELIEF)  # only now, so that no belief is from before
         with console.status("waiting for state tracking"):
             messages.wait_for(Belief, lambda belief: belief.state == "tracking", LOCALISATION_TIMEOUT_S)
