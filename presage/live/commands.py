@@ -78,7 +78,7 @@ def send_goal(link: Link, goal: Goal, console: Console, *, wait: bool) -> int:
             return 0 if done else 1
         if (status := messages.wait_for(Status, lambda s: s.goal_seq == goal.seq, 3.0)) is None:
             raise UserError("the controller did not acknowledge the goal within 3 s")
-        if status.state == "blocked":
+        if status.refused:
             raise UserError(status.reason)
         console.print(f"going to {_place(goal.pose, goal.map_id)}")
         try:
