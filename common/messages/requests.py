@@ -42,7 +42,7 @@ class PoseRequest(Request):
 class LocaliseRequest(Request):
     """Restart localisation, from a known pose or globally."""
 
-    pose: Pose | None = None  # base_link in the frame of map_id; nil searches the whole map
+    pose: Pose | None = None  # base_link in the frame of map_id; nil: anywhere (preset paper: its initial pose)
     heading_known: bool = True  # false: pose.yaw is unknown
     map_id: Name = ""  # a floor; empty: map
 

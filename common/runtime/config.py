@@ -31,6 +31,7 @@ from pydantic_settings import (
 from common.bus.bus import DEFAULT_ENDPOINT, Link
 from common.bus.security import Credentials, read_credentials
 from common.errors import UserError, first_fault, first_problem
+from common.names import split_names
 from common.yaml_text import NOT_YAML, parse_yaml
 
 _file_values: ContextVar[dict[str, Any]] = ContextVar("_file_values")
@@ -101,8 +102,8 @@ class ServiceSettings(BaseSettings):
         """Parameters of the zenoh session; raises UserError if the credentials cannot be read."""
         return Link(
             self.robot,
-            split_endpoints(self.connect),
-            split_endpoints(self.listen),
+            tuple(split_names(self.connect)),
+            tuple(split_names(self.listen)),
             lossless=self.lossless,
             security=self.credentials(),
             insecure=self.insecure,
@@ -133,11 +134,6 @@ class ServiceSettings(BaseSettings):
         environment |= own
         file = InitSettingsSource(settings_cls, _file_values.get({}))
         return init_settings, InitSettingsSource(settings_cls, environment), file
-
-
-def split_endpoints(text: str) -> tuple[str, ...]:
-    """Splits comma-separated endpoints."""
-    return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
 def join_negative_values(argv: list[str]) -> list[str]:

@@ -142,7 +142,7 @@ def run(params: LockstepRun, stack: Stack) -> RunTrace:
         stack.wait_alive(bus)
         x, y = params.ends.goal
         answer = _send_goal(messages, stack, params.goal or Goal(stamp_ns=0, seq=1, pose=Pose(x=x, y=y)))
-        if answer.state == "blocked" and not params.ends_with_status:
+        if answer.refused and not params.ends_with_status:
             raise UserError(answer.reason)
         bus.declare_alive(HARNESS_NAME)
         trace = RunTrace()

@@ -16,6 +16,7 @@ from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
 from common.log import LogRateLimiter, logger
 from common.messages.topics import SCAN
+from common.names import split_names
 from common.runtime.runnable import Runnable
 from common.runtime.service import Service
 from common.runtime.service_loop import ServiceLoop
@@ -123,7 +124,7 @@ class FleetLoop:
     def __init__(self, settings: EstimatorSettings, bus: Bus) -> None:
         """``settings.robots`` are names and patterns of names, separated by commas."""
         self.settings, self.bus = settings, bus
-        wanted = [part.strip() for part in settings.robots.split(",") if part.strip()]
+        wanted = split_names(settings.robots)
         self.names = list(dict.fromkeys(name for name in wanted if ROBOT_NAME.fullmatch(name)))
         self.patterns = [name for name in wanted if name not in self.names]
         if len(self.names) > settings.max_robots:
