@@ -61,12 +61,12 @@ class World(WorldPart):
     boundary: Ring  # m, the walls; optional with a grid or floors
     obstacles: Annotated[list[Obstacle], Field(max_length=10_000)] = []  # noqa: RUF012 - pydantic copies it
     start: Start | None = None
-    grid: Annotated[OccupancyGrid | None, Field(exclude_if=lambda grid: grid is None)] = None
     # a ROS map; left out if there is none
-    floors: Annotated[list[Floor], Field(max_length=100, exclude_if=lambda floors: not floors)] = []  # noqa: RUF012
+    grid: Annotated[OccupancyGrid | None, Field(exclude_if=lambda grid: grid is None)] = None
     # side by side in map
-    lifts: Annotated[list[Lift], Field(max_length=1000, exclude_if=lambda lifts: not lifts)] = []  # noqa: RUF012
+    floors: Annotated[list[Floor], Field(max_length=100, exclude_if=lambda floors: not floors)] = []  # noqa: RUF012
     # places x m, y m of a lift by floor, in the floor's frame
+    lifts: Annotated[list[Lift], Field(max_length=1000, exclude_if=lambda lifts: not lifts)] = []  # noqa: RUF012
 
     @model_validator(mode="before")
     @classmethod
