@@ -306,7 +306,9 @@ class Preference(Stamped):
     resolution: PositiveDistance  # m, edge length of a cell
     width: Annotated[int, Field(ge=1, le=MAX_FIELD_SIDE)]  # cells along x
     height: Annotated[int, Field(ge=1, le=MAX_FIELD_SIDE)]  # cells along y
-    distance: Costs  # (height * width,) m, path to the goal, row by row along x; +inf: unreachable
+    # (height * width,) m, cost of the path to the goal: its length, where metres near walls or without knowing the pose
+    # count more; row by row along x; +inf: unreachable
+    distance: Costs
     frame_id: Name = "map"
 
     @model_validator(mode="after")

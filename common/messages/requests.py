@@ -54,7 +54,7 @@ class ResetRequest(Request):
 
 
 class SpeedRequest(Request):
-    """Set the speed of the simulation's clock in realtime pace."""
+    """Set the speed of the clock of a simulator whose setting `pace` is `realtime`."""
 
     factor: Annotated[float, Field(allow_inf_nan=False, ge=0.1, le=20)]  # times real time
 

@@ -52,8 +52,8 @@ class ServiceSettings(BaseSettings):
     )
     service: ClassVar[str] = "service"
     program: ClassVar[str] = ""  # shown in --help; if empty, python -m services.NAME
-    # Each field is set by PRESAGE_<SERVICE>_<FIELD> and in the service's section of the file. These are set only there,
-    # the others also for all services, by PRESAGE_<FIELD> and at the top level of the file.
+    # Fields that are set only for this service: by PRESAGE_<SERVICE>_<FIELD> or in its section of the file. All other
+    # fields can also be set for all services, by PRESAGE_<FIELD> or at the top level of the file.
     private: ClassVar[frozenset[str]] = frozenset()
 
     robot: Annotated[
