@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from common.geometry.outline_index import OutlineIndex
     from common.geometry.se2 import Array
 
-__all__ = ["NOT_YAML", "Box", "Circle", "Obstacle", "Start", "World", "known_worlds", "load_world", "save_world"]
+__all__ = ["Box", "Circle", "Obstacle", "Start", "World", "known_worlds", "load_world", "save_world"]
 
 FOLDER = Path(__file__).resolve().parents[2] / "worlds"
 
@@ -244,7 +244,7 @@ class World(WorldPart):
         where = place_text(self.floors, place)
         return f"{where} {what} {self.name!r}; the robot needs {radius:g} m around it"
 
-    def clearances(self, x: Array, y: Array) -> Array:
+    def clearance_on_lattice(self, x: Array, y: Array) -> Array:
         """(len(y), len(x)) `clearance` in m at the nodes x, y of a lattice in map, ascending."""
         nodes = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
         if self.grid is None:
@@ -252,7 +252,7 @@ class World(WorldPart):
         clearance = 0.0 - self.grid.geometry.lattice_distances(FREE, x, y)  # subtracted, to avoid -0.0
         return self._limit_by_obstacles(nodes, clearance.ravel()).reshape(len(y), len(x))
 
-    def surface_distances(self, x: Array, y: Array, max_distance: float) -> Array:
+    def surface_distance_on_lattice(self, x: Array, y: Array, max_distance: float) -> Array:
         """(len(y), len(x)) distances in m to the nearest surface that a laser sees, negative behind surfaces.
 
         x and y are the nodes of a lattice in map, ascending. Distances are limited to ``max_distance``. A laser does
