@@ -31,6 +31,7 @@ from pydantic_settings import (
 from common.bus.bus import DEFAULT_ENDPOINT, Link
 from common.bus.security import Credentials, read_credentials
 from common.errors import UserError, first_fault, first_problem
+from common.messages.topics import ROBOT_NAME_PATTERN
 from common.yaml_text import NOT_YAML, parse_yaml
 
 _file_values: ContextVar[dict[str, Any]] = ContextVar("_file_values")
@@ -58,7 +59,10 @@ class ServiceSettings(BaseSettings):
 
     robot: Annotated[
         str,
-        Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$", description="name of the robot: the topics are presage/ROBOT/TOPIC"),
+        Field(
+            pattern=rf"^{ROBOT_NAME_PATTERN}$",
+            description="name of the robot: the topics are presage/ROBOT/TOPIC",
+        ),
     ] = "robot"
     connect: Annotated[
         str, Field(description="zenoh endpoints to connect to, comma-separated; empty for no connection")
