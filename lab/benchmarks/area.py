@@ -71,8 +71,8 @@ class Site:
 
 def bench_area(
     areas: str, places: int, moved: float, seed: int, out: Path, workers: int, json_file: Path | None, console: Console
-) -> int:
-    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
+) -> None:
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given."""
     check_file(json_file, "--json")
     make_folder(out)
     wanted = sorted(float(area) for area in areas.split(","))
@@ -89,7 +89,6 @@ def bench_area(
         printed.add_row(*(f"{value:.4g}" for value in row.values()))
     console.print(printed)
     write_json(json_file, {"rows": rows, **provenance(seed)})
-    return 0
 
 
 def _learn_buildings(area: float, seed: int, out: Path, workers: int, console: Console) -> list[LearnedBuilding]:

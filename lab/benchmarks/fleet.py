@@ -228,8 +228,8 @@ def _pin_threads(process: psutil.Process, cores: set[int]) -> None:
             os.sched_setaffinity(thread.id, cores)
 
 
-def bench_fleet(estimators: str, plan: FleetPlan, json_file: Path | None, console: Console) -> int:
-    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
+def bench_fleet(estimators: str, plan: FleetPlan, json_file: Path | None, console: Console) -> None:
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given."""
     check_file(json_file, "--json")
     rows = [
         measure(name, deployment, plan, console).row() for name in estimators.split(",") for deployment in DEPLOYMENTS
@@ -247,4 +247,3 @@ def bench_fleet(estimators: str, plan: FleetPlan, json_file: Path | None, consol
             **provenance(plan.seed),
         },
     )
-    return 0

@@ -51,8 +51,8 @@ class RefinementJob:
 
 def bench_refinement(
     worlds: int, seed: int, seconds: float, out: Path, json_file: Path | None, workers: int, console: Console
-) -> int:
-    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0.
+) -> None:
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given.
 
     The maps, logs and models are written to ``out``.
     """
@@ -64,7 +64,6 @@ def bench_refinement(
     rows = [row for result in results for row in result["rows"]]
     print(table(rows))
     write_json(json_file, {"rows": rows, "seconds": seconds, **provenance(seed)})
-    return 0
 
 
 def refine_and_test(job: RefinementJob) -> dict[str, Any]:

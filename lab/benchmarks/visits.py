@@ -81,8 +81,8 @@ def bench_visits(
     json_file: Path | None,
     workers: int,
     console: Console,
-) -> int:
-    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0.
+) -> None:
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given.
 
     The maps, logs and models are written to ``out``.
     """
@@ -94,7 +94,6 @@ def bench_visits(
     rows = [row for result in results for row in result["rows"]]
     print(table(rows))
     write_json(json_file, {"rows": rows, "scans": scans, **provenance(seed)})
-    return 0
 
 
 def run_visits(job: VisitsJob) -> dict[str, Any]:
