@@ -434,7 +434,7 @@ def _load(name: str, folder: Path, *, is_floor: bool = False) -> World:
 
 
 def world_name(path: Path) -> str:
-    """Name of the world in a file that does not state it."""
+    """Name of a world that is made from a file, such as a log, which does not state one."""
     return re.sub(r"[^\w.-]+", "-", path.resolve().stem)
 
 
