@@ -31,6 +31,7 @@ from pydantic_settings import (
 from common.bus.bus import DEFAULT_ENDPOINT, Link
 from common.bus.security import Credentials, read_credentials
 from common.errors import UserError, first_fault, first_problem
+from common.messages.topics import ROBOT_NAME_PATTERN
 from common.names import split_names
 from common.yaml_text import NOT_YAML, parse_yaml
 
@@ -53,13 +54,16 @@ class ServiceSettings(BaseSettings):
     )
     service: ClassVar[str] = "service"
     program: ClassVar[str] = ""  # shown in --help; if empty, python -m services.NAME
-    # Each field is set by PRESAGE_<SERVICE>_<FIELD> and in the service's section of the file. These are set only there,
-    # the others also for all services, by PRESAGE_<FIELD> and at the top level of the file.
+    # Fields that are set only for this service: by PRESAGE_<SERVICE>_<FIELD> or in its section of the file. All other
+    # fields can also be set for all services, by PRESAGE_<FIELD> or at the top level of the file.
     private: ClassVar[frozenset[str]] = frozenset()
 
     robot: Annotated[
         str,
-        Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$", description="name of the robot: the topics are presage/ROBOT/TOPIC"),
+        Field(
+            pattern=rf"^{ROBOT_NAME_PATTERN}$",
+            description="name of the robot: the topics are presage/ROBOT/TOPIC",
+        ),
     ] = "robot"
     connect: Annotated[
         str, Field(description="zenoh endpoints to connect to, comma-separated; empty for no connection")

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING
 from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
 from common.log import LogRateLimiter, logger
-from common.messages.topics import SCAN
+from common.messages.topics import ROBOT_NAME_PATTERN, SCAN
 from common.names import split_names
 from common.runtime.runnable import Runnable
 from common.runtime.service import Service
 from common.runtime.service_loop import ServiceLoop
 from services.estimator.service import EstimatorService, SharedModels
-from services.estimator.settings import ROBOT_NAME, EstimatorSettings
+from services.estimator.settings import EstimatorSettings
 from services.estimator.shared.interface import SearchingEstimator
 
 if TYPE_CHECKING:
@@ -125,7 +125,7 @@ class FleetLoop:
         """``settings.robots`` are names and patterns of names, separated by commas."""
         self.settings, self.bus = settings, bus
         wanted = split_names(settings.robots)
-        self.names = list(dict.fromkeys(name for name in wanted if ROBOT_NAME.fullmatch(name)))
+        self.names = list(dict.fromkeys(name for name in wanted if re.fullmatch(ROBOT_NAME_PATTERN, name)))
         self.patterns = [name for name in wanted if name not in self.names]
         if len(self.names) > settings.max_robots:
             raise UserError(f"{len(self.names)} robots are named, --max-robots is {settings.max_robots}: raise it")
@@ -243,7 +243,8 @@ class FleetLoop:
                 self.log.warning("too many robots", not_served=name, max_robots=self.settings.max_robots)
 
     def _matches(self, name: str) -> bool:
-        return bool(ROBOT_NAME.fullmatch(name)) and any(fnmatchcase(name, pattern) for pattern in self.patterns)
+        is_name = re.fullmatch(ROBOT_NAME_PATTERN, name) is not None
+        return is_name and any(fnmatchcase(name, pattern) for pattern in self.patterns)
 
     def _update_robots(self, now: float) -> None:
         """Starts robots that can become active, and resets those that sent no scan and had no simulator for long.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -11,8 +10,7 @@ from pydantic import Field
 from common.geometry.pose_text import POSE_PATTERN
 from common.runtime.robot_settings import MotionLimitSettings
 
-ROBOT_NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
-_PATTERN = r"[A-Za-z0-9_.*?-]{1,64}"
+_PATTERN = r"[A-Za-z0-9_.*?-]{1,64}"  # name of a robot, or a pattern of names
 
 
 class EstimatorSettings(MotionLimitSettings):
