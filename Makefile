@@ -124,7 +124,7 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	$(if $(LOGS),$(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/fr079.npz' --mount 0,0,0 --world $(RESULTS)/maps/first_half.yaml --every 30 --name fr079)
 	$(if $(LOGS),$(BIN)/presage map '$(LOGS)/uwb.npz' --mount 0,0,0 --poses reference --half first --no-learn -o $(RESULTS)/maps/uwb_first_half.yaml)
 	$(if $(LOGS),$(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/uwb.npz' --mount 0,0,0 --world $(RESULTS)/maps/uwb_first_half.yaml --every 10 --name uwb)
-	$(BIN)/presage bench integrity --out $(RESULTS)/integrity --worlds 3 --seed 3539 --model exact --seconds 10 --estimators precise,particle-filter,particle-filter-recovery
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity --worlds 3 --seed 3571 --model exact --seconds 10 --estimators precise,particle-filter,particle-filter-recovery
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-kidnapped-similar --worlds 20 --seed 3541 --model exact --seconds 10 --cases kidnapped-similar --estimators precise
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-long-corridor --worlds 40 --seed 3542 --model exact --seconds 10 --cases long-corridor --estimators precise
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-wrong-map --worlds 40 --seed 3543 --model exact --seconds 10 --cases wrong-map --estimators precise
