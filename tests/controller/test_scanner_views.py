@@ -59,7 +59,9 @@ def test_actions_stay_within_the_view(centre, half_deg):
             off = abs(float(se2.wrap(np.arctan2(action[1], action[0]) - centre)))
             assert off <= max(view.half - FIELD_OF_VIEW_MARGIN_RAD, view.half / 3) + 1e-6
         else:
-            turned = turn_to_lookahead(action, lookahead, Robot(), may_turn=True, forward=surroundings.forward)
+            turned = turn_to_lookahead(
+                np.zeros(3), action, lookahead, Robot(), may_turn=True, forward=surroundings.forward
+            )
             assert abs(turned[2]) > 0.1  # turns until the lookahead point is in view
 
 

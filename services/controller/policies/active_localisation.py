@@ -360,6 +360,7 @@ class ActiveLocaliser:
     def _approach(self, lookahead: Array, surroundings: Surroundings, velocity: Array, decision: Decision) -> Decision:
         """The ``decision`` with a velocity towards the lookahead point (2,) m in base_link."""
         action = turn_to_lookahead(
+            velocity,
             select_motion(velocity, lookahead, surroundings, self.robot).action,
             lookahead,
             self.robot,

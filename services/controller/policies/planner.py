@@ -189,7 +189,12 @@ class GeodesicPolicy:
         known = PoseBelief(pose, _covariance(belief), self._information)
         selected = select_motion(velocity, lookahead, surroundings, self.robot, known)
         action = turn_to_lookahead(
-            selected.action, lookahead, self.robot, may_turn=surroundings.may_turn, forward=surroundings.forward
+            velocity,
+            selected.action,
+            lookahead,
+            self.robot,
+            may_turn=surroundings.may_turn,
+            forward=surroundings.forward,
         )
         # The velocity that was commanded counts, not the action: the limits may have stopped the robot.
         self._recovery.watch(stamp_ns, moving=is_moving(velocity))

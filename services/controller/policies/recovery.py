@@ -61,6 +61,6 @@ def back_off(velocity: Array, surroundings: Surroundings, robot: Robot) -> Selec
     target = targets[int(np.argmax(surroundings.gaps(targets[:, None, :], np.zeros(1))[:, 0]))]
     selected = select_motion(velocity, target, surroundings, robot)
     action = turn_to_lookahead(
-        selected.action, target, robot, may_turn=surroundings.may_turn, forward=surroundings.forward
+        velocity, selected.action, target, robot, may_turn=surroundings.may_turn, forward=surroundings.forward
     )
     return replace(selected, action=action)

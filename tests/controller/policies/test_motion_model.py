@@ -127,6 +127,21 @@ def test_unseen_directions():
     behind, view = np.array([-3.0, 0.0]), Sector(0.0, np.deg2rad(135))
     action = select_motion(np.zeros(3), behind, around(field_of_view=view), ROBOT).action
     assert abs(np.arctan2(action[1], action[0])) <= np.pi / 2 + 1e-9  # the body is wide
-    assert abs(turn_to_lookahead(action, behind, ROBOT, may_turn=True)[2]) > 1.0
+    assert abs(turn_to_lookahead(np.zeros(3), action, behind, ROBOT, may_turn=True)[2]) > 1.0
     kept = select_motion(np.zeros(3), behind, around(field_of_view=view, may_turn=False), ROBOT).action
     assert 0 < np.hypot(*kept[:2]) <= 0.25 + 1e-9
+
+
+@pytest.mark.parametrize("period", [0.025, 1 / 15, 0.1])
+def test_braking_base_that_turns_stays_on_its_line(period):
+    """It brakes along y with all its acceleration, and turns towards a point beside the line meanwhile."""
+    pose, velocity = np.zeros(3), np.array([0.0, 0.7, -0.6])
+    while np.hypot(*velocity[:2]) > 1e-3:
+        lookahead = se2.rotate(-pose[2], np.array([2.0, 2.0]))
+        action = turn_to_lookahead(velocity, np.zeros(3), lookahead, ROBOT, may_turn=True)
+        velocity = safety.ramp(velocity, action, ROBOT, period)
+        step = se2.rotate(pose[2] + velocity[2] * period / 2, velocity[:2]) * period
+        pose = np.array([*(pose[:2] + step), pose[2] + velocity[2] * period])
+    assert abs(pose[2]) > 0.3
+    assert abs(pose[0]) < 0.015
+    assert pose[1] == pytest.approx(0.7**2 / 2 - 0.7 * period / 2, abs=0.02)  # it brakes once per period
