@@ -29,7 +29,8 @@ from services.mapper.slam.elements import elements_of_scan
 from services.mapper.slam.front_end import ScanPose
 from services.mapper.slam.mapper import Mapper, MapSnapshot
 
-MAX_LATE_NS = 1_000_000_000  # a scan that is late by less is left out; a larger step back is a reset of the clock
+MAX_LATE_NS = 1_000_000_000  # a scan that is late by less is left out; after a larger step back, mapping goes on
+MAX_GAP_NS = 10_000_000_000  # longest time between two scans of which the second one follows the first
 UPDATE_PERIOD_NS = 1_000_000_000  # between the beginnings of two updates of the map, which leaves time for the scans
 REPEAT_PERIOD_NS = 5_000_000_000  # an unchanged map is published again after this time, for later subscribers
 
@@ -52,6 +53,7 @@ class MapperService(Service):
         super().__init__(settings)
         self.mapper: Mapper | None = None
         self._belief: Belief | None = None  # of the latest scan
+        self._received_ns = 0  # stamp of the latest scan, also if it was left out
         self._odometry_sync = OdometrySync()
         self._pool = ThreadPoolExecutor(1, "update")
         self._update: Future[MapSnapshot] | None = None  # running
@@ -78,13 +80,17 @@ class MapperService(Service):
             self._add(scan, odom)
 
     def _add(self, scan: Scan, odom: Odom | None) -> None:
+        received_before_ns, self._received_ns = self._received_ns, scan.stamp_ns
         if self._belief is not None:
             late_ns = self._belief.stamp_ns - scan.stamp_ns
             if late_ns == 0:
                 self.publish(BELIEF, self._belief)  # a repeated scan gets the same belief again
                 return
-            if 0 < late_ns < MAX_LATE_NS:
-                self.counters["late_scans"] += 1
+            # One scan whose stamp is far from the others' is late, or its stamp is wrong; two in a row follow a reset.
+            last_stamps_ns = self._belief.stamp_ns, received_before_ns
+            follows_another = any(0 <= scan.stamp_ns - each <= MAX_GAP_NS for each in last_stamps_ns)
+            if 0 < late_ns < MAX_LATE_NS or not follows_another:
+                self.counters["scans_out_of_order"] += 1
                 return
         mapper, angles = self._mapper_for(scan), scan.angles()
         ranges = ranges_for_localisation(scan.ranges)
@@ -95,9 +101,10 @@ class MapperService(Service):
             self.counters["unmatched_scans"] += 1
         self._belief = belief_message(scan, scan_pose)
         self.publish(BELIEF, self._belief)
-        if self._update is None and mapper.outdated and scan.stamp_ns - self._update_ns >= UPDATE_PERIOD_NS:
+        # Both times may be later than the scan, after a reset.
+        if self._update is None and mapper.outdated and abs(scan.stamp_ns - self._update_ns) >= UPDATE_PERIOD_NS:
             self._start_update(mapper, scan.stamp_ns)
-        if scan.stamp_ns - self._published_ns >= REPEAT_PERIOD_NS:
+        if abs(scan.stamp_ns - self._published_ns) >= REPEAT_PERIOD_NS:
             self._publish_map(mapper)
 
     def _start_update(self, mapper: Mapper, stamp_ns: int) -> None:
@@ -106,13 +113,11 @@ class MapperService(Service):
         self._update.add_done_callback(lambda _: self.loop.inbox.wake())
 
     def _mapper_for(self, scan: Scan) -> Mapper:
-        """The mapper; a new one if time went back or the mount changed, because then scans no longer fit the map."""
+        """The mapper; a new one if the mount changed, because then scans no longer fit the map."""
         mount = scan.mount.array()
-        restarted = self._belief is not None and scan.stamp_ns < self._belief.stamp_ns
-        if self.mapper is None or restarted or not np.allclose(mount, self.mapper.laser.mount, atol=1e-4):
+        if self.mapper is None or not np.allclose(mount, self.mapper.laser.mount, atol=1e-4):
             if self.mapper is not None:
-                why = "time went back" if restarted else "the scanner's mount changed"
-                self.log.warning("mapping starts again", reason=why)
+                self.log.warning("mapping starts again", reason="the scanner's mount changed")
                 self._update = None  # its result belongs to the old map
             self.mapper = Mapper(Laser(scan.angles(), mount, scan.range_max, scan.time_increment), self.settings.cell)
             self._update_ns = self._published_ns = scan.stamp_ns - UPDATE_PERIOD_NS
