@@ -31,6 +31,7 @@ from services.mapper.slam.mapper import Mapper, MapSnapshot
 
 MAX_LATE_NS = 1_000_000_000  # a scan that is late by less is left out; after a larger step back, mapping goes on
 MAX_GAP_NS = 10_000_000_000  # longest time between two scans of which the second one follows the first
+MORE_BEAMS = 1.1  # ratio; numbers of beams that vary from turn to turn do so by less
 UPDATE_PERIOD_NS = 1_000_000_000  # between the beginnings of two updates of the map, which leaves time for the scans
 REPEAT_PERIOD_NS = 5_000_000_000  # an unchanged map is published again after this time, for later subscribers
 
@@ -113,14 +114,16 @@ class MapperService(Service):
         self._update.add_done_callback(lambda _: self.loop.inbox.wake())
 
     def _mapper_for(self, scan: Scan) -> Mapper:
-        """The mapper; a new one if the mount changed, because then scans no longer fit the map."""
-        mount = scan.mount.array()
-        if self.mapper is None or not np.allclose(mount, self.mapper.laser.mount, atol=1e-4):
-            if self.mapper is not None:
-                self.log.warning("mapping starts again", reason="the scanner's mount changed")
-                self._update = None  # its result belongs to the old map
-            self.mapper = Mapper(Laser(scan.angles(), mount, scan.range_max, scan.time_increment), self.settings.cell)
-            self._update_ns = self._published_ns = scan.stamp_ns - UPDATE_PERIOD_NS
+        """The mapper; a new one if the scan does not fit its laser."""
+        if self.mapper is not None:
+            reason = _reason_to_start_again(self.mapper, scan)
+            if not reason:
+                return self.mapper
+            self.log.warning("mapping starts again", reason=reason)
+            self._update = None  # its result belongs to the old map
+        laser = Laser(scan.angles(), scan.mount.array(), scan.range_max, scan.time_increment)
+        self.mapper = Mapper(laser, self.settings.cell)
+        self._update_ns = self._published_ns = scan.stamp_ns - UPDATE_PERIOD_NS
         return self.mapper
 
     def due(self) -> float | None:
@@ -152,6 +155,15 @@ class MapperService(Service):
         path = save_map(self.settings.maps, request.name, self.mapper)
         self.log.info("map saved", file=str(path))
         return SaveMapReply(file=str(path))
+
+
+def _reason_to_start_again(mapper: Mapper, scan: Scan) -> str:
+    """Why the laser of the mapper is not that of a scan; empty if it is."""
+    if not np.allclose(scan.mount.array(), mapper.laser.mount, atol=1e-4):
+        return "the scanner's mount changed"
+    if mapper.key_scan_count == 1 and len(scan.ranges) > MORE_BEAMS * len(mapper.laser.angles):
+        return "the first scan lacked some of the beams"
+    return ""
 
 
 def save_map(folder: Path, name: str, mapper: Mapper) -> Path:

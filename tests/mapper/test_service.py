@@ -148,6 +148,21 @@ def test_reset_keeps_the_map(mapper, moved):
         assert {each.state for each in beliefs} == {"tracking"}
 
 
+def test_first_scan_with_few_beams(mapper):
+    """The map is drawn with the beams of later scans; numbers of beams that vary a little do not matter."""
+    truth = Scene.of(OFFICE, 300, 5).path(3)
+    drive = driven(OFFICE, truth)
+    full = [scan_message(drive, k) for k in range(len(truth))]
+    first = full[0].model_copy(
+        update={"ranges": full[0].ranges[120:180], "angle_min": full[0].angle_min + 120 * full[0].angle_increment}
+    )
+    varying = [scan.model_copy(update={"ranges": scan.ranges[: 300 - k % 3]}) for k, scan in enumerate(full[1:], 1)]
+    beliefs = mapper.drive([first, *varying])
+    assert len(mapper.mapper.laser.angles) == 299
+    assert {belief.state for belief in beliefs} == {"tracking"}
+    assert is_close(beliefs[-1], truth[-1], truth[1])
+
+
 def test_key_scans_keep_their_numbers():
     grid = OccupancyGrid.of(np.zeros((2, 2), np.uint8), 0.05, (0.0, 0.0, 0.0))
     poses = np.array([[0.0, 0.0, 0.0], [np.nan] * 3, [np.nan] * 3, [1.0, 0.0, 0.0]])
