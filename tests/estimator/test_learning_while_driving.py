@@ -127,6 +127,8 @@ def test_learn_save_and_follow(process, bus, worlds, tmp_path):
     assert reply.ok, reply.reason
     assert reply.version == stored[-1].field_version
     assert "exists already" in bus.query(SAVE_MODEL, SaveModelRequest(name="monday"), SaveModelReply).reason
+    (tmp_path / "saved" / "tuesday-precise.json").touch()
+    assert "exists already" in bus.query(SAVE_MODEL, SaveModelRequest(name="tuesday"), SaveModelReply).reason
     assert "letters" in bus.query(SAVE_MODEL, SaveModelRequest(name="../monday"), SaveModelReply).reason
     saved = tmp_path / "saved" / "monday-precise.safetensors"
     model, _, card = weights.load(saved)
