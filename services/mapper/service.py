@@ -14,7 +14,7 @@ from common.errors import UserError
 from common.geometry.ros_map_writer import write_grid
 from common.geometry.tum import write_tum
 from common.geometry.world import known_worlds
-from common.messages.definitions import Belief, BeliefHypothesis, Map, Odom, Pose, Scan, Stamped
+from common.messages.definitions import MAX_LATE_NS, Belief, BeliefHypothesis, Map, Odom, Pose, Scan, Stamped
 from common.messages.requests import FILE_NAME, Reply, Request, SaveMapReply, SaveMapRequest
 from common.messages.topics import BELIEF, MAP, ODOM, SAVE_MAP, SCAN, Query, Topic
 from common.robot.motion_distortion import evenly_spaced
@@ -29,7 +29,6 @@ from services.mapper.slam.elements import elements_of_scan
 from services.mapper.slam.front_end import ScanPose
 from services.mapper.slam.mapper import Mapper, MapSnapshot
 
-MAX_LATE_NS = 1_000_000_000  # a scan that is late by less is left out; after a larger step back, mapping goes on
 MAX_GAP_NS = 10_000_000_000  # longest time between two scans of which the second one follows the first
 MORE_BEAMS = 1.1  # ratio; numbers of beams that vary from turn to turn do so by less
 UPDATE_PERIOD_NS = 1_000_000_000  # between the beginnings of two updates of the map, which leaves time for the scans
