@@ -30,6 +30,7 @@ from presage.terminal.output import check_file, write_json
 # Palette of Okabe and Ito, suitable for colour-blind readers.
 TRUTH, BELIEF, MEASURED, GOAL = "#000000", "#D55E00", "#0072B2", "#009E73"
 WALL, FURNITURE, INK = "#8C8C8C", "#C8C8C8", "#555555"
+FORMATS = (".png", ".pdf", ".svg")
 MAX_TIES = 200  # lines between belief and truth
 MIN_LOG_VALUE = 1e-3  # m, smallest error on the logarithmic axis
 
@@ -48,7 +49,9 @@ def draw_session(path: Path, png: Path, *, title: str | None = None) -> None:
 
 
 def plot_command(recording: Path, figure: Path, json_file: Path | None, console: Console) -> None:
-    """Prints the summary of a recording and draws its figure."""
+    """Prints the summary of a recording and draws its figure. Raises UserError if an option is wrong."""
+    if figure.suffix not in FORMATS:
+        raise UserError(f"{figure}: the name of the figure must end with {' or '.join(FORMATS)}")
     check_file(figure, "--out")
     check_file(json_file, "--json")
     summary = summarise(recording)
