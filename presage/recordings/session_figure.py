@@ -23,6 +23,7 @@ from common.robot.ranges import is_surface
 from common.runtime import safety
 from common.versions import commit
 from presage.plotting.maps import draw_walls
+from presage.plotting.style import save_figure
 from presage.recordings.recorded_session import RecordedSession, load_session
 from presage.recordings.session_summary import print_summary, summarise, summary_of
 from presage.terminal.output import check_file, write_json
@@ -43,7 +44,7 @@ def draw_session(path: Path, png: Path, *, title: str | None = None) -> None:
     session = load_session(path)
     figure = figure_of(session, title if title is not None else path.stem)
     try:
-        figure.savefig(png, dpi=150)
+        save_figure(figure, png, dpi=150)
     except OSError as error:
         raise UserError(f"{png}: cannot be written ({error.strerror}); choose another place for the figure") from None
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
 from pathlib import Path
 from typing import ClassVar
 
@@ -22,6 +21,7 @@ from common.robot.ranges import ranges_for_localisation
 from common.robot.scan_geometry import Sweep
 from common.runtime.odometry_sync import OdometrySync
 from common.runtime.service import Service
+from common.writing import complete_files
 from services.mapper.settings import MapperSettings
 from services.mapper.slam.correlative_search import correlative_search
 from services.mapper.slam.drive import Laser
@@ -177,12 +177,10 @@ def save_map(folder: Path, name: str, mapper: Mapper) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
         if existing := next((file for file in files if file.exists()), None):
             raise UserError(f"{existing} exists already: choose another name")
-        write_grid(path.parent, name, mapper.draw())
-        write_tum(path.with_suffix(".tum"), *mapper.trajectory())
+        with complete_files(path) as partial:
+            write_grid(partial, name, mapper.draw())
+            write_tum(partial / f"{name}.tum", *mapper.trajectory())
     except OSError as error:
-        for file in files:  # so that the name is free for the next attempt
-            with suppress(OSError):
-                file.unlink()
         raise UserError(f"{path}: cannot be written ({error.strerror}): choose another folder with --maps") from None
     return path
 

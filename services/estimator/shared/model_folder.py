@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from common.packages import IN_CHECKOUT
-from common.writing import writing
+from common.writing import complete_files
 
 SHIPPED = Path(__file__).resolve().parents[3] / "models"
 
@@ -27,11 +27,7 @@ def find_folder(world: str, preset: str) -> Path:
 def write_weights_and_card(path: Path, weights: bytes, card: str) -> None:
     """Writes ``weights`` to ``path`` and the card beside it; replaces existing files when both are complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    card_path = path.with_suffix(".json")
-    partial_weights, partial_card = (file.with_name(f"{file.name}.partial") for file in (path, card_path))
-    with writing(path, partial_weights, partial_card):
-        partial_weights.write_bytes(weights)
-        partial_weights.chmod(0o644)
-        partial_card.write_text(card, encoding="utf-8")
-        partial_weights.replace(path)
-        partial_card.replace(card_path)
+    with complete_files(path) as folder:
+        (folder / path.name).write_bytes(weights)
+        (folder / path.name).chmod(0o644)
+        (folder / path.with_suffix(".json").name).write_text(card, encoding="utf-8")
