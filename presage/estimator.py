@@ -87,6 +87,8 @@ class Estimator:
         self._mount = None if mount is None else np.asarray(mount, float)
         if self._mount is not None and self._mount.shape != (3,):
             raise UserError(f"mount: give x, y in m and yaw in rad, not an array of shape {self._mount.shape}")
+        if self._mount is not None and not np.isfinite(self._mount).all():
+            raise UserError("mount: NaN and infinity are not allowed")
         self._geometry: ScannerGeometry | None = None  # of the scans
         self._core: PoseEstimator | None = None  # made for this geometry
         if self.scanner is not None:

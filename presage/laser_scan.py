@@ -18,8 +18,8 @@ class LaserScan(Observation):
     """One scan, with its scanner's mount and noise.
 
     ``ranges`` are those of a driver: range_max and more mean no return; NaN, 0 and negative values are not used. They
-    are stored as estimators need them: +inf for no return, -inf for a beam that is not used. Raises UserError if
-    the shapes do not fit.
+    are stored as estimators need them: +inf for no return, -inf for a beam that is not used. A NaN in any pose but the
+    mount means that the pose is unknown. Raises UserError if a shape does not fit, or another number is not finite.
     """
 
     mount: Array = field(default_factory=lambda: np.zeros(3))  # (3,) laser in base_link: m, m, rad
@@ -32,12 +32,16 @@ class LaserScan(Observation):
         ranges, angles = np.asarray(self.ranges, float), np.asarray(self.angles, float)
         if ranges.ndim != 1 or ranges.shape != angles.shape:
             raise UserError(f"a scan needs as many ranges as angles, not shapes {ranges.shape} and {angles.shape}")
+        mount = self._pose("mount")
+        needed = {"angles": angles, "mount": mount, "stamp": self.stamp, "range_max": self.range_max}
+        for name, numbers in needed.items():
+            if numbers is not None and not np.isfinite(numbers).all():
+                raise UserError(f"{name} of a scan: NaN and infinity are not allowed")
         ranges = normalise_driver_ranges(ranges, 0.0, self.range_max)
-        stored = {
-            "ranges": ranges_for_localisation(ranges),
-            "angles": angles,
-            **{name: self._pose(name) for name in ("mount", "odom", "command", "goal", "reference")},
-        }
+        stored = {"ranges": ranges_for_localisation(ranges), "angles": angles, "mount": mount}
+        for name in ("odom", "command", "goal", "reference"):
+            pose = self._pose(name)
+            stored[name] = pose if pose is not None and np.isfinite(pose).all() else None
         for name, value in stored.items():
             object.__setattr__(self, name, value)
 

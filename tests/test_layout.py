@@ -18,7 +18,7 @@ PACKAGES = ("common", "services", "presage", "lab")
 LAYERS = (
     (
         "common.errors", "common.limits", "common.versions", "common.processes", "common.log_capture",
-        "common.yaml_text", "common.names",
+        "common.yaml_text", "common.names", "common.writing",
     ),
     ("common.log", "common.packages"),
     ("common.geometry",),

@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from common.robot.scanner import Scanner
 
 GOAL_TOLERANCE_M = 0.02  # default of Goal.tolerance
+# A message whose stamp is earlier than that of the last one by less is late; by more, time was reset.
+MAX_LATE_NS = 1_000_000_000
 
 
 class Stamped(Message):

@@ -41,7 +41,8 @@ def info(
 def plot(
     file: Annotated[Path, typer.Argument(help="A recording, finished or not.")],
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="PNG file to write. Defaults to the recording's name with .png.")
+        Path | None,
+        typer.Option("--out", "-o", help="PNG, PDF or SVG file to write. Defaults to the recording's name with .png."),
     ] = None,
     json_file: Json = None,
 ) -> None:

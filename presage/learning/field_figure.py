@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 
-from presage.plotting.style import empty_figure
+from presage.plotting.style import empty_figure, save_figure
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.learning.calibration import Calibration
 from services.estimator.precise.learning.weights import FieldCard
@@ -23,7 +23,7 @@ def draw_model(model: FieldModel, card: FieldCard, png: Path) -> None:
         left, right = figure.subplots(1, 2, width_ratios=(1.7, 1))
         _draw_field(left, model, card.world.name)
         calibration_curve(right, card.calibration)
-    figure.savefig(png, dpi=120, bbox_inches="tight")  # else the title of a narrow world is cut off
+    save_figure(figure, png, dpi=120, bbox_inches="tight")  # else the title of a narrow world is cut off
 
 
 def _draw_field(axes: Axes, model: FieldModel, name: str) -> None:

@@ -17,6 +17,7 @@ from common.geometry.ros_map_writer import write_grid
 from common.geometry.se2 import Array
 from common.geometry.tum import write_tum
 from common.geometry.world import World, load_world, world_name
+from common.writing import complete_files
 from presage.learning.map_picture import draw_map
 from presage.learning.placement import place_drive
 from presage.learning.pose_refinement import refine_poses
@@ -80,9 +81,11 @@ def _write_map(options: MapOptions, console: Console, progress: Console) -> Path
     laser = Laser(drive.angles, drive.mount, drive.range_max)
     unseen = None if rough is None else rasterise(rough, options.cell)
     grid = grid_of_scans(drive.poses, drive.ranges, laser, options.cell, unseen)
-    path = write_grid(options.out.parent, options.out.stem, grid)
-    write_tum(options.out.with_suffix(".tum"), drive.stamps, drive.poses)
-    draw_map(options.out.with_suffix(".png"), grid, drive.poses)
+    path = options.out
+    with complete_files(path) as partial:
+        write_grid(partial, path.stem, grid)
+        write_tum(partial / f"{path.stem}.tum", drive.stamps, drive.poses)
+        draw_map(partial / f"{path.stem}.png", grid, drive.poses)
     console.print(
         f"{path}: {grid.width} x {grid.height} cells of {options.cell:g} m from {len(drive.ranges)} scans; "
         f"{(grid.values == OCCUPIED).mean():.0%} occupied, {(grid.values == FREE).mean():.0%} free",

@@ -16,7 +16,7 @@ from common.robot.robot import Robot
 from common.robot.scanner import Scanner
 from common.versions import commit, presage_command, versions
 from presage.learning.simulated_scans import collect, scanner_on_bus
-from presage.plotting.style import empty_figure
+from presage.plotting.style import empty_figure, save_figure
 from services.estimator.paper import training, weights
 from services.estimator.paper.checkpoint import Checkpoint
 from services.estimator.paper.decoder import DecoderShape, Normalisation, PaperModel
@@ -175,4 +175,4 @@ def _draw_curve(card: weights.ModelCard, png: Path) -> None:
     )
     axes.grid(alpha=0.3, which="both")
     axes.legend()
-    figure.savefig(png, dpi=120)
+    save_figure(figure, png, dpi=120)

@@ -61,7 +61,7 @@ class Scans:
 
     def _scan(self, k: int) -> LaserScan:
         def row(values: Array | None) -> Array | None:
-            return values[k] if values is not None and np.isfinite(values[k]).all() else None
+            return None if values is None else values[k]
 
         stamp = None if self.stamps is None else float(self.stamps[k])
         if self.stamps_ns is not None:

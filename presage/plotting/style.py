@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import shapely
@@ -14,6 +16,7 @@ from matplotlib.ticker import FuncFormatter
 
 from common.geometry.se2 import Array
 from common.geometry.world import World
+from common.writing import complete_files
 from presage.plotting.maps import draw_cells
 
 # Palette of Okabe and Ito, the same in every figure. Green is the colour of the distance to the goal in the paper.
@@ -47,6 +50,12 @@ def empty_figure(width: float, height: float) -> Figure:
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
+
+
+def save_figure(figure: Figure, path: Path, **options: Any) -> None:
+    """Writes a figure, with options of `savefig`. An OSError names ``path``, and an existing file stays."""
+    with complete_files(path) as partial:
+        figure.savefig(partial / path.name, **options)
 
 
 def style_axes(axes: Axes) -> Axes:

@@ -18,6 +18,7 @@ from common.errors import UserError
 from common.messages.reference import comments
 from common.messages.topics import Topic
 from common.messages.wire import Binary, Message
+from common.writing import complete_files
 from presage.recordings.selection import entries, keys_of, refuse_to_overwrite, robot_of, with_progress
 from presage.terminal.output import make_folder
 from services.recorder.reader import Recording
@@ -96,10 +97,9 @@ def _element(get: Callable[[Any], Any], index: tuple[int, ...], message: Any) ->
 class CsvTables:
     """The CSV files in a folder; each is created when its first row comes."""
 
-    def __init__(self, folder: Path, *, force: bool) -> None:
+    def __init__(self, folder: Path) -> None:
         """The files are written into ``folder``."""
         self.folder, self.rows = folder, dict[str, int]()  # number of rows by file name
-        self._force = force
         self._open: dict[str, TextIO] = {}  # by file name, the one opened first comes first
 
     def close(self) -> None:
@@ -111,7 +111,6 @@ class CsvTables:
         """Adds a row to NAME.csv; None becomes an empty cell, and booleans become true and false."""
         path = self.folder / f"{name}.csv"
         if path.name not in self.rows:
-            refuse_to_overwrite([path], force=self._force)
             path.write_text(",".join(header) + "\n", encoding="utf-8")
             self.rows[path.name] = 0
         if path.name not in self._open:
@@ -172,11 +171,12 @@ def export_csv(
         raise UserError(f"{recording.path}: no message of presage in it, so there is nothing to export")
     layouts = {topic.name: _TopicLayout(topic) for topic in dict.fromkeys(keys.values())}
     counts = recording.counts
-    with closing(CsvTables(folder, force=force)) as tables:
-        messages = with_progress(entries(recording, name), sum(counts[key] for key in keys), "csv", console)
-        for topic, message, raw in messages:
-            layouts[topic.name].write(tables, message, [raw.logged_ns, raw.published_ns], arrays=arrays)
-    (folder / README).write_text(_readme(recording, name, layouts, tables.rows), encoding="utf-8")
+    with complete_files(folder / README) as new:
+        with closing(CsvTables(new)) as tables:
+            messages = with_progress(entries(recording, name), sum(counts[key] for key in keys), "csv", console)
+            for topic, message, raw in messages:
+                layouts[topic.name].write(tables, message, [raw.logged_ns, raw.published_ns], arrays=arrays)
+        (new / README).write_text(_readme(recording, name, layouts, tables.rows), encoding="utf-8")
     return tables.rows
 
 

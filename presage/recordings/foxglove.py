@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +22,7 @@ from common.errors import UserError
 from common.messages.definitions import Belief, Truth
 from common.messages.topics import BELIEF, TRUTH
 from common.versions import versions
+from common.writing import complete_files
 from presage.recordings import foxglove_numbers as numbers
 from presage.recordings.foxglove_session import FoxgloveMessage, SessionConverter, pose_source_of, static_messages
 from presage.recordings.selection import entries, keys_of, refuse_to_overwrite, robot_of, with_progress
@@ -78,19 +78,14 @@ def export_foxglove(recording: Recording, out: Path, robot: str, console: Consol
         raise UserError(f"{out}: is the recording itself; choose another place with --out")
     if not keys_of(recording, name):
         raise UserError(f"{recording.path}: no message of presage in it, so there is nothing to export")
-    unfinished = out.with_name(out.name + ".partial")  # .active is the recorder's
     try:
-        with unfinished.open("wb") as stream:
+        with complete_files(out) as folder, (folder / out.name).open("wb") as stream:
             writer = Writer(stream, compression=CompressionType.ZSTD)
             writer.start("", "presage export")
             counts = _write(recording, name, writer, console)
             writer.finish()  # type: ignore[no-untyped-call]
-        unfinished.replace(out)
     except OSError as error:
         raise UserError(f"{out}: cannot be written ({error.strerror}); choose another place with --out") from None
-    finally:
-        with suppress(OSError):
-            unfinished.unlink()
     return dict(counts)
 
 

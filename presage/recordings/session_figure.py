@@ -23,6 +23,7 @@ from common.robot.ranges import is_surface
 from common.runtime import safety
 from common.versions import commit
 from presage.plotting.maps import draw_walls
+from presage.plotting.style import save_figure
 from presage.recordings.recorded_session import RecordedSession, load_session
 from presage.recordings.session_summary import print_summary, summarise, summary_of
 from presage.terminal.output import check_file, write_json
@@ -30,6 +31,7 @@ from presage.terminal.output import check_file, write_json
 # Palette of Okabe and Ito, suitable for colour-blind readers.
 TRUTH, BELIEF, MEASURED, GOAL = "#000000", "#D55E00", "#0072B2", "#009E73"
 WALL, FURNITURE, INK = "#8C8C8C", "#C8C8C8", "#555555"
+FORMATS = (".png", ".pdf", ".svg")
 MAX_TIES = 200  # lines between belief and truth
 MIN_LOG_VALUE = 1e-3  # m, smallest error on the logarithmic axis
 
@@ -42,13 +44,15 @@ def draw_session(path: Path, png: Path, *, title: str | None = None) -> None:
     session = load_session(path)
     figure = figure_of(session, title if title is not None else path.stem)
     try:
-        figure.savefig(png, dpi=150)
+        save_figure(figure, png, dpi=150)
     except OSError as error:
         raise UserError(f"{png}: cannot be written ({error.strerror}); choose another place for the figure") from None
 
 
 def plot_command(recording: Path, figure: Path, json_file: Path | None, console: Console) -> None:
-    """Prints the summary of a recording and draws its figure."""
+    """Prints the summary of a recording and draws its figure. Raises UserError if an option is wrong."""
+    if figure.suffix not in FORMATS:
+        raise UserError(f"{figure}: the name of the figure must end with {' or '.join(FORMATS)}")
     check_file(figure, "--out")
     check_file(json_file, "--json")
     summary = summarise(recording)

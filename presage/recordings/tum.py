@@ -18,6 +18,7 @@ from rich.console import Console
 from common.errors import UserError
 from common.messages.definitions import Belief, Odom, Truth
 from common.messages.topics import BELIEF, ODOM, TRUTH
+from common.writing import complete_files
 from presage.recordings.selection import entries, keys_of, refuse_to_overwrite, robot_of, with_progress
 from presage.terminal.output import make_folder
 from services.recorder.reader import Recording
@@ -74,8 +75,8 @@ def export_tum(
     make_folder(folder)
     refuse_to_overwrite(sorted(folder.iterdir())[:1], force=force)
     counts = recording.counts
-    with ExitStack() as stack:
-        files = {topic.name: TrajectoryWriter(folder, topic.name, stack) for topic in keys.values()}
+    with complete_files(folder / "belief.tum") as partial, ExitStack() as stack:
+        files = {topic.name: TrajectoryWriter(partial, topic.name, stack) for topic in keys.values()}
         messages = with_progress(entries(recording, name, *TOPICS), sum(counts[key] for key in keys), "tum", console)
         for topic, message, _ in messages:
             assert isinstance(message, Belief | Truth | Odom)  # noqa: S101 - the message types of TOPICS

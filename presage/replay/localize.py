@@ -7,10 +7,10 @@ import json
 import sys
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TextIO, get_args
 
 import numpy as np
 from rich.console import Console
@@ -21,6 +21,7 @@ from common.geometry.pose_text import parse_initial_pose
 from common.geometry.se2 import Array
 from common.geometry.tum import write_tum
 from common.geometry.world import load_world
+from common.writing import complete_files, naming
 from presage.estimator import Estimator
 from presage.interrupts import ignoring_interrupts
 from presage.laser_scan import LaserScan
@@ -268,15 +269,19 @@ def _output(options: LocalizeOptions, count: int) -> Iterator[Callable[[dict[str
         try:
             yield rows.append
         finally:
-            with ignoring_interrupts():
-                if options.out.suffix == ".json":
-                    _write_json(options, options.out, rows, complete=len(rows) == count)
+            with ignoring_interrupts(), complete_files(options.out) as partial:
+                out = partial / options.out.name
+                if out.suffix == ".json":
+                    _write_json(options, out, rows, complete=len(rows) == count)
                 else:
                     poses = np.array([[row["x"], row["y"], row["yaw"]] for row in rows]).reshape(-1, 3)
-                    write_tum(options.out, np.array([row["stamp"] for row in rows]), poses, options.frame)
+                    write_tum(out, np.array([row["stamp"] for row in rows]), poses, options.frame)
         return
-    stream = sys.stdout if options.out is None else options.out.open("w", newline="", encoding="utf-8")
-    try:
+    with ExitStack() as stack:
+        stream: TextIO = sys.stdout
+        if options.out is not None:
+            stack.enter_context(naming(options.out))
+            stream = stack.enter_context(options.out.open("w", newline="", encoding="utf-8"))
         writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
         writer.writeheader()
 
@@ -285,9 +290,6 @@ def _output(options: LocalizeOptions, count: int) -> Iterator[Callable[[dict[str
             stream.flush()  # so that the rows so far are in the file however the run ends
 
         yield write
-    finally:
-        if options.out is not None:
-            stream.close()
 
 
 def _write_json(options: LocalizeOptions, out: Path, rows: list[dict[str, Any]], *, complete: bool) -> None:

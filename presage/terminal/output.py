@@ -12,6 +12,7 @@ from typing import Any
 
 from common.errors import UserError
 from common.versions import commit, versions
+from common.writing import naming
 
 
 def check_file(file: Path | None, option: str) -> None:
@@ -59,7 +60,8 @@ def output_folder(folder: Path, option: str = "--out") -> Iterator[None]:
 def write_json(file: Path | None, data: dict[str, Any]) -> None:
     """Writes ``data`` as indented JSON; does nothing if ``file`` is None."""
     if file is not None:
-        file.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+        with naming(file):
+            file.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
 def provenance(seed: int | None = None) -> dict[str, Any]:

@@ -83,8 +83,8 @@ def save_learned(
     if re.fullmatch(FILE_NAME, name) is None:
         raise UserError(f"name {name!r}: give up to 64 letters, digits, - and _")
     path, field, errors = precise_weights.path_of(folder.resolve(), name), version.model.field, version.errors
-    if path.exists():
-        raise UserError(f"{path} exists already: choose another name")
+    if existing := next((file for file in (path, path.with_suffix(".json")) if file.exists()), None):
+        raise UserError(f"{existing} exists already: choose another name")
     card_before = precise_weights.FieldCard.model_validate_json(original.card) if original.card else None
     card = precise_weights.FieldCard(
         world=original.world,

@@ -148,6 +148,7 @@ class EstimatorService(Service):
         self._learned: EncodedVersion | None = None  # the learned version in use
         self._field_published_ns = 0  # stamp with which the learned version was published last
         self._assembler = FieldAssembler()
+        self._followed: bytes | None = None  # the received field in use
 
     def open(self) -> None:
         """Loads the models, so that missing weights are an error now and not at the first scan."""
@@ -268,13 +269,14 @@ class EstimatorService(Service):
     def _follow(self, message: LearnedField) -> None:
         """Uses the field that another estimator has learned from the same model."""
         data = self._assembler.add(message)
-        if data is None or message.version == self.field_version or not isinstance(self.estimator, PreciseEstimator):
+        # Fields are sent again and again. Their version does not tell, as it begins again if the sender is restarted.
+        if data is None or data == self._followed or not isinstance(self.estimator, PreciseEstimator):
             return
         if message.base != self._base():
             self.counters["other_fields"] += 1  # learned from another model
             return
         self.estimator.use_model(*weights.decode(data))
-        self.field_version = message.version
+        self._followed, self.field_version = data, message.version
 
     def _save_model(self, name: str) -> SaveModelReply:
         if self._learned is None or self.geometry is None or isinstance(self.model, str):
@@ -342,7 +344,7 @@ class EstimatorService(Service):
     def _start_learning(self, geometry: ScannerGeometry) -> None:
         """Starts to learn with the original model, if the settings say so."""
         self.close()
-        self.field_version, self._learned = 0, None
+        self.field_version, self._learned, self._followed = 0, None, None
         if self.settings.learn == "refine" and isinstance(self.estimator, PreciseEstimator):
             self._learner = Learner(self.estimator, geometry)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
 from pathlib import Path
 from typing import ClassVar
 
@@ -14,7 +13,7 @@ from common.errors import UserError
 from common.geometry.ros_map_writer import write_grid
 from common.geometry.tum import write_tum
 from common.geometry.world import known_worlds
-from common.messages.definitions import Belief, BeliefHypothesis, Map, Odom, Pose, Scan, Stamped
+from common.messages.definitions import MAX_LATE_NS, Belief, BeliefHypothesis, Map, Odom, Pose, Scan, Stamped
 from common.messages.requests import FILE_NAME, Reply, Request, SaveMapReply, SaveMapRequest
 from common.messages.topics import BELIEF, MAP, ODOM, SAVE_MAP, SCAN, Query, Topic
 from common.robot.motion_distortion import evenly_spaced
@@ -22,6 +21,7 @@ from common.robot.ranges import ranges_for_localisation
 from common.robot.scan_geometry import Sweep
 from common.runtime.odometry_sync import OdometrySync
 from common.runtime.service import Service
+from common.writing import complete_files
 from services.mapper.settings import MapperSettings
 from services.mapper.slam.correlative_search import correlative_search
 from services.mapper.slam.drive import Laser
@@ -29,7 +29,8 @@ from services.mapper.slam.elements import elements_of_scan
 from services.mapper.slam.front_end import ScanPose
 from services.mapper.slam.mapper import Mapper, MapSnapshot
 
-MAX_LATE_NS = 1_000_000_000  # a scan that is late by less is left out; a larger step back is a reset of the clock
+MAX_GAP_NS = 10_000_000_000  # longest time between two scans of which the second one follows the first
+MORE_BEAMS = 1.1  # ratio; numbers of beams that vary from turn to turn do so by less
 UPDATE_PERIOD_NS = 1_000_000_000  # between the beginnings of two updates of the map, which leaves time for the scans
 REPEAT_PERIOD_NS = 5_000_000_000  # an unchanged map is published again after this time, for later subscribers
 
@@ -52,6 +53,7 @@ class MapperService(Service):
         super().__init__(settings)
         self.mapper: Mapper | None = None
         self._belief: Belief | None = None  # of the latest scan
+        self._received_ns = 0  # stamp of the latest scan, also if it was left out
         self._odometry_sync = OdometrySync()
         self._pool = ThreadPoolExecutor(1, "update")
         self._update: Future[MapSnapshot] | None = None  # running
@@ -78,13 +80,17 @@ class MapperService(Service):
             self._add(scan, odom)
 
     def _add(self, scan: Scan, odom: Odom | None) -> None:
+        received_before_ns, self._received_ns = self._received_ns, scan.stamp_ns
         if self._belief is not None:
             late_ns = self._belief.stamp_ns - scan.stamp_ns
             if late_ns == 0:
                 self.publish(BELIEF, self._belief)  # a repeated scan gets the same belief again
                 return
-            if 0 < late_ns < MAX_LATE_NS:
-                self.counters["late_scans"] += 1
+            # One scan whose stamp is far from the others' is late, or its stamp is wrong; two in a row follow a reset.
+            last_stamps_ns = self._belief.stamp_ns, received_before_ns
+            follows_another = any(0 <= scan.stamp_ns - each <= MAX_GAP_NS for each in last_stamps_ns)
+            if 0 < late_ns < MAX_LATE_NS or not follows_another:
+                self.counters["scans_out_of_order"] += 1
                 return
         mapper, angles = self._mapper_for(scan), scan.angles()
         ranges = ranges_for_localisation(scan.ranges)
@@ -95,9 +101,10 @@ class MapperService(Service):
             self.counters["unmatched_scans"] += 1
         self._belief = belief_message(scan, scan_pose)
         self.publish(BELIEF, self._belief)
-        if self._update is None and mapper.outdated and scan.stamp_ns - self._update_ns >= UPDATE_PERIOD_NS:
+        # Both times may be later than the scan, after a reset.
+        if self._update is None and mapper.outdated and abs(scan.stamp_ns - self._update_ns) >= UPDATE_PERIOD_NS:
             self._start_update(mapper, scan.stamp_ns)
-        if scan.stamp_ns - self._published_ns >= REPEAT_PERIOD_NS:
+        if abs(scan.stamp_ns - self._published_ns) >= REPEAT_PERIOD_NS:
             self._publish_map(mapper)
 
     def _start_update(self, mapper: Mapper, stamp_ns: int) -> None:
@@ -106,16 +113,16 @@ class MapperService(Service):
         self._update.add_done_callback(lambda _: self.loop.inbox.wake())
 
     def _mapper_for(self, scan: Scan) -> Mapper:
-        """The mapper; a new one if time went back or the mount changed, because then scans no longer fit the map."""
-        mount = scan.mount.array()
-        restarted = self._belief is not None and scan.stamp_ns < self._belief.stamp_ns
-        if self.mapper is None or restarted or not np.allclose(mount, self.mapper.laser.mount, atol=1e-4):
-            if self.mapper is not None:
-                why = "time went back" if restarted else "the scanner's mount changed"
-                self.log.warning("mapping starts again", reason=why)
-                self._update = None  # its result belongs to the old map
-            self.mapper = Mapper(Laser(scan.angles(), mount, scan.range_max, scan.time_increment), self.settings.cell)
-            self._update_ns = self._published_ns = scan.stamp_ns - UPDATE_PERIOD_NS
+        """The mapper; a new one if the scan does not fit its laser."""
+        if self.mapper is not None:
+            reason = _reason_to_start_again(self.mapper, scan)
+            if not reason:
+                return self.mapper
+            self.log.warning("mapping starts again", reason=reason)
+            self._update = None  # its result belongs to the old map
+        laser = Laser(scan.angles(), scan.mount.array(), scan.range_max, scan.time_increment)
+        self.mapper = Mapper(laser, self.settings.cell)
+        self._update_ns = self._published_ns = scan.stamp_ns - UPDATE_PERIOD_NS
         return self.mapper
 
     def due(self) -> float | None:
@@ -149,6 +156,15 @@ class MapperService(Service):
         return SaveMapReply(file=str(path))
 
 
+def _reason_to_start_again(mapper: Mapper, scan: Scan) -> str:
+    """Why the laser of the mapper is not that of a scan; empty if it is."""
+    if not np.allclose(scan.mount.array(), mapper.laser.mount, atol=1e-4):
+        return "the scanner's mount changed"
+    if mapper.key_scan_count == 1 and len(scan.ranges) > MORE_BEAMS * len(mapper.laser.angles):
+        return "the first scan lacked some of the beams"
+    return ""
+
+
 def save_map(folder: Path, name: str, mapper: Mapper) -> Path:
     """Writes map and trajectory; returns the path of NAME.yaml. Raises UserError if that fails."""
     if mapper.map is None:
@@ -161,12 +177,10 @@ def save_map(folder: Path, name: str, mapper: Mapper) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
         if existing := next((file for file in files if file.exists()), None):
             raise UserError(f"{existing} exists already: choose another name")
-        write_grid(path.parent, name, mapper.draw())
-        write_tum(path.with_suffix(".tum"), *mapper.trajectory())
+        with complete_files(path) as partial:
+            write_grid(partial, name, mapper.draw())
+            write_tum(partial / f"{name}.tum", *mapper.trajectory())
     except OSError as error:
-        for file in files:  # so that the name is free for the next attempt
-            with suppress(OSError):
-                file.unlink()
         raise UserError(f"{path}: cannot be written ({error.strerror}): choose another folder with --maps") from None
     return path
 

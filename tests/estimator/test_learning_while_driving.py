@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -127,6 +129,8 @@ def test_learn_save_and_follow(process, bus, worlds, tmp_path):
     assert reply.ok, reply.reason
     assert reply.version == stored[-1].field_version
     assert "exists already" in bus.query(SAVE_MODEL, SaveModelRequest(name="monday"), SaveModelReply).reason
+    (tmp_path / "saved" / "tuesday-precise.json").touch()
+    assert "exists already" in bus.query(SAVE_MODEL, SaveModelRequest(name="tuesday"), SaveModelReply).reason
     assert "letters" in bus.query(SAVE_MODEL, SaveModelRequest(name="../monday"), SaveModelReply).reason
     saved = tmp_path / "saved" / "monday-precise.safetensors"
     model, _, card = weights.load(saved)
@@ -147,6 +151,24 @@ def test_learn_save_and_follow(process, bus, worlds, tmp_path):
     for belief in stored:
         assert again[belief.stamp_ns].pose == belief.pose
         assert again[belief.stamp_ns].field_version == belief.field_version
+
+
+def test_follows_a_restarted_estimator(monkeypatch):
+    """The versions of a restarted estimator begin again at 1; repeated fields are used once."""
+    follower = StoringService(EstimatorSettings(world="corridor", learn="follow"))
+    follower.open()
+    _, (scan, *_), scanner = drive(load_world("corridor"), 1)
+    follower.on_message(SCAN, scan_message(scanner, 0, scan))
+    use_model = Mock(wraps=follower.estimator.use_model)
+    monkeypatch.setattr(follower.estimator, "use_model", use_model)
+    model, places = follower.estimator.model, follower.estimator.seeds.places
+    for k, offset in enumerate((0.0, 0.0, 0.1)):
+        field = replace(model.field, phi=model.field.phi + offset)
+        data = weights.encode(replace(model, field=field), places)
+        for part in split_into_messages(data, 1, follower.model.sha256, k):
+            follower.on_message(FIELD, part)
+    used = [call.args[0].field.phi.mean() for call in use_model.call_args_list]
+    assert np.diff(used) == pytest.approx([0.1], abs=1e-3)
 
 
 def test_parts():

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -27,7 +29,11 @@ def files(request, tmp_path):
         path, load, card = paper.saved(tmp_path)[0], paper_weights.load, paper.card()
     else:
         path, load, card = precise.saved(FIELD, tmp_path), precise_weights.load, precise.card(FIELD)
-    return SimpleNamespace(path=path, card_path=path.with_suffix(".json"), load=load, card=card)
+
+    def save():
+        return paper.saved(tmp_path) if request.param == "paper" else precise.saved(FIELD, tmp_path)
+
+    return SimpleNamespace(path=path, card_path=path.with_suffix(".json"), load=load, card=card, save=save)
 
 
 @given(position=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
@@ -62,6 +68,20 @@ def test_card_without_digest(files, caplog):
 def test_damaged_files(files, damage):
     damage(files)
     check_error(files.path, files.load)
+
+
+def test_full_disk(files, monkeypatch):
+    """A card that cannot be written leaves the old files, and no others."""
+    files.path.write_bytes(b"old")
+    files.card_path.write_text("old")
+    monkeypatch.setattr(Path, "write_text", Mock(side_effect=OSError(28, "No space left on device")))
+    with pytest.raises(OSError, match="No space left") as error:
+        files.save()
+    assert error.value.filename == str(files.path)
+    assert {file: file.read_bytes() for file in files.path.parent.iterdir()} == {
+        files.path: b"old",
+        files.card_path: b"old",
+    }
 
 
 @pytest.mark.parametrize(

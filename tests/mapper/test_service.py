@@ -22,7 +22,8 @@ from lab.accuracy import tasks
 from lab.accuracy.scenes import Scene
 from presage.live.commands import save_map
 from services.mapper import service
-from services.mapper.service import map_message
+from services.mapper.service import MapperService, map_message
+from services.mapper.settings import MapperSettings
 from services.mapper.slam.mapper import MapSnapshot
 from tests.conftest import WAIT_TIMEOUT_S, wait_for_message
 from tests.mapper.drives import driven
@@ -89,6 +90,77 @@ def test_drive_and_save(process, bus, link, tmp_path, odometry):
     later = scan_message(drive, last).model_copy(update={"stamp_ns": lost.stamp_ns + 10**8})
     found = belief_of(later, truth[last])
     assert tasks.is_at(se2.compose(truth[0], found.pose.array()), truth[last])
+
+
+@pytest.fixture
+def mapper(monkeypatch):
+    """A mapper service without a bus; `drive(scans)` returns the beliefs that it publishes."""
+    mapping, published = MapperService(MapperSettings()), []
+    monkeypatch.setattr(mapping, "_loop", Mock(publish=lambda _, message: published.append(message)))
+
+    def drive(scans):
+        published.clear()
+        for scan in scans:
+            mapping.on_message(SCAN, scan)
+            while mapping.due() == 0:
+                mapping.on_timer()
+        return [message for message in published if isinstance(message, Belief)]
+
+    mapping.drive = drive
+    yield mapping
+    mapping.close()
+
+
+def is_close(belief, truth, start):
+    return tasks.is_at(se2.compose(start, belief.pose.array()), truth)
+
+
+def stamped(scan, stamp_s):
+    return scan.model_copy(update={"stamp_ns": round(stamp_s * 1e9)})
+
+
+@pytest.mark.parametrize("step_s", [-5.0, 1000.0])
+def test_a_scan_with_another_stamp_leaves_the_map(mapper, step_s):
+    truth = Scene.of(OFFICE, 300, 5).path(6)
+    drive = driven(OFFICE, truth)
+    scans = [scan_message(drive, k) for k in range(len(truth))]
+    scans[70] = stamped(scans[0], 70 / 15 + step_s)
+    beliefs = mapper.drive(scans)
+    assert len(beliefs) == len(scans) - 1
+    assert {belief.state for belief in beliefs} == {"tracking"}
+    assert is_close(beliefs[-1], truth[-1], truth[0])
+
+
+@pytest.mark.parametrize("moved", [0, 69])
+def test_reset_keeps_the_map(mapper, moved):
+    """After a reset of the simulator, the robot is back at its start. A clock may also be set while it stands."""
+    truth = Scene.of(OFFICE, 300, 5).path(6)
+    drive = driven(OFFICE, truth)
+    scans = [scan_message(drive, k) for k in range(70)]
+    mapper.drive(scans)
+    before = mapper.mapper
+    count = len(before.key_scans().poses)
+    beliefs = mapper.drive([stamped(scans[moved], k / 15) for k in range(15)])
+    assert mapper.mapper is before
+    assert len(before.key_scans().poses) >= count
+    assert all(is_close(each, truth[moved], truth[0]) for each in beliefs if each.state == "tracking")
+    if moved == 69:
+        assert {each.state for each in beliefs} == {"tracking"}
+
+
+def test_first_scan_with_few_beams(mapper):
+    """The map is drawn with the beams of later scans; numbers of beams that vary a little do not matter."""
+    truth = Scene.of(OFFICE, 300, 5).path(3)
+    drive = driven(OFFICE, truth)
+    full = [scan_message(drive, k) for k in range(len(truth))]
+    first = full[0].model_copy(
+        update={"ranges": full[0].ranges[120:180], "angle_min": full[0].angle_min + 120 * full[0].angle_increment}
+    )
+    varying = [scan.model_copy(update={"ranges": scan.ranges[: 300 - k % 3]}) for k, scan in enumerate(full[1:], 1)]
+    beliefs = mapper.drive([first, *varying])
+    assert len(mapper.mapper.laser.angles) == 299
+    assert {belief.state for belief in beliefs} == {"tracking"}
+    assert is_close(beliefs[-1], truth[-1], truth[1])
 
 
 def test_key_scans_keep_their_numbers():

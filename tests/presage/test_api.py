@@ -90,6 +90,16 @@ def test_plain_ranges_are_a_scan(estimator, world, ranges):
     assert (belief.pose.tobytes(), belief.free_energy) == (other.pose.tobytes(), other.free_energy)
 
 
+def test_unknown_odometry(world, ranges):
+    """NaN means that the odometry of a scan is unknown, as in a log."""
+    estimator = presage.Estimator(world, scanner=SCANNER)
+    beliefs = [estimator.update(ranges, stamp=k / 15, odom=(np.nan if k in {0, 3} else 0.0, 0, 0)) for k in range(6)]
+    assert beliefs[-1].state == "tracking"
+    np.testing.assert_allclose(beliefs[-1].pose, POSE, atol=0.02)
+    scan = presage.LaserScan(ranges, SCANNER.angles(), 25.0, odom=(0, 0, np.nan), reference=(np.nan, 0, 0))
+    assert scan.odom is scan.reference is None
+
+
 def test_prediction_shapes(estimator, ranges):
     one, two = estimator.predict(POSE), estimator.predict([POSE, POSE], angles=[0.0, 0.1, 0.2])
     assert (one.ranges.shape, one.sigma.shape, two.ranges.shape) == ((200,), (200,), (2, 3))
@@ -118,6 +128,11 @@ def test_mount_argument_replaces_the_scans(world, ranges):
         (lambda e, r: e.update(presage.LaserScan(r, SCANNER.angles(), 25.0)), "the scanner, its mount or its noise"),
         (lambda e, r: presage.LaserScan(r, SCANNER.angles()[1:], 25.0), "as many ranges as angles"),
         (lambda e, r: presage.LaserScan(r, SCANNER.angles(), 25.0, odom=(0, 0)), "odom of a scan has three numbers"),
+        (lambda e, r: presage.LaserScan(r, SCANNER.angles(), 25.0, np.nan), "stamp of a scan: NaN and infinity"),
+        (lambda e, r: presage.LaserScan(r, SCANNER.angles(), np.nan), "range_max of a scan: NaN and infinity"),
+        (lambda e, r: presage.LaserScan(r, SCANNER.angles() * np.inf, 25.0), "angles of a scan: NaN and infinity"),
+        (lambda e, r: presage.LaserScan(r, SCANNER.angles(), 25.0, mount=(0, 0, np.nan)), "mount of a scan: NaN"),
+        (lambda e, r: presage.Estimator("corridor", mount=(0, np.nan, 0)), "mount: NaN and infinity"),
         (lambda e, r: presage.Estimator("corridor").update(r), "the directions of these ranges are not known"),
         (lambda e, r: presage.Estimator("corridor").predict(POSE), "which beams to predict is not known"),
         (lambda e, r: presage.Estimator("corridor").restart(), "nothing to restart"),

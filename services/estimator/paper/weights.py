@@ -15,6 +15,7 @@ from common.geometry.world import World
 from common.robot.scanner import Scanner
 from services.estimator.paper.decoder import Decoder, DecoderShape, Normalisation, PaperModel
 from services.estimator.shared.digest import check_digest, sha256
+from services.estimator.shared.model_folder import write_weights_and_card
 
 
 class ModelCard(BaseModel):
@@ -79,17 +80,11 @@ def train_command(world: str, preset: str, scanner: str = "tim571", beams: int |
 
 
 def save(path: Path, decoder: Decoder, card: ModelCard) -> None:
-    """Writes the weights, in half precision, and their card atomically."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """Writes the weights, in half precision, and their card."""
     tensors = {name: tensor.detach().half().contiguous() for name, tensor in decoder.state_dict().items()}
-    partial = path.with_suffix(".partial")
     data = safetensors.torch.save(tensors)
-    partial.write_bytes(data)
-    partial.replace(path)
     card = card.model_copy(update={"weights_sha256": sha256(data)})
-    card_path = path.with_suffix(".json")
-    partial.write_text(card.model_dump_json(indent=1) + "\n", encoding="utf-8")
-    partial.replace(card_path)
+    write_weights_and_card(path, data, card.model_dump_json(indent=1) + "\n")
 
 
 def load(path: Path) -> tuple[PaperModel, ModelCard]:

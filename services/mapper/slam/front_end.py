@@ -7,8 +7,9 @@ Its pose is unknown. After `MAX_SUSPECT_SCANS` in a row a new piece begins, whos
 unknown, unless odometry and the local map agree on it.
 
 A scan that matches, but far from where the motion model expects it, or with more contradictions than usual, also begins
-a piece: the wheels may have slipped, a door may have moved, or the robot was carried to a place that looks alike. This
-piece is linked to the former one, but the link may turn out to be wrong.
+a piece: the wheels may have slipped, a door may have moved, or the robot was carried to a place that looks alike. So
+does the first scan that matches after the stamps have stepped back or jumped ahead, because the robot may have been
+moved meanwhile. This piece is linked to the former one, but the link may turn out to be wrong.
 """
 
 from __future__ import annotations
@@ -64,6 +65,7 @@ VELOCITY_CHANGE_DEVIATION = np.array([1.0, 1.0, 3.0])
 VELOCITY_DEVIATION = np.array([1.0, 1.0, 1.5])
 STANDING_DEVIATION = np.array([0.002, 0.002, 0.002])  # m, m, rad: in addition to both
 MAX_VELOCITY = 3 * VELOCITY_DEVIATION  # a robot that seems to move faster was kidnapped
+MAX_PERIOD_S = 2.0  # between two scans; after a longer time, or a step back, the velocity is unknown
 # Scans over which these deviations are learned, and the largest error that counts, in deviations.
 LEARNING_SCANS, MAX_LEARNED_SIGMAS = 100, 10.0
 # Errors of a registration that do not average out, for each key scan: moving things, the surfaces' roughness.
@@ -150,10 +152,16 @@ class FrontEnd:
     def add(self, stamp: float, ranges: Array, odom: Array | None = None) -> ScanPose:
         """Registers a scan and returns its pose in the frame of the first scan.
 
-        ``ranges`` (B,) are in m, +inf without a return and -inf if not measured. ``stamp`` in s must be larger than
-        that of the scan before. ``odom`` (3,) is the pose of base_link in odom, or None if it is unknown.
+        ``ranges`` (B,) are in m, +inf without a return and -inf if not measured. ``stamp`` is in s; it may step back,
+        as after a reset of the simulator, which also resets the odometry. ``odom`` (3,) is the pose of base_link in
+        odom, or None if it is unknown.
         """
         period = stamp - self.stamps[-1] if self.stamps else 0.0
+        clock_stepped = not 0 <= period <= MAX_PERIOD_S
+        if clock_stepped:
+            self._velocity = None
+        if period < 0:
+            period, self._odom = MAX_PERIOD_S, None
         motion, deviation = self._predict_motion(period, odom)
         scan = self._correct(ranges, motion, period)
         used_odometry, self._odom = self._odom is not None and odom is not None, odom
@@ -175,7 +183,8 @@ class FrontEnd:
         # If odometry and registration agree even after many suspect scans, the surroundings have changed.
         confirmed = self._suspect_scans + 1 >= MAX_SUSPECT_SCANS and used_odometry and not _is_far(found, prior)
         if found is not None and (confirmed or not suspect):
-            begins_piece = suspect or self._is_unusual(contradiction) or prior.difference(found.pose)[1] > MAX_SLIP**2
+            slipped = prior.difference(found.pose)[1] > MAX_SLIP**2
+            begins_piece = clock_stepped or suspect or slipped or self._is_unusual(contradiction)
             if not suspect:  # in a suspect scan, the contradiction is not due to moving objects
                 self._update_recent_contradiction(contradiction)
             return self._add_matched(scan, found, prior, deviation, period, begins_piece=begins_piece)

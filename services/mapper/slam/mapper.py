@@ -65,7 +65,12 @@ class Mapper:
         """
         if self._front_end.shows_too_little:
             return False
-        return self.map is None or len(self.map.poses) < len(self._front_end.keys)
+        return self.map is None or len(self.map.poses) < self.key_scan_count
+
+    @property
+    def key_scan_count(self) -> int:
+        """Number of key scans so far."""
+        return len(self._front_end.keys)
 
     def key_scans(self) -> KeyScanGraph:
         """The key scans so far, for `update`."""

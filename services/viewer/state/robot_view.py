@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from common.messages.definitions import (
+    MAX_LATE_NS,
     Belief,
     CmdVel,
     Goal,
@@ -101,7 +102,10 @@ class RobotView:
         if isinstance(message, Truth) and self.map is not None:
             return None  # it is in the frame of the simulator's world, not of the map
         last, frame = self._received.get(topic.name), None
-        if topic in SENSOR_TOPICS and last is not None and message.stamp_ns < last.message.stamp_ns:
+        late_ns = 0 if last is None else last.message.stamp_ns - message.stamp_ns
+        if topic in SENSOR_TOPICS and late_ns > 0:
+            if self.live and late_ns < MAX_LATE_NS:  # a replay may go back by less
+                return None
             self._restart()
         elif topic in SENSOR_TOPICS and self._waiting is not None and message.stamp_ns != self._waiting[0]:
             frame = self._frame(now)

@@ -67,6 +67,22 @@ def test_gap_in_the_scans():
 
 
 @pytest.mark.parametrize("with_odometry", [True, False])
+@pytest.mark.parametrize("step_s", [-1000.0, 1000.0])
+def test_step_of_the_clock(with_odometry, step_s):
+    truth = Scene.of(OFFICE, 300, 5).path(10)
+    drive = driven(OFFICE, truth)
+    drive.stamps[70:] += step_s
+    odom = None
+    if with_odometry:  # a reset also resets the odometry
+        odom = odometry(truth)
+        odom[70:] = se2.between(odom[70], odom[70:])
+    mapper, places = mapped(replace(drive, odom=odom))
+    assert all(place.matched for place in places)
+    _, poses = mapper.trajectory()
+    assert np.hypot(*(se2.compose(truth[0], poses) - truth)[:, :2].T).max() < 0.1
+
+
+@pytest.mark.parametrize("with_odometry", [True, False])
 @pytest.mark.parametrize("first_step", [0.0, 0.2])
 def test_first_scans_without_return(with_odometry, first_step):
     """A robot that stands is localised, and gets a map, as soon as its scanner sees something."""

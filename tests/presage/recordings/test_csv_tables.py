@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import subprocess
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -86,6 +87,14 @@ def test_readme_explains_columns(tmp_path):
         )
     assert "| `twist.vx` | m/s, forward; base_link |" in text
     assert "| `free_energy` | nats" in text
+
+
+def test_full_disk(tmp_path, monkeypatch):
+    monkeypatch.setattr(csv_tables, "_readme", Mock(side_effect=OSError(28, "No space left on device")))
+    with pytest.raises(OSError, match="No space left") as error:
+        tables(tmp_path)
+    assert error.value.filename == str(tmp_path / "csv" / "README.md")
+    assert list((tmp_path / "csv").iterdir()) == []
 
 
 def test_more_files_than_may_be_open(tmp_path, monkeypatch):

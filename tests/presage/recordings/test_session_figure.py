@@ -8,10 +8,11 @@ from io import BytesIO
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from rich.console import Console
 
 from common.errors import UserError
 from common.messages.topics import BELIEF, GOAL, HEALTH, PREDICTION, SCAN, STATUS, TOPICS, TRUTH
-from presage.recordings.session_figure import draw_session, figure_of
+from presage.recordings.session_figure import draw_session, figure_of, plot_command
 from presage.recordings.session_summary import load_session
 from tests.recorder import sessions as made
 
@@ -80,6 +81,12 @@ def test_beliefs_without_free_energy(tmp_path):
     session = load_session(made.write(tmp_path / "run.mcap"))
     session.belief._rows = array("d", [np.nan if k % 6 > 2 else v for k, v in enumerate(session.belief._rows)])
     assert texts(figure_of(session, "run")) == "no free energy in this recording"
+
+
+def test_unknown_format(tmp_path):
+    recording = made.write(tmp_path / "run.mcap")
+    with pytest.raises(UserError, match=r"run\.txt: the name of the figure must end with \.png"):
+        plot_command(recording, tmp_path / "run.txt", None, Console(quiet=True))
 
 
 def test_unwritable_folder(tmp_path):

@@ -9,6 +9,7 @@ import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -86,6 +87,21 @@ def test_json(tmp_path):
     assert {"world", "estimator", "model", "frame", "seed", "commit"} <= set(data)
     assert data["mode"] == "single"
     assert data["rows"] == rows
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_full_disk(tmp_path, monkeypatch):
+    out = tmp_path / "out.csv"
+    out.symlink_to("/dev/full")
+    with pytest.raises(OSError, match="No space left") as error:
+        localize(job(npz(tmp_path), out=out), CONSOLE)
+    assert error.value.filename == str(out)
+    out = tmp_path / "out.tum"
+    monkeypatch.setattr(np, "savetxt", Mock(side_effect=OSError(28, "No space left on device")))
+    with pytest.raises(OSError, match="No space left") as error:
+        localize(job(npz(tmp_path), out=out), CONSOLE)
+    assert error.value.filename == str(out)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["out.csv", "scans.npz"]
 
 
 def test_tum(tmp_path):

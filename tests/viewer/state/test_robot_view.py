@@ -249,6 +249,20 @@ def test_restarted_time_clears_the_history():
     assert view.history.columns()["t"] == [2.0, 3.0]
 
 
+def test_late_messages_are_left_out():
+    view = RobotView("robot")
+    feed(view, 10.0)
+    for topic in (ODOM, TRUTH, SCAN):
+        assert view.add(topic, at(9.98)[topic], 10.02) is None
+    assert view.stamp_ns == 10_000_000_000
+    assert view.history.columns()["t"] == [10.0]
+    assert not view.time_restarted
+    replay = RobotView("ghost", live=False)
+    feed(replay, 10.0)
+    feed(replay, 9.98)
+    assert replay.time_restarted
+
+
 def test_history_is_the_last_minute():
     history = History()
     for i in range(100):

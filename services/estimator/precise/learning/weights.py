@@ -19,7 +19,7 @@ from services.estimator.precise.field import CLASSES, DistanceField, FieldModel
 from services.estimator.precise.global_seeds import RANKED_HEADINGS, Seeds
 from services.estimator.precise.learning.calibration import Calibration
 from services.estimator.shared.digest import check_digest, sha256
-from services.estimator.shared.model_folder import SHIPPED, training_folder
+from services.estimator.shared.model_folder import SHIPPED, training_folder, write_weights_and_card
 from services.estimator.shared.seen_cells import SeenCells
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def path_of(folder: Path, world: str) -> Path:
 
 
 def save(path: Path, model: FieldModel, places: Array, card: FieldCard) -> None:
-    """Writes the field, the seeds of a search at ``places`` (S, 2) m, and the card; each file atomically.
+    """Writes the field, the seeds of a search at ``places`` (S, 2) m, and the card.
 
     The field is stored in half precision, whose resolution is finest near zero, at surfaces.
     """
@@ -79,16 +79,10 @@ def save(path: Path, model: FieldModel, places: Array, card: FieldCard) -> None:
 
 
 def write(path: Path, model: FieldModel, seeds: Seeds, card: FieldCard) -> None:
-    """Writes a field whose solid parts are marked, the seeds of a search and the card; each file atomically."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial")
+    """Writes a field whose solid parts are marked, the seeds of a search and the card."""
     data = safetensors.numpy.save({**_tensors(model, seeds.places), "panoramas_in_bytes": seeds.panoramas})
-    partial.write_bytes(data)
-    partial.chmod(0o644)
-    partial.replace(path)
     card = card.model_copy(update={"weights_sha256": sha256(data)})
-    partial.write_text(card.model_dump_json(indent=1) + "\n", encoding="utf-8")
-    partial.replace(path.with_suffix(".json"))
+    write_weights_and_card(path, data, card.model_dump_json(indent=1) + "\n")
 
 
 def encode(model: FieldModel, places: Array) -> bytes:
