@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from common.errors import UserError
 from common.geometry.occupancy_grid import OccupancyGrid
@@ -41,6 +41,21 @@ if TYPE_CHECKING:
     from common.robot.scanner import Scanner
 
 GOAL_TOLERANCE_M = 0.02  # default of Goal.tolerance
+COVARIANCE_ROUNDING = 1e-6  # of the largest element; more than what single precision loses
+
+
+def _check_covariance(covariance: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    if covariance.shape != (3, 3):
+        raise ValueError(f"covariance has shape {covariance.shape}, not (3, 3)")
+    relative = covariance / max(float(np.abs(covariance).max()), np.finfo(float).tiny)
+    if (np.abs(relative - relative.T) > COVARIANCE_ROUNDING).any():
+        raise ValueError("covariance is not symmetric")
+    if (np.diagonal(covariance) < 0).any() or np.linalg.eigvalsh(relative)[0] < -COVARIANCE_ROUNDING:
+        raise ValueError("covariance is not positive semidefinite")
+    return covariance
+
+
+Covariance = Annotated[Matrix3, AfterValidator(_check_covariance)]
 
 
 class Stamped(Message):
@@ -118,14 +133,8 @@ class BeliefHypothesis(Message):
     """One Gaussian of a belief's mixture."""
 
     pose: Pose  # base_link in map
-    covariance: Matrix3 | None = None  # (3, 3) of x, y, yaw in map
+    covariance: Covariance | None = None  # (3, 3) of x, y, yaw in map
     weight: Annotated[float, Field(ge=0, le=1)]  # the weights sum to 1
-
-    @model_validator(mode="after")
-    def _shape(self) -> BeliefHypothesis:
-        if self.covariance is not None and self.covariance.shape != (3, 3):
-            raise ValueError(f"covariance has shape {self.covariance.shape}, not (3, 3)")
-        return self
 
 
 class Belief(Stamped):
@@ -136,7 +145,7 @@ class Belief(Stamped):
 
     state: Literal["localising", "tracking", "ambiguous", "lost"]  # operations.md explains these
     pose: Pose  # base_link in map
-    covariance: Matrix3 | None = None  # (3, 3) of x, y, yaw in map
+    covariance: Covariance | None = None  # (3, 3) of x, y, yaw in map, positive semidefinite
     xi: Floats | None = None  # (3,) dg' Pi (o - g), the negative gradient of accuracy in map: nats/m, nats/m, nats/rad
     curvature: Matrix3 | None = None  # (3, 3) dg' Pi dg, Gauss-Newton Hessian of accuracy in map
     free_energy: Finite | None = None  # nats, accuracy + complexity
@@ -157,10 +166,8 @@ class Belief(Stamped):
             vector = getattr(self, name)
             if vector is not None and vector.shape != (3,):
                 raise ValueError(f"{name} has shape {vector.shape}, not (3,)")
-        for name in ("covariance", "curvature"):
-            matrix = getattr(self, name)
-            if matrix is not None and matrix.shape != (3, 3):
-                raise ValueError(f"{name} has shape {matrix.shape}, not (3, 3)")
+        if self.curvature is not None and self.curvature.shape != (3, 3):
+            raise ValueError(f"curvature has shape {self.curvature.shape}, not (3, 3)")
         return self
 
 

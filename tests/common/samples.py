@@ -46,8 +46,7 @@ def message_of(cls: type[Message]) -> st.SearchStrategy:
     rows = {name: _field(field) for name, field in cls.model_fields.items()}
     if cls in (Belief, BeliefHypothesis):
         three = st.builds(np.array, st.lists(st.floats(-1e6, 1e6, width=64), min_size=9, max_size=9))
-        matrix = st.none() | three.map(lambda m: m.reshape(3, 3))
-        rows["covariance"] = matrix
+        rows["covariance"] = st.none() | three.map(lambda m: m.reshape(3, 3) @ m.reshape(3, 3).T)
     if cls is Preference:
         rows |= {"width": st.just(3), "height": st.just(2)}
         rows["distance"] = st.lists(st.floats(0, allow_nan=False, width=32), min_size=6, max_size=6)
@@ -55,7 +54,7 @@ def message_of(cls: type[Message]) -> st.SearchStrategy:
         rows |= {"poses": st.just(np.zeros((2, 3))), "connected": st.sampled_from([[], [1, 0, 1]])}
     if cls is Belief:
         vector = st.none() | st.lists(st.floats(-1e6, 1e6, width=32), min_size=3, max_size=3)
-        rows |= {"xi": vector, "protection": vector, "curvature": matrix}
+        rows |= {"xi": vector, "protection": vector, "curvature": st.none() | three.map(lambda m: m.reshape(3, 3))}
     return st.builds(cls, **rows)
 
 
