@@ -69,10 +69,10 @@ class Scan(Stamped):
     """One sweep of the scanner (sensor_msgs/LaserScan); its stamp is the time of the beam that was measured first."""
 
     angle_min: Angle  # rad, first beam in laser, counter-clockwise seen from above in any mounting
-    angle_increment: Angle  # rad, between beams; negative if they run clockwise, as of an upside-down scanner
+    angle_increment: Angle  # rad, between beams, not 0; negative if they run clockwise, as of an upside-down scanner
     range_min: Distance  # m
     range_max: PositiveDistance  # m
-    ranges: ScanRanges  # (B,) m; +inf is nothing within range_max, -inf is too close (REP-117), 0 is not measured
+    ranges: ScanRanges  # (B >= 2,) m; +inf is nothing within range_max, -inf too close (REP-117), 0 not measured
     mount: Pose = Pose(x=0.0, y=0.0)  # scanner in base_link
     scan_time: NotNegative = 0.0  # s, between scans
     time_increment: Annotated[float, Field(ge=-1, le=1)] = 0.0  # s, between beams; negative if the last was measured
@@ -80,6 +80,12 @@ class Scan(Stamped):
     frame_id: Name = "laser"
     sigma: Distance = 0.0  # m, standard deviation of a range; unknown if both sigmas are 0
     sigma_relative: Annotated[float, Field(ge=0, le=1)] = 0.0  # part proportional to the range, added in quadrature
+
+    @model_validator(mode="after")
+    def _has_directions(self) -> Scan:
+        if len(self.ranges) < 2 or not self.angle_increment:
+            raise ValueError(f"{len(self.ranges)} beams {self.angle_increment:g} rad apart: no scanner has those")
+        return self
 
     @classmethod
     def of_scanner(cls, scanner: Scanner, ranges: npt.ArrayLike, stamp_ns: int, **fields: Any) -> Scan:

@@ -146,9 +146,6 @@ def _scanner(observation: BusObservation) -> Iterator[Finding]:
     if sweep.spacing * (sweep.beams - 1) > np.deg2rad(360.1):
         advice = "the beams cover more than one turn: angle_increment must be wrong"
         yield Finding("scanner", False, what, where, advice)
-    elif not sweep.increment or sweep.beams < 2:
-        advice = "the beams have no directions: angle_increment is 0, or there is only one beam"
-        yield Finding("scanner", False, what, where, advice)
     elif abs(se2.wrap(-view.centre)) > view.half:
         advice = "no beam points ahead; correct the yaw of `mount` if that is wrong (docs/scanners.md)"
         yield Finding("scanner", None, what, where, advice)

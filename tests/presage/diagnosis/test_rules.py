@@ -140,7 +140,6 @@ def test_doubled_services():
         ({}, True, "301 beams from -85.94 deg on, 0.573 deg apart, mounted at (0, 0) m, 0 deg"),
         ({"angle_min": 1.5, "angle_increment": -0.01}, True, "clockwise as if upside down"),
         ({"mount": Pose(x=-0.2, y=0.0, yaw=3.0)}, None, "mounted at (-0.2, 0) m, 171.9 deg"),
-        ({"angle_increment": 0.0}, False, "0 deg apart"),
         ({"angle_increment": 0.05}, False, "2.86 deg apart"),
     ],
 )
