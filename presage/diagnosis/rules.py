@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 
 import numpy as np
@@ -9,16 +10,19 @@ import numpy as np
 from common.geometry import se2
 from common.messages.definitions import Health, TopicHealth
 from common.messages.requests import ConfigReply
-from common.messages.topics import CMD_VEL, PREDICTION, SCAN, TOPICS, TRUTH, expected_rate, topic_of
+from common.messages.topics import BELIEF, CMD_VEL, PREDICTION, SCAN, TOPICS, TRUTH, expected_rate, topic_of
 from common.robot.scan_geometry import Sweep
 from common.runtime.protocol_check import describe_version_differences, same_protocol
-from common.runtime.service_monitor import SUBSTITUTES, start_command
+from common.runtime.service_monitor import REPLAY, SUBSTITUTES, start_command
 from presage.diagnosis.bus_observation import BusObservation
 from presage.diagnosis.findings import Finding
 from presage.diagnosis.health_board import MIN_RATE_SHARE
 
 MAX_CLOCK_DIFFERENCE_S = 0.5  # as long as the time-outs of the robot
 MAX_DROPPED_SHARE = 0.1  # of the received messages; a service that drops more cannot keep up
+MIN_STAMPED_S = 1.0  # scans of a shorter time do not show whether their stamps advance
+MIN_SIMULATION_SPEED = 0.01  # times real time; stamps that advance more slowly are in another unit
+MIN_STAMPED_BELIEFS = 5  # fewer may all belong to scans that came before the observation
 MAY_SKIP_MESSAGES = {"viewer"}  # it shows only the newest messages
 MAY_RUN_SEVERAL_TIMES = {"recorder", "viewer"}  # of the other services, only one instance is active (`Service.single`)
 
@@ -31,6 +35,7 @@ def evaluate_observation(observation: BusObservation, own_config: ConfigReply) -
     yield from _clocks(observation)
     yield from _rates(observation)
     yield from _scanner(observation)
+    yield from _stamps(observation)
     yield from _counts(observation)
 
 
@@ -151,6 +156,31 @@ def _scanner(observation: BusObservation) -> Iterator[Finding]:
         yield Finding("scanner", None, what, where, advice)
     else:
         yield Finding("scanner", True, what, where)
+
+
+def _stamps(observation: BusObservation) -> Iterator[Finding]:
+    """Checks that stamps of scans advance with time, and that beliefs have the stamps of scans."""
+    arrivals, stamps = np.array(observation.scan_stamps, np.int64).reshape(-1, 2).T
+    passed = float(np.ptp(arrivals)) * 1e-9 if len(arrivals) else 0.0
+    if passed >= MIN_STAMPED_S and not _time_may_stand(observation):
+        advance = float(np.maximum(np.diff(stamps), 0).sum()) * 1e-9
+        ok = advance >= MIN_SIMULATION_SPEED * passed
+        text = "advance with time" if ok else "do not advance with time"
+        what = f"scans: their stamps {text} ({advance:.3g} s in {passed:.3g} s)"
+        yield Finding("stamps", ok, what, SCAN.key(observation.robot), "" if ok else "stamp_ns is in nanoseconds")
+    if len(stamps) and len(observation.belief_stamps) >= MIN_STAMPED_BELIEFS:
+        matched = int(np.isin(observation.belief_stamps, stamps).sum())
+        ok = matched > len(observation.belief_stamps) / 2
+        what = f"beliefs: {matched} of {len(observation.belief_stamps)} have the stamp of a scan"
+        advice = "" if ok else "a belief has the stamp_ns of the scan that it follows from; others are taken for old"
+        yield Finding("stamps", ok, what, BELIEF.key(observation.robot), advice)
+
+
+def _time_may_stand(observation: BusObservation) -> bool:
+    """Whether the stamps of scans may rightly stand still: in a replay, and in lockstep."""
+    configs = [json.loads(reply.config) for reply in observation.replies.get("simulator", [])]
+    lockstep = any(isinstance(config, dict) and config.get("pace") == "lockstep" for config in configs)
+    return lockstep or observation.monitor.present(REPLAY, observation.seconds)
 
 
 def _counts(observation: BusObservation) -> Iterator[Finding]:

@@ -182,3 +182,33 @@ def test_rising_counts(service, counts, codes):
 @pytest.mark.parametrize("endpoint", ["udp/127.0.0.1:1", "serial//dev/ttyS0"])
 def test_only_tcp_endpoints_are_checked(endpoint):
     assert check_endpoint(endpoint) is None
+
+
+@pytest.mark.parametrize(
+    ("stamp_ns", "words"),
+    [
+        (lambda _: 0, "do not advance with time (0 s in 2.93 s)"),
+        (lambda t: int(1e3 * t), "do not advance with time (2.93e-06 s in 2.93 s)"),  # milliseconds
+        (lambda t: int(1e9 * (0.1 * t % 0.2)), ""),  # a slow simulation, which begins again
+    ],
+)
+def test_stamps_of_scans(stamp_ns, words):
+    seen = observed()
+    seen.scan_stamps = [(int(n / 15 * SECOND), stamp_ns(n / 15)) for n in range(45)]
+    (finding,) = findings(seen, "stamps")
+    assert (finding.ok, words in finding.what) == (not words, True)
+    for alive, config in (([*NAMES, "replay"], "{}"), (NAMES, '{"pace": "lockstep"}')):  # there, time may stand still
+        seen.monitor.set_alive(alive, 0.0)
+        seen.replies["simulator"] = [build_config_reply("simulator", config, 5.0)]
+        assert not problems(seen)
+
+
+@pytest.mark.parametrize(("delay_ns", "ok"), [(0, True), (1, False)])
+def test_stamps_of_beliefs(delay_ns, ok):
+    seen = observed()
+    stamps = [n * SECOND // 15 for n in range(45)]
+    seen.scan_stamps = list(zip(stamps, stamps, strict=True))
+    seen.belief_stamps = [stamp + delay_ns for stamp in [-SECOND // 15, *stamps]]
+    (_, finding) = findings(seen, "stamps")
+    assert finding.ok is ok
+    assert f"{45 if ok else 0} of 46" in finding.what
