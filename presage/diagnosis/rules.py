@@ -114,17 +114,19 @@ def _clocks(observation: BusObservation) -> Iterator[Finding]:
 def _rates(observation: BusObservation) -> Iterator[Finding]:
     # A real robot's scanner may have any rate, and there is no ground truth.
     real_robot = bool(_substitute(observation, "simulator"))
-    mapping = bool(_substitute(observation, "estimator"))  # a mapper publishes beliefs, but predicts no scans
     period = observation.scan.scan_time if observation.scan is not None else 0.0
     if real_robot and not period and (scans := observation.arrivals[SCAN.key(observation.robot)]):
         period = observation.seconds / scans  # some drivers do not fill in scan_time
     for topic in TOPICS:
-        if not topic.rate or topic.per_service or (real_robot and topic is TRUTH) or (mapping and topic is PREDICTION):
+        if not topic.rate or topic.per_service or (real_robot and topic is TRUTH):
             continue
         key = topic.key(observation.robot)
         rate = observation.arrivals[key] / observation.seconds
         expected = expected_rate(topic, period)
         ok = rate > 0 and rate >= MIN_RATE_SHARE * expected
+        if topic is PREDICTION and not rate and observation.arrivals[BELIEF.key(observation.robot)]:
+            yield Finding("rate", None, "prediction: none, which is right for an estimator that predicts no scans", key)
+            continue
         publisher = _substitute(observation, topic.publisher) or topic.publisher
         advice = f"published by the {publisher}: is it alive, paused, or are its inputs missing? See its log"
         if topic is CMD_VEL and rate > 1.5 * expected:
@@ -185,18 +187,27 @@ def _time_may_stand(observation: BusObservation) -> bool:
 
 def _counts(observation: BusObservation) -> Iterator[Finding]:
     for service, health in sorted(observation.health.items()):
-        first, last = health[0][1], health[-1][1]
-        if last.note:
-            unfit = _increase(first, last, "unfit_scans") > 0
-            yield Finding(
-                "weights" if unfit else "note", False if unfit else None, f"{service} reports: {last.note}", service
-            )
-        if (failed := _increase(first, last, "failed")) > 0:
-            what = f"{service}: {failed} steps failed during the observation"
-            yield Finding("failed", False, what, service, "its log contains the traceback")
-        before = {row.key: row for row in first.topics}
-        for row in last.topics:
-            yield from _counts_of_key(service, before.get(row.key, TopicHealth(key=row.key)), row)
+        by_instance: dict[str, list[Health]] = {}
+        for _, message in health:
+            by_instance.setdefault(message.instance, []).append(message)
+        # The recorder that `presage up` keeps ready is idle while `presage record` records.
+        active = [each for each in by_instance.values() if not each[-1].idle]
+        for messages in active or by_instance.values():
+            yield from _counts_of_instance(service, messages[0], messages[-1])
+
+
+def _counts_of_instance(service: str, first: Health, last: Health) -> Iterator[Finding]:
+    if last.note:
+        unfit = _increase(first, last, "unfit_scans") > 0
+        yield Finding(
+            "weights" if unfit else "note", False if unfit else None, f"{service} reports: {last.note}", service
+        )
+    if (failed := _increase(first, last, "failed")) > 0:
+        what = f"{service}: {failed} steps failed during the observation"
+        yield Finding("failed", False, what, service, "its log contains the traceback")
+    before = {row.key: row for row in first.topics}
+    for row in last.topics:
+        yield from _counts_of_key(service, before.get(row.key, TopicHealth(key=row.key)), row)
 
 
 def _counts_of_key(service: str, before: TopicHealth, row: TopicHealth) -> Iterator[Finding]:

@@ -127,6 +127,28 @@ def test_mapping():
     assert not any("estimator" in finding.what for finding in findings(seen, "missing"))
 
 
+def test_estimator_without_predictions():
+    """They are optional for an estimator of one's own; without beliefs, their lack is a problem."""
+    seen = observed()
+    seen.arrivals[PREDICTION.key("robot")] = 0
+    assert not problems(seen)
+    assert any("prediction: none" in finding.what for finding in findings(seen, "rate"))
+    seen.arrivals[BELIEF.key("robot")] = 0
+    assert [each.what.split(":")[0] for each in findings(seen, "rate") if each.ok is False] == ["belief", "prediction"]
+
+
+def test_recorder_beside_an_idle_one():
+    """`presage record` runs beside the idle recorder of `presage up`."""
+    seen = observed()
+    idle = Health(stamp_ns=0, service="recorder", uptime=9, instance="a", idle=True, note="not recording")
+    busy = Health(stamp_ns=0, service="recorder", uptime=2, instance="b", counters={"failed": 3})
+    seen.health["recorder"] = [(0, idle), (0, busy), (0, idle)]
+    assert not findings(seen, "note")
+    assert not problems(seen)
+    seen.health["recorder"] = [(0, idle), (0, idle)]
+    assert findings(seen, "note")[0].what == "recorder reports: not recording"
+
+
 def test_doubled_services():
     for name, codes in (("controller", {"doubled"}), ("recorder", set())):
         seen = observed([*NAMES, name], reporting=[*NAMES, name])
