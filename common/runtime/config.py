@@ -36,6 +36,7 @@ from common.yaml_text import NOT_YAML, parse_yaml
 _file_values: ContextVar[dict[str, Any]] = ContextVar("_file_values")
 S = TypeVar("S", bound="ServiceSettings")
 M = TypeVar("M", bound=BaseModel)
+ROBOT_NAME_PATTERN = r"^[A-Za-z0-9_.-]{1,64}$"  # a part of each key, without the wildcards of zenoh
 METRICS_PATTERN = r"^$|^(\[[0-9A-Fa-f:.]+\]:|[^\s:\[\]]+:)?\d{1,5}$"  # PORT, HOST:PORT, [IPv6]:PORT, or empty
 
 
@@ -58,7 +59,7 @@ class ServiceSettings(BaseSettings):
 
     robot: Annotated[
         str,
-        Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$", description="name of the robot: the topics are presage/ROBOT/TOPIC"),
+        Field(pattern=ROBOT_NAME_PATTERN, description="name of the robot: the topics are presage/ROBOT/TOPIC"),
     ] = "robot"
     connect: Annotated[
         str, Field(description="zenoh endpoints to connect to, comma-separated; empty for no connection")
