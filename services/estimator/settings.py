@@ -8,6 +8,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
+from common.errors import UserError
 from common.geometry.pose_text import POSE_PATTERN
 from common.runtime.robot_settings import MotionLimitSettings
 
@@ -91,3 +92,19 @@ class EstimatorSettings(MotionLimitSettings):
     iterations: Annotated[
         int, Field(ge=1, le=1000, description="paper: gradient steps per scan; 1 in the publication")
     ] = 10
+
+    @property
+    def robot_names(self) -> list[str]:
+        """The names in ``robots``, without the patterns."""
+        return list(dict.fromkeys(name for name in self.robots.split(",") if ROBOT_NAME.fullmatch(name)))
+
+    def check_several_robots(self) -> None:
+        """Raises UserError if a setting is only for one robot, or more robots are named than allowed."""
+        if self.learn != "none":
+            raise UserError("--learn is for one robot: leave it out, or leave out --robots")
+        if self.initial_pose:
+            raise UserError(
+                "initial_pose is for one robot: leave it out with --robots, and set each pose with `presage relocalise`"
+            )
+        if (count := len(self.robot_names)) > self.max_robots:
+            raise UserError(f"{count} robots are named, --max-robots is {self.max_robots}: raise it")
