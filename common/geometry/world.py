@@ -405,7 +405,8 @@ def lack_of_room(clearance: float, radius: float) -> str:
     """What is wrong with a place for a robot of ``radius`` m, ``clearance`` m from the edge of free space."""
     if clearance < 0:
         return "is inside something, or off the map"
-    return f"is {clearance:.2f} m from a wall, and the robot needs {radius:g} m around it"
+    # Adding 0 turns -0, the clearance at a corner, into 0.
+    return f"is {clearance + 0.0:.2f} m from a wall, and the robot needs {radius:g} m around it"
 
 
 def known_worlds() -> list[str]:

@@ -69,8 +69,9 @@ def run_up(options: UpOptions, console: Console) -> None:
         with session_file(stack.endpoint, robots, stack.security):
             if options.mapping:
                 console.print(
-                    "[bold green]mapping[/]: click a goal, press Explore or use the arrow keys on the page, then save "
-                    "the map there or with `presage save-map NAME`."
+                    "[bold green]mapping[/]: click a goal, press Explore or use the arrow keys on the page, or use "
+                    "`presage goal X Y` or `presage explore` in another terminal; then save the map on the page or "
+                    "with `presage save-map NAME`."
                 )
             else:
                 _show_hints(stack, plan.estimator_settings.world, robots, console)

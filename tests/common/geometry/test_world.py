@@ -9,7 +9,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from common.errors import UserError
-from common.geometry.world import World, known_worlds, load_world, save_world
+from common.geometry.world import World, known_worlds, lack_of_room, load_world, save_world
 from common.robot.robot import Robot
 from services.controller.policies.geodesic_field import WALL_GAP_M
 from tests.common.geometry.maps import ROOM
@@ -151,6 +151,10 @@ def test_invalid_files(tmp_path, text, message):
     assert message in str(error.value)
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_place_on_a_corner():
+    assert lack_of_room(-0.0, 0.3) == "is 0.00 m from a wall, and the robot needs 0.3 m around it"
 
 
 def test_unknown_world():
