@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 HEALTH_PERIOD_S = 1.0
 RESTORE_PERIOD_S = 5.0  # after its start, a service keeps querying latched topics for this long until one answers
 MAX_REPORTED_KEYS, MAX_KEY_LENGTH = 200, 200  # in a health message
+MAX_ERROR_LENGTH = 300  # in the log line of an error that was logged in full before
 SOURCE_TIMEOUT_S = 0.3  # a source silent for longer is replaced by another source of the same topic
 
 
@@ -224,8 +225,8 @@ class ServiceLoop:
             self._known_failures.add(failure)
             self.service.log.error(event, **details, so_far=self.failed, exc_info=error)
         elif self._may_log(event):
-            repeated, text = f"{event} (as before)", f"{type(error).__name__}: {error}".splitlines()[0]
-            self.service.log.error(repeated, **details, so_far=self.failed, error=text)
+            repeated, text = f"{event} (as before)", " ".join(f"{type(error).__name__}: {error}".split())
+            self.service.log.error(repeated, **details, so_far=self.failed, error=text[:MAX_ERROR_LENGTH])
 
     def _answer(self, call: IncomingRequest) -> None:
         try:
