@@ -26,3 +26,9 @@ def test_session(monkeypatch, options, command, line):
     with session_file(HERE, ["truck"], None):
         done = CliRunner(env={"PRESAGE_CONNECT": "", "PRESAGE_ROBOT": ""}).invoke(app, [*options, *command])
     assert (done.exit_code, done.stderr, done.stdout) == (0, line, "")
+
+
+def test_no_session(monkeypatch):
+    monkeypatch.setattr(commands, "send_goal", lambda *_, **__: 0)
+    done = CliRunner(env={"PRESAGE_CONNECT": "", "PRESAGE_ROBOT": ""}).invoke(app, ["goal", "1", "1"])
+    assert (done.exit_code, done.stderr) == (0, "")
