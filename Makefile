@@ -103,7 +103,7 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	$(BIN)/presage experiment --out $(RESULTS) all
 	$(BIN)/presage experiment --seed 3547 --out $(RESULTS) navigation --trials 30
 	$(BIN)/presage experiment --seed 3548 --out $(RESULTS) navigation --start unknown --trials 30
-	$(BIN)/presage experiment --seed 3540 --out $(RESULTS) navigation --worlds office --people 10 --trials 50
+	$(BIN)/presage experiment --seed 3560 --out $(RESULTS) navigation --worlds office --people 10 --trials 50
 	$(BIN)/presage experiment --seed 3502 --out $(RESULTS) navigation --worlds hall --drives holonomic --max-range 4 --beams 271 --prior odometry --slip 0.05 --limit 60 --trials 50
 	$(BIN)/presage experiment --seed 3502 --out $(RESULTS) navigation --worlds hall --drives holonomic --max-range 4 --beams 271 --prior odometry --slip 0.05 --limit 60 --trials 50 --no-epistemic
 	$(BIN)/presage experiment --seed 3549 --out $(RESULTS) navigation --worlds twins --start unknown --trials 50
@@ -124,7 +124,7 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	$(if $(LOGS),$(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/fr079.npz' --mount 0,0,0 --world $(RESULTS)/maps/first_half.yaml --every 30 --name fr079)
 	$(if $(LOGS),$(BIN)/presage map '$(LOGS)/uwb.npz' --mount 0,0,0 --poses reference --half first --no-learn -o $(RESULTS)/maps/uwb_first_half.yaml)
 	$(if $(LOGS),$(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/uwb.npz' --mount 0,0,0 --world $(RESULTS)/maps/uwb_first_half.yaml --every 10 --name uwb)
-	$(BIN)/presage bench integrity --out $(RESULTS)/integrity --worlds 3 --seed 3539 --model exact --seconds 10 --estimators precise,particle-filter,particle-filter-recovery
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity --worlds 3 --seed 3571 --model exact --seconds 10 --estimators precise,particle-filter,particle-filter-recovery
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-kidnapped-similar --worlds 20 --seed 3541 --model exact --seconds 10 --cases kidnapped-similar --estimators precise
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-long-corridor --worlds 40 --seed 3542 --model exact --seconds 10 --cases long-corridor --estimators precise
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-wrong-map --worlds 40 --seed 3543 --model exact --seconds 10 --cases wrong-map --estimators precise

@@ -16,7 +16,10 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("common", "services", "presage", "lab")
 # Each layer imports only those before it; what shares a line imports nothing of one another.
 LAYERS = (
-    ("common.errors", "common.limits", "common.versions", "common.processes", "common.log_capture", "common.yaml_text"),
+    (
+        "common.errors", "common.limits", "common.versions", "common.processes", "common.log_capture",
+        "common.yaml_text", "common.names",
+    ),
     ("common.log", "common.packages"),
     ("common.geometry",),
     ("common.robot",),

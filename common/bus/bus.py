@@ -18,10 +18,9 @@ from common.bus.liveliness import Liveliness, published_ns
 from common.bus.security import Credentials, may_put, may_query
 from common.bus.session import DEFAULT_ENDPOINT, JOIN_TIMEOUT_S, LOG_FILTER, Link, open_session, wait_until
 from common.errors import UserError
-from common.messages.definitions import Stamped
 from common.messages.requests import Reply, Request
-from common.messages.topics import Query, Topic, topic_of
-from common.messages.wire import ENCODING, DecodeError, Message
+from common.messages.topics import Query, Topic
+from common.messages.wire import ENCODING, DecodeError
 
 R = TypeVar("R", bound=Reply)
 TIMEOUT_REPLY = "Timeout"  # the text of the error reply that zenoh itself makes when a request expires
@@ -271,4 +270,4 @@ def open_bus(
         yield Bus(session, link.robot, link.security, lossless=link.lossless)
 
 
-__all__ = ["DEFAULT_ENDPOINT", "Bus", "Link", "Message", "Stamped", "open_bus", "topic_of", "wait_until"]
+__all__ = ["DEFAULT_ENDPOINT", "Bus", "Link", "open_bus", "wait_until"]

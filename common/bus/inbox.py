@@ -57,6 +57,11 @@ class RequestResult:
             return self.query.reply(ok=False, reason=f"the reply cannot be decoded: {error}")
 
 
+def is_message_counter(name: str) -> bool:
+    """Whether a counter of an inbox counts messages: its name is a key, or `OTHERS`. Requests have the query's name."""
+    return "/" in name or name == OTHERS
+
+
 class Inbox:
     """A bounded, thread-safe queue that counts every dropped entry.
 

@@ -36,7 +36,7 @@ ROLES: dict[str, str] = {
     "viewer-control": "the live page, whose visitors may drive",
     "operator": "people and tools that may drive, teleport, reset, record",
     "observer": "people and tools that only read",
-    "remote": "reports whether scans of a robot outside compose arrive",
+    "remote": "reports whether scans of a robot outside Docker Compose arrive",
     "replay": "publishes a recording in place of the robot's services",
 }
 EVERY_ROBOT = ("*",)

@@ -1,4 +1,4 @@
-"""Reports whether scans of a robot outside compose arrive."""
+"""Reports whether scans of a robot outside Docker Compose arrive."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SCAN_TIMEOUT_S = 5.0
 
 
 class RemoteSettings(ServiceSettings):
-    """Logs when scans of a robot outside compose arrive and when they stop. It publishes no scans itself.
+    """Logs when scans of a robot outside Docker Compose arrive and when they stop. It publishes no scans itself.
 
     Examples:
       python -m common.containers.remote_robot

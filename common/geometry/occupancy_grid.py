@@ -43,8 +43,8 @@ class OccupancyGrid(BaseModel):
     height: Annotated[int, Field(ge=1, le=MAX_CELLS)]  # cells along y
     resolution: Annotated[float, Field(allow_inf_nan=False, gt=0, le=1e3)]  # m, edge length of a cell
     origin: tuple[Coordinate, Coordinate, Angle]  # x m, y m, yaw rad in map of the lower left corner
-    cells: Annotated[str, Field(max_length=4 * MAX_CELLS)]
     # one byte per cell, row by row from the lower left, zlib, base64: 0 free, 100 occupied, 255 unknown
+    cells: Annotated[str, Field(max_length=4 * MAX_CELLS)]
 
     @classmethod
     def of(cls, values: Cells, resolution: float, origin: tuple[float, float, float]) -> OccupancyGrid:

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from common.geometry.outline_index import OutlineIndex
     from common.geometry.se2 import Array
 
-__all__ = ["NOT_YAML", "Box", "Circle", "Obstacle", "Start", "World", "known_worlds", "load_world", "save_world"]
+__all__ = ["Box", "Circle", "Obstacle", "Start", "World", "known_worlds", "load_world", "save_world"]
 
 FOLDER = Path(__file__).resolve().parents[2] / "worlds"
 
@@ -61,12 +61,12 @@ class World(WorldPart):
     boundary: Ring  # m, the walls; optional with a grid or floors
     obstacles: Annotated[list[Obstacle], Field(max_length=10_000)] = []  # noqa: RUF012 - pydantic copies it
     start: Start | None = None
-    grid: Annotated[OccupancyGrid | None, Field(exclude_if=lambda grid: grid is None)] = None
     # a ROS map; left out if there is none
-    floors: Annotated[list[Floor], Field(max_length=100, exclude_if=lambda floors: not floors)] = []  # noqa: RUF012
+    grid: Annotated[OccupancyGrid | None, Field(exclude_if=lambda grid: grid is None)] = None
     # side by side in map
-    lifts: Annotated[list[Lift], Field(max_length=1000, exclude_if=lambda lifts: not lifts)] = []  # noqa: RUF012
+    floors: Annotated[list[Floor], Field(max_length=100, exclude_if=lambda floors: not floors)] = []  # noqa: RUF012
     # places x m, y m of a lift by floor, in the floor's frame
+    lifts: Annotated[list[Lift], Field(max_length=1000, exclude_if=lambda lifts: not lifts)] = []  # noqa: RUF012
 
     @model_validator(mode="before")
     @classmethod
@@ -248,7 +248,7 @@ class World(WorldPart):
         problem = lack_of_room(float(self.clearance(place[:2])[0]), radius)
         return f"{place_text(self.floors, place)} in {self.name} {problem}"
 
-    def clearances(self, x: Array, y: Array) -> Array:
+    def clearance_on_lattice(self, x: Array, y: Array) -> Array:
         """(len(y), len(x)) `clearance` in m at the nodes x, y of a lattice in map, ascending."""
         nodes = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
         if self.grid is None:
@@ -256,7 +256,7 @@ class World(WorldPart):
         clearance = 0.0 - self.grid.geometry.lattice_distances(FREE, x, y)  # subtracted, to avoid -0.0
         return self._limit_by_obstacles(nodes, clearance.ravel()).reshape(len(y), len(x))
 
-    def surface_distances(self, x: Array, y: Array, max_distance: float) -> Array:
+    def surface_distance_on_lattice(self, x: Array, y: Array, max_distance: float) -> Array:
         """(len(y), len(x)) distances in m to the nearest surface that a laser sees, negative behind surfaces.
 
         x and y are the nodes of a lattice in map, ascending. Distances are limited to ``max_distance``. A laser does
@@ -446,7 +446,7 @@ def _load(name: str, folder: Path, *, is_floor: bool = False) -> World:
 
 
 def world_name(path: Path) -> str:
-    """Name of the world in a file that does not state it."""
+    """Name of a world that is made from a file, such as a log, which does not state one."""
     return re.sub(r"[^\w.-]+", "-", path.resolve().stem)
 
 

@@ -3,7 +3,7 @@
 Frames: `map` is fixed to the world, `odom` drifts, `base_link` is the centre of the robot's round outline, `laser` is
 the scanner.
 A new field gets a default; a field never changes its type. docs/messages.md is generated from the docstrings and the
-comments beside the fields.
+comments above and beside the fields.
 """
 
 from __future__ import annotations
@@ -75,8 +75,8 @@ class Scan(Stamped):
     ranges: ScanRanges  # (B >= 2,) m; +inf is nothing within range_max, -inf too close (REP-117), 0 not measured
     mount: Pose = Pose(x=0.0, y=0.0)  # scanner in base_link
     scan_time: NotNegative = 0.0  # s, between scans
-    time_increment: Annotated[float, Field(ge=-1, le=1)] = 0.0  # s, between beams; negative if the last was measured
-    # first; 0: at once, or unknown
+    # s, between beams; negative if the last was measured first; 0: at once, or unknown
+    time_increment: Annotated[float, Field(ge=-1, le=1)] = 0.0
     frame_id: Name = "laser"
     sigma: Distance = 0.0  # m, standard deviation of a range; unknown if both sigmas are 0
     sigma_relative: Annotated[float, Field(ge=0, le=1)] = 0.0  # part proportional to the range, added in quadrature
@@ -157,8 +157,8 @@ class Belief(Stamped):
     free_energy: Finite | None = None  # nats, accuracy + complexity
     accuracy: Finite | None = None  # nats, negative log-likelihood -ln p(o | pose): smaller is better
     complexity: Finite | None = None  # nats, divergence of the posterior from the prior
-    hypotheses: Annotated[list[BeliefHypothesis], Field(max_length=64)] = []  # noqa: RUF012
     # best first; the first one is at `pose`
+    hypotheses: Annotated[list[BeliefHypothesis], Field(max_length=64)] = []  # noqa: RUF012
     probability: Annotated[float, Field(ge=0, le=1)] | None = None  # that `pose` is within 0.2 m and 5 deg of the truth
     protection: Floats | None = None  # (3,) m, m, rad in base_link: error bounds, exceeded in 1 of 10^4 scans
     estimator: Name = ""
@@ -193,8 +193,8 @@ class Map(Stamped):
     grid: OccupancyGrid  # occupied, free and unknown cells
     poses: Poses  # (K, 3) base_link in map, key scans in order of time
     closures: Points = np.zeros((0, 2), np.float32)  # (2 C, 2) m in map, both ends of each loop closure
-    connected: Bytes = np.zeros(0, np.uint8)  # (N,) 1 for each key scan so far that is connected to the map, and so in
-    # poses, else 0; empty: all are
+    # (N,) 1 for each key scan so far that is connected to the map, and so in poses, else 0; empty: all are
+    connected: Bytes = np.zeros(0, np.uint8)
     frame_id: Name = "map"
 
     @property
@@ -269,8 +269,9 @@ class PolicyEnergy(Message):
     """Expected free energy of the chosen motion, in nats: risk + ambiguity - pose_information - place_information."""
 
     risk: Finite  # of distance to go, closeness to obstacles and changes of velocity
-    ambiguity: Finite  # entropy of the pose expected along the way; with several hypotheses, mean entropy of the beams
-    # predicted at the end of the way
+    # entropy of the pose expected along the way; with several hypotheses, mean entropy of the beams predicted at the
+    # end of the way
+    ambiguity: Finite
     pose_information: Finite  # expected gain about the pose within a place; negative: a loss
     place_information: Finite  # expected gain about which hypothesis is true
     probability: Annotated[float, Field(ge=0, le=1)]  # among the motions compared, softmax(-5000 G)
@@ -279,8 +280,9 @@ class PolicyEnergy(Message):
 class Exploration(Message):
     """Progress of the exploration of an unknown building."""
 
-    phase: Literal["exploring", "returning", "finished", "failed"]  # finished: all is seen, and the robot is back;
-    # failed: it cannot get back, or cannot plan a path to what is left; the status says why
+    # finished: all is seen, and the robot is back; failed: it cannot get back, or cannot plan a path to what is left;
+    # the status says why
+    phase: Literal["exploring", "returning", "finished", "failed"]
     seq: Count  # of the goal that requested it
     area: NotNegative  # m², free space in the map
     path: NotNegative  # m, driven since it began
@@ -289,8 +291,8 @@ class Exploration(Message):
 class Status(Stamped):
     """What the controller does, and why."""
 
-    state: Literal["idle", "navigating", "reached", "blocked", "lost", "manual", "exploring"]
     # exploring: to find its pose, or unknown space
+    state: Literal["idle", "navigating", "reached", "blocked", "lost", "manual", "exploring"]
     reason: Text = ""
     refused: bool = False  # the goal cannot be reached; else, blocked is temporary
     goal: Pose | None = None  # base_link in map
@@ -317,7 +319,9 @@ class Preference(Stamped):
     resolution: PositiveDistance  # m, edge length of a cell
     width: Annotated[int, Field(ge=1, le=MAX_FIELD_SIDE)]  # cells along x
     height: Annotated[int, Field(ge=1, le=MAX_FIELD_SIDE)]  # cells along y
-    distance: Costs  # (height * width,) m, path to the goal, row by row along x; +inf: unreachable
+    # (height * width,) m, cost of the path to the goal: its length, where metres near walls or without knowing the pose
+    # count more; row by row along x; +inf: unreachable
+    distance: Costs
     frame_id: Name = "map"
 
     @model_validator(mode="after")

@@ -176,18 +176,19 @@ def comments(model: type[BaseModel]) -> dict[str, str]:
 
 
 def _comments(model: type[BaseModel]) -> dict[str, str]:
-    """Comments of a class's own fields: at the end of the field's line, and on the line below it."""
+    """Comments of a class's own fields: on the lines above the field, and at the end of its line."""
     lines = inspect.getsource(model).splitlines()
     body = ast.parse("\n".join(lines)).body[0]
     assert isinstance(body, ast.ClassDef)  # noqa: S101 - for the type checker
     found: dict[str, str] = {}
     for node in body.body:
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.end_lineno is not None:
-            rest_of_line, next_line = lines[node.end_lineno - 1][node.end_col_offset :], (*lines, "")[node.end_lineno]
-            texts = [
-                part.split("#", 1)[1].strip() for part in (rest_of_line, next_line) if part.lstrip().startswith("#")
-            ]
-            found[node.target.id] = " ".join(t for t in texts if not t.startswith("noqa"))
+            first = node.lineno - 1  # index of the first line of the field and its comments
+            while lines[first - 1].lstrip().startswith("#"):
+                first -= 1
+            rest_of_line = lines[node.end_lineno - 1][node.end_col_offset :]
+            texts = [line.partition("#")[2].strip() for line in (*lines[first : node.lineno - 1], rest_of_line)]
+            found[node.target.id] = " ".join(text for text in texts if text and not text.startswith("noqa"))
     return found
 
 

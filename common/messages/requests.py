@@ -1,7 +1,7 @@
 """Requests to queryables and their replies.
 
 A new field gets a default; a field never changes its type. docs/messages.md is generated from the docstrings and the
-comments beside the fields.
+comments above and beside the fields.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class PoseRequest(Request):
 class LocaliseRequest(Request):
     """Restart localisation, from a known pose or globally."""
 
-    pose: Pose | None = None  # base_link in the frame of map_id; nil searches the whole map
+    pose: Pose | None = None  # base_link in the frame of map_id; nil: anywhere (preset paper: its initial pose)
     heading_known: bool = True  # false: pose.yaw is unknown
     map_id: Name = ""  # a floor; empty: map
 
@@ -54,7 +54,7 @@ class ResetRequest(Request):
 
 
 class SpeedRequest(Request):
-    """Set the speed of the simulation's clock in realtime pace."""
+    """Set the speed of the clock of a simulator whose setting `pace` is `realtime`."""
 
     factor: Annotated[float, Field(allow_inf_nan=False, ge=0.1, le=20)]  # times real time
 
@@ -110,8 +110,8 @@ class PlayerRequest(Request):
     """Control a running replay."""
 
     action: Literal["pause", "resume", "step", "seek", "rate", "status"]  # step plays to the end of a scan and pauses
-    value: Finite = 0.0
     # seek: s from the start; rate: times the original speed, 0: maximum; step: number of scans
+    value: Finite = 0.0
 
 
 class PlayerReply(Reply):
@@ -169,8 +169,8 @@ class ConfigReply(Reply):
 
     service: Name = ""
     config: Text = ""  # the settings as JSON
-    versions: dict[str, str] = {}  # noqa: RUF012
     # of Python and packages, by name
+    versions: dict[str, str] = {}  # noqa: RUF012
     protocol: Count = 0  # version of the messages; 0: unknown
     host: Name = ""
     uptime: NotNegative = 0.0  # s of wall time

@@ -9,6 +9,8 @@ from common.messages import definitions as m
 from common.messages import requests as r
 
 ROOT = "presage"
+ROBOT_NAME_PATTERN = r"[A-Za-z0-9_.-]{1,64}"  # the second part of a key
+SCAN_RATE_HZ = 15  # nominal rate of the topics that are published once for each scan
 # Roles as named in certificates, described in common/bus/security.py. The role of a service has the service's name.
 CONTROL_ROLES = ("operator", "viewer-control")  # may move the robot, delete data, or change what runs
 SERVICE_ROLES = (
@@ -28,7 +30,7 @@ class Topic:
 
     name: str
     message: type[m.Stamped]
-    publisher: str  # the service or services that publish it
+    publisher: str  # the service that publishes it; if there are several, only a text for tables and messages
     rate: float  # nominal, Hz; 0 if it is published on events
     queue: Literal["newest", "all"]  # which messages a slow receiver keeps; the recorder always keeps all
     recorded: bool = True
@@ -64,26 +66,37 @@ SCAN = Topic(
     "scan",
     m.Scan,
     "simulator",
-    15,
+    SCAN_RATE_HZ,
     "newest",
     publisher_roles=ROBOT_ROLES,
     about="the laser scan, stamped with the time of the beam that was measured first",
 )
 ODOM = Topic(
-    "odom", m.Odom, "simulator", 15, "newest", publisher_roles=ROBOT_ROLES, about="dead reckoning, which drifts"
+    "odom",
+    m.Odom,
+    "simulator",
+    SCAN_RATE_HZ,
+    "newest",
+    publisher_roles=ROBOT_ROLES,
+    about="dead reckoning, which drifts",
 )
-TRUTH = Topic("truth", m.Truth, "simulator", 15, "newest", about="true state, from a simulator only")
+TRUTH = Topic("truth", m.Truth, "simulator", SCAN_RATE_HZ, "newest", about="true state, from a simulator only")
 BELIEF = Topic(
     "belief",
     m.Belief,
     "estimator",
-    15,
+    SCAN_RATE_HZ,
     "newest",
     publisher_roles=("estimator", "mapper"),
     about="posterior of the pose, with the stamp of the scan; while mapping, from the mapper",
 )
 PREDICTION = Topic(
-    "prediction", m.Prediction, "estimator", 15, "newest", about="the scan predicted for the belief, with its stamp"
+    "prediction",
+    m.Prediction,
+    "estimator",
+    SCAN_RATE_HZ,
+    "newest",
+    about="the scan predicted for the belief, with its stamp",
 )
 MAP = Topic(
     "map",
@@ -105,7 +118,7 @@ CMD_VEL = Topic(
     "cmd_vel",
     m.CmdVel,
     "controller",
-    15,
+    SCAN_RATE_HZ,
     "newest",
     about="velocity command, with the stamp of the scan that it responds to",
 )
@@ -130,7 +143,9 @@ DRIVE = Topic(
     publisher_roles=CONTROL_ROLES,
     about="velocity steered by hand, which overrides the goal",
 )
-STATUS = Topic("status", m.Status, "controller", 15, "newest", latched=True, about="what the controller does, and why")
+STATUS = Topic(
+    "status", m.Status, "controller", SCAN_RATE_HZ, "newest", latched=True, about="what the controller does, and why"
+)
 PLAN = Topic("plan", m.Plan, "controller", 0, "newest", about="planned path, and obstacles outside the map")
 PREFERENCE = Topic(
     "preference",
@@ -278,8 +293,9 @@ def topic_of(key: str) -> Topic | None:
 
 
 def expected_rate(topic: Topic, scan_time: float) -> float:
-    """Rate of a topic in Hz. Topics with the nominal rate of scans have that of a scanner with this ``scan_time`` in s.
+    """Expected rate of a topic in Hz.
 
-    If that is 0, it is not known, and the nominal rate is returned.
+    Topics published once for each scan follow the scanner's period ``scan_time`` (s); if that is 0, it is unknown, and
+    the nominal rate is returned.
     """
-    return 1 / scan_time if scan_time > 0 and topic.rate == SCAN.rate else topic.rate
+    return 1 / scan_time if scan_time > 0 and topic.rate == SCAN_RATE_HZ else topic.rate

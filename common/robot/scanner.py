@@ -28,8 +28,8 @@ class Scanner(BaseModel):
     sigma: Distance  # m, standard deviation of a range
     mount: tuple[Coordinate, Coordinate, Angle] = (0.0, 0.0, 0.0)  # x m, y m, yaw rad in base_link
     sigma_relative: Annotated[float, Field(ge=0, le=1)] = 0.0  # part proportional to the range, added in quadrature
-    first: Annotated[float, Field(ge=-2 * np.pi, le=2 * np.pi)] | None = None
     # rad, first beam in the scanner's frame, counter-clockwise; nil: -fov / 2
+    first: Annotated[float, Field(ge=-2 * np.pi, le=2 * np.pi)] | None = None
     upside_down: bool = False  # a roll of 180 deg: beams run clockwise seen from above
 
     @model_validator(mode="after")

@@ -18,8 +18,9 @@ from pydantic_settings import CliSuppress
 from common.bus.bus import DEFAULT_ENDPOINT, Link, open_bus
 from common.errors import UserError
 from common.log import Logger, begin_logging, logger, report_failure, set_up_logging
+from common.names import split_names
 from common.router.refusals import LOG_FILTER, Refusals, capture_zenoh_log
-from common.runtime.config import ServiceSettings, load_settings, split_endpoints
+from common.runtime.config import ServiceSettings, load_settings
 
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 STOP_PERIOD_S = 0.1  # of looking for a signal
@@ -51,7 +52,7 @@ class RouterSettings(ServiceSettings):
 
     def link(self) -> Link:
         """Parameters of a session in router mode; raises UserError if the credentials are not a router's."""
-        connect, listen = split_endpoints(self.connect), split_endpoints(self.listen)
+        connect, listen = tuple(split_names(self.connect)), tuple(split_names(self.listen))
         security = self.credentials()
         if security is not None and security.member.role != self.service:
             raise UserError(

@@ -31,12 +31,13 @@ from pydantic_settings import (
 from common.bus.bus import DEFAULT_ENDPOINT, Link
 from common.bus.security import Credentials, read_credentials
 from common.errors import UserError, first_fault, first_problem
+from common.messages.topics import ROBOT_NAME_PATTERN
+from common.names import split_names
 from common.yaml_text import NOT_YAML, parse_yaml
 
 _file_values: ContextVar[dict[str, Any]] = ContextVar("_file_values")
 S = TypeVar("S", bound="ServiceSettings")
 M = TypeVar("M", bound=BaseModel)
-ROBOT_NAME_PATTERN = r"^[A-Za-z0-9_.-]{1,64}$"  # a part of each key, without the wildcards of zenoh
 METRICS_PATTERN = r"^$|^(\[[0-9A-Fa-f:.]+\]:|[^\s:\[\]]+:)?\d{1,5}$"  # PORT, HOST:PORT, [IPv6]:PORT, or empty
 
 
@@ -53,13 +54,16 @@ class ServiceSettings(BaseSettings):
     )
     service: ClassVar[str] = "service"
     program: ClassVar[str] = ""  # shown in --help; if empty, python -m services.NAME
-    # Each field is set by PRESAGE_<SERVICE>_<FIELD> and in the service's section of the file. These are set only there,
-    # the others also for all services, by PRESAGE_<FIELD> and at the top level of the file.
+    # Fields that are set only for this service: by PRESAGE_<SERVICE>_<FIELD> or in its section of the file. All other
+    # fields can also be set for all services, by PRESAGE_<FIELD> or at the top level of the file.
     private: ClassVar[frozenset[str]] = frozenset()
 
     robot: Annotated[
         str,
-        Field(pattern=ROBOT_NAME_PATTERN, description="name of the robot: the topics are presage/ROBOT/TOPIC"),
+        Field(
+            pattern=rf"^{ROBOT_NAME_PATTERN}$",
+            description="name of the robot: the topics are presage/ROBOT/TOPIC",
+        ),
     ] = "robot"
     connect: Annotated[
         str, Field(description="zenoh endpoints to connect to, comma-separated; empty for no connection")
@@ -102,8 +106,8 @@ class ServiceSettings(BaseSettings):
         """Parameters of the zenoh session; raises UserError if the credentials cannot be read."""
         return Link(
             self.robot,
-            split_endpoints(self.connect),
-            split_endpoints(self.listen),
+            tuple(split_names(self.connect)),
+            tuple(split_names(self.listen)),
             lossless=self.lossless,
             security=self.credentials(),
             insecure=self.insecure,
@@ -134,11 +138,6 @@ class ServiceSettings(BaseSettings):
         environment |= own
         file = InitSettingsSource(settings_cls, _file_values.get({}))
         return init_settings, InitSettingsSource(settings_cls, environment), file
-
-
-def split_endpoints(text: str) -> tuple[str, ...]:
-    """Splits comma-separated endpoints."""
-    return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
 def join_negative_values(argv: list[str]) -> list[str]:

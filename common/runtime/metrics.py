@@ -15,7 +15,7 @@ from prometheus_client import CollectorRegistry, Gauge, Histogram, Info, Process
 from prometheus_client.core import CounterMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from common.bus.inbox import OTHERS
+from common.bus.inbox import is_message_counter
 from common.messages.definitions import Belief, Health, Stamped, Status
 from common.messages.topics import ROOT
 from common.versions import PROTOCOL, versions
@@ -258,7 +258,7 @@ class ServiceMetrics(Collector):
             "undecodable": {key: undecodable.get(key, 0) + oversized[key] for key in received},
         }
         for name, by_key in counters.items():
-            requests = [((*self._labels, key), number) for key, number in by_key.items() if not _is_key(key)]
+            requests = [((*self._labels, key), number) for key, number in by_key.items() if not is_message_counter(key)]
             yield _counter(f"presage_messages_{name}", self._by_topic(by_key))
             yield _counter(f"presage_requests_{name}", requests)
         yield _counter("presage_messages_published", self._by_topic(counts.published))
@@ -274,7 +274,7 @@ class ServiceMetrics(Collector):
 
     def _by_topic(self, by_key: Mapping[str, float]) -> Values:
         for key, number in by_key.items():
-            if _is_key(key):
+            if is_message_counter(key):
                 robot, topic = topic_labels(key)
                 yield (robot, self.service, topic), number
 
@@ -285,11 +285,6 @@ def _counter(name: str, values: Values) -> CounterMetricFamily:
     for labels, value in values:
         metric.add_metric(labels, value)
     return metric
-
-
-def _is_key(name: str) -> bool:
-    """Whether a counter's name is a message's key, or `OTHERS`. Requests are counted under the name of the query."""
-    return "/" in name or name == OTHERS
 
 
 def table() -> str:

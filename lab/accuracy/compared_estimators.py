@@ -64,7 +64,7 @@ class LearnedSurfaces:
     bounds: tuple[float, float, float, float]  # m: x and y of the lower left corner, and of the upper right one
     name: str
 
-    def surface_distances(self, x: Array, y: Array, max_dist: float) -> Array:
+    def surface_distance_on_lattice(self, x: Array, y: Array, max_dist: float) -> Array:
         """Signed distances (Y, X) m at the nodes with coordinates x (X,) and y (Y,) m, at most ``max_dist``."""
         (x0, y0), step = self.field.origin, self.field.resolution
         nodes = np.meshgrid((y - y0) / step, (x - x0) / step, indexing="ij")

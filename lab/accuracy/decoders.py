@@ -92,8 +92,8 @@ def paper(epochs: int) -> Learn:
     return learn
 
 
-def bench_decoders(world: str, samples: int, steps: int, seed: int, json_file: Path | None, console: Console) -> int:
-    """Trains and evaluates the models, prints a table and writes ``json_file`` if given. Returns exit status 0."""
+def bench_decoders(world: str, samples: int, steps: int, seed: int, json_file: Path | None, console: Console) -> None:
+    """Trains and evaluates the models, prints a table and writes ``json_file`` if given."""
     check_file(json_file, "--json")
     any_heading, one_heading = TrainingScans(world, samples, seed), TrainingScans(world, samples, seed, HEADING)
     rows = [
@@ -106,7 +106,6 @@ def bench_decoders(world: str, samples: int, steps: int, seed: int, json_file: P
         "causes it"
     )
     write_json(json_file, {"rows": rows, "samples": samples, "network_steps": steps, **provenance(seed)})
-    return 0
 
 
 def _learners(steps: int) -> dict[str, Learn]:

@@ -63,8 +63,8 @@ def localisation(world: str, beams: int, trials: int, scans: int, seed: int, con
 
 def bench_localisation(
     world: str, beams: int, trials: int, scans: int, seed: int, json_file: Path | None, console: Console
-) -> int:
-    """Runs the benchmark, prints the result and writes it to ``json_file`` if given. Returns exit status 0."""
+) -> None:
+    """Runs the benchmark, prints the result and writes it to ``json_file`` if given."""
     result = localisation(world, beams, trials, scans, seed, console)
     mean, std = (result[f"position_error_of_found_{k}_m"] for k in ("mean", "std"))
     console.print(
@@ -74,4 +74,3 @@ def bench_localisation(
         f"reported as tracking: {result['claimed_tracking']}, of these wrong: {result['claimed_tracking_but_wrong']}"
     )
     write_json(json_file, result)
-    return 0

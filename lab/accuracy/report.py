@@ -48,7 +48,6 @@ HEADS = ("estimator", "found (95 %)", "wrong", "median", "RMS (95 %)", "NEES", "
 
 def bench_accuracy(
     worlds: str,
-    beams: str,
     estimators: str,
     tasks: str,
     trials: int,
@@ -62,7 +61,7 @@ def bench_accuracy(
     *,
     markdown: bool = False,
     scanner: str = "tim571",
-) -> int:
+) -> None:
     """Runs the benchmark, prints a table per world and scanner, and writes ``json_file`` and ``figure`` if given.
 
     Each of ``seeds`` consecutive seeds has its own places, noise and paths; the rows are over all of them.
@@ -71,7 +70,7 @@ def bench_accuracy(
     unknown = [name for name in chosen if name not in COMPARED_ESTIMATORS]
     if unknown:
         raise UserError(f"no estimator {unknown[0]!r} in this benchmark: choose from {', '.join(COMPARED_ESTIMATORS)}")
-    scanners = scanners_of(scanner, beams)
+    scanners = scanners_of(scanner)
     wanted = tuple(tasks.split(",")) if tasks else TASKS
     if missing := [name for name in wanted if name not in TASKS]:
         raise UserError(f"no task {missing[0]!r}: choose from {', '.join(TASKS)}")
@@ -96,23 +95,14 @@ def bench_accuracy(
     write_json(json_file, {"rows": rows, "trials": trials, "minutes": minutes, "seeds": seeds, **provenance(seed)})
     if figure is not None:
         _draw(rows, figure)
-    return 0
 
 
-def scanners_of(names: str, beams: str) -> list[Scanner]:
-    """Every named scanner with every number of beams. Raises UserError for unknown names or malformed numbers.
+def scanners_of(names: str) -> list[Scanner]:
+    """The scanners of comma-separated names or files; tim571 has 622 beams, as in the paper.
 
-    If ``beams`` is empty, a scanner keeps its own number of beams; tim571 gets 622, as in the paper.
+    Raises UserError for unknown names.
     """
-    try:
-        counts = [int(part) for part in beams.split(",") if part]
-    except ValueError:
-        raise UserError(f"--beams {beams!r}: give comma-separated whole numbers, such as 622,811") from None
-    scanners = []
-    for name in names.split(","):
-        name_counts: list[int | None] = [*counts] or [622 if name == "tim571" else None]
-        scanners += [build_scanner(name, count) for count in name_counts]
-    return scanners
+    return [build_scanner(name, 622 if name == "tim571" else None) for name in names.split(",")]
 
 
 def _by_title(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:

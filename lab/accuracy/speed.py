@@ -25,8 +25,8 @@ TRACKING_UPDATES = 300
 SKIPPED_UPDATES = 5  # at the start of the path, while caches warm up
 
 
-def bench_speed(world: str, beams: str, seed: int, json_file: Path | None, console: Console) -> int:
-    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
+def bench_speed(world: str, beams: str, seed: int, json_file: Path | None, console: Console) -> None:
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given."""
     check_file(json_file, "--json")
     load_world(world)
     jobs = [(name, world, int(count), seed) for count in beams.split(",") for name in ESTIMATORS]
@@ -53,7 +53,6 @@ def bench_speed(world: str, beams: str, seed: int, json_file: Path | None, conso
         f"required of precise: {LIMITS['tracking']:g} ms tracking, {LIMITS['from nothing']:g} ms for a global search"
     )
     write_json(json_file, {"rows": rows, "limits_ms": LIMITS, **provenance(seed)})
-    return 0
 
 
 def measure(estimator: str, world_name: str, beams: int, seed: int) -> dict[str, Any]:

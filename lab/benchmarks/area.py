@@ -9,7 +9,7 @@ import time
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -39,7 +39,6 @@ SCANS = 300  # from which the field of each building is learned
 CELL_M = 0.04
 TYPICAL_BUILDING_M2 = 150.0
 GAP_CELLS = 10  # between buildings
-SHARES = ("found", "wrongly_tracking", "ambiguous")
 
 
 @dataclass(frozen=True)
@@ -69,10 +68,19 @@ class Site:
         return sum(building.area for building in self.buildings)
 
 
+class SearchOutcome(NamedTuple):
+    """Result of a search from one scan."""
+
+    found: bool
+    wrongly_tracking: bool
+    ambiguous: bool
+    seconds: float  # processor time
+
+
 def bench_area(
     areas: str, places: int, moved: float, seed: int, out: Path, workers: int, json_file: Path | None, console: Console
-) -> int:
-    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
+) -> None:
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given."""
     check_file(json_file, "--json")
     make_folder(out)
     wanted = sorted(float(area) for area in areas.split(","))
@@ -89,7 +97,6 @@ def bench_area(
         printed.add_row(*(f"{value:.4g}" for value in row.values()))
     console.print(printed)
     write_json(json_file, {"rows": rows, **provenance(seed)})
-    return 0
 
 
 def _learn_buildings(area: float, seed: int, out: Path, workers: int, console: Console) -> list[LearnedBuilding]:
@@ -158,18 +165,19 @@ def _measure(site: Site, places: int, moved: float, seed: int, console: Console)
     estimator = PreciseEstimator(
         site.model, site.seeds, np.array(SCANNER.mount), ScannerGeometry.of(SCANNER).likelihood()
     )
-    _trial(estimator, *_scan(site, moved, rng))  # a warm-up, as numba compiles now
+    _search(estimator, *_scan(site, moved, rng))  # a warm-up, as numba compiles now
     title = f"{site.area:.0f} m², {moved:.0%} moved"
-    trials = [
-        _trial(estimator, *_scan(site, moved, rng))
+    outcomes = [
+        _search(estimator, *_scan(site, moved, rng))
         for _ in track(range(places), title, console=console, transient=True)
     ]
-    values = np.array(trials)
-    milliseconds = values[:, 3] * 1e3
+    milliseconds = [1e3 * outcome.seconds for outcome in outcomes]
     return {
         "area_m2": round(site.area),
         "moved": moved,
-        **dict(zip(SHARES, values[:, :3].mean(axis=0).tolist(), strict=True)),
+        "found": float(np.mean([outcome.found for outcome in outcomes])),
+        "wrongly_tracking": float(np.mean([outcome.wrongly_tracking for outcome in outcomes])),
+        "ambiguous": float(np.mean([outcome.ambiguous for outcome in outcomes])),
         "ms_median": float(np.median(milliseconds)),
         "ms_p95": float(np.quantile(milliseconds, 0.95)),
         "seeds": len(site.seeds.places),
@@ -206,11 +214,16 @@ def _scan(site: Site, moved: float, rng: np.random.Generator) -> tuple[Observati
     return scene.observe(scene.clean(pose[None])[0], 0.0), pose + np.append(site.offsets[k], 0.0)
 
 
-def _trial(estimator: PreciseEstimator, observation: Observation, truth: Array) -> tuple[float, ...]:
-    """Found, wrongly tracking and ambiguous (0 or 1), and seconds of the update."""
+def _search(estimator: PreciseEstimator, observation: Observation, truth: Array) -> SearchOutcome:
+    """Localises one scan without a start pose."""
     estimator.restart()
     began = time.process_time()
     posterior = estimator.update(observation)
     seconds = time.process_time() - began
     found = is_at(posterior.pose, truth)
-    return found, posterior.state == "tracking" and not found, posterior.state == "ambiguous", seconds
+    return SearchOutcome(
+        found=found,
+        wrongly_tracking=posterior.state == "tracking" and not found,
+        ambiguous=posterior.state == "ambiguous",
+        seconds=seconds,
+    )

@@ -86,8 +86,8 @@ def cpu_seconds(stack: Stack, names: Sequence[str]) -> dict[str, float]:
     return {name: used.user + used.system for name, used in times.items()}
 
 
-def bench_cpu(seconds: float, beams: int, json_file: Path | None, console: Console) -> int:
-    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
+def bench_cpu(seconds: float, beams: int, json_file: Path | None, console: Console) -> None:
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given."""
     check_file(json_file, "--json")
     result = measure(seconds, beams)
     title = f"{beams} beams, {result['beliefs_hz']:.1f} beliefs/s, {seconds:g} s"
@@ -107,4 +107,3 @@ def bench_cpu(seconds: float, beams: int, json_file: Path | None, console: Conso
         **provenance(),
     }
     write_json(json_file, result)
-    return 0

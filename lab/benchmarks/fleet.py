@@ -17,7 +17,7 @@ from common.bus.bus import open_bus
 from common.errors import UserError
 from common.geometry.world import load_world
 from lab.benchmarks.fleet_load import AnswerStatistics, FleetLoad
-from lab.benchmarks.fleet_table import DEPLOYMENTS, show
+from lab.benchmarks.fleet_table import DEPLOYMENTS, ONE_PROCESS, show
 from presage.session.stack import Stack
 from presage.terminal.output import check_file, provenance, write_json
 
@@ -62,7 +62,7 @@ class DeploymentResult:
         cpu_ms = min(window["cpu_ms_per_scan"] for window in self.windows if window["robots"] == busiest)
         fewest, most = min(self.memory_mb), max(self.memory_mb)
         per_robot = self.memory_mb[most] / most
-        if self.deployment == DEPLOYMENTS[0]:
+        if self.deployment == ONE_PROCESS:
             per_robot = (self.memory_mb[most] - self.memory_mb[fewest]) / max(1, most - fewest)
         return {
             "estimator": self.estimator,
@@ -94,7 +94,7 @@ class EstimatorDeployment:
         if count <= self.ready:
             return
         arguments = ["--world", self.plan.world, "--estimator", self.result.estimator]
-        if self.result.deployment == DEPLOYMENTS[0]:
+        if self.result.deployment == ONE_PROCESS:
             if not self.ready:
                 names = ",".join(robot.name for robot in self.load.robots)
                 self.stack.start("estimator", *arguments, "--robots", names)
@@ -190,7 +190,7 @@ def measure(estimator: str, deployment: str, plan: FleetPlan, console: Console) 
             load = FleetLoad(bus, load_world(plan.world), plan.beams, plan.rate, plan.max_robots, plan.seed)
             estimators = EstimatorDeployment(stack, load, plan, result, cores[-1])
             estimators.prepare(1)
-            if deployment == DEPLOYMENTS[0]:
+            if deployment == ONE_PROCESS:
                 # Measures the memory of all robots; a robot without scans takes no processor time.
                 estimators.prepare(plan.max_robots)
             result.bytes = load.message_sizes()
@@ -228,8 +228,8 @@ def _pin_threads(process: psutil.Process, cores: set[int]) -> None:
             os.sched_setaffinity(thread.id, cores)
 
 
-def bench_fleet(estimators: str, plan: FleetPlan, json_file: Path | None, console: Console) -> int:
-    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
+def bench_fleet(estimators: str, plan: FleetPlan, json_file: Path | None, console: Console) -> None:
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given."""
     check_file(json_file, "--json")
     rows = [
         measure(name, deployment, plan, console).row() for name in estimators.split(",") for deployment in DEPLOYMENTS
@@ -247,4 +247,3 @@ def bench_fleet(estimators: str, plan: FleetPlan, json_file: Path | None, consol
             **provenance(plan.seed),
         },
     )
-    return 0

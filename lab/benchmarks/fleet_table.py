@@ -10,7 +10,7 @@ from rich.table import Table
 if TYPE_CHECKING:
     from lab.benchmarks.fleet import FleetPlan
 
-DEPLOYMENTS = ("one process", "one each")
+ONE_PROCESS, ONE_EACH = DEPLOYMENTS = ("one process", "one each")
 LARGE_FLEET = 1000  # robots, for the extrapolation
 CORE_LOAD = 0.7  # share of a core that one would plan to use
 MAX_OTHER_LOAD = 0.05  # share of the core that other processes may use without a warning
@@ -41,7 +41,7 @@ def show(rows: list[dict[str, Any]], plan: FleetPlan, console: Console) -> dict[
         highlight=False,
     )
     for row in rows:
-        if row["deployment"] == DEPLOYMENTS[0]:
+        if row["deployment"] == ONE_PROCESS:
             console.print(_large_fleet_note(row, plan.rate), highlight=False)
     _warn_of_other_load(rows, console)
     return {name: _compare_deployments(name, rows, console) for name in dict.fromkeys(row["estimator"] for row in rows)}

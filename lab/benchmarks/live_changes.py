@@ -13,9 +13,14 @@ from typing import Any
 import numpy as np
 
 from lab.accuracy.scenes import Scene
+from lab.benchmarks.building_drives import (
+    building_of,
+    drive_for,
+    errors_of_single_scans,
+    found_of,
+    learn_at_true_poses,
+)
 from lab.benchmarks.live_refinement import drive_and_learn
-from lab.benchmarks.refinement import drive_for
-from lab.benchmarks.visits import building_of, errors_of_single_scans, found_of, learn_at_true_poses
 from lab.experiments.results import markdown
 from lab.integrity.cases import BEAMS
 from lab.integrity.changes import move_furniture

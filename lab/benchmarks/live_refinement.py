@@ -16,9 +16,9 @@ import psutil
 
 from common.geometry.se2 import Array
 from lab.accuracy.scenes import Scene
+from lab.benchmarks.building_drives import PERIOD_S, building_of, drive_for, make_estimator
 from lab.benchmarks.mapping import fitted
-from lab.benchmarks.refinement import DRIVE_SEED, ROUGH_SEED, TEST_SECONDS, TEST_SEED, drive_for
-from lab.benchmarks.visits import PERIOD_S, building_of, make_estimator
+from lab.benchmarks.refinement import DRIVE_SEED, ROUGH_SEED, TEST_SECONDS, TEST_SEED
 from lab.experiments.results import markdown, millimetres
 from lab.integrity.cases import BEAMS, START_DEVIATION
 from lab.integrity.maps import noisy_grid

@@ -35,8 +35,8 @@ def bench_mapping(
     seconds: float,
     json_file: Path | None,
     console: Console,
-) -> int:
-    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
+) -> None:
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given."""
     check_file(json_file, "--json")
     if (log is None) != (relations is None):
         raise UserError("--log and --relations belong together: give both, or neither")
@@ -52,7 +52,6 @@ def bench_mapping(
         raise UserError("nothing to map: give --worlds, or --log and --relations")
     _print(rows, console)
     write_json(json_file, {"rows": rows, **provenance(seed)})
-    return 0
 
 
 def relation_errors(poses: Array, stamps: Array, relations: Array) -> Errors:

@@ -137,8 +137,8 @@ def _ranges_in_crowd(scene: Scene, truth: Array) -> Array:
     )
 
 
-def bench_mapping_faults(worlds: int, seed: int, seconds: float, json_file: Path | None, console: Console) -> int:
-    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
+def bench_mapping_faults(worlds: int, seed: int, seconds: float, json_file: Path | None, console: Console) -> None:
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given."""
     check_file(json_file, "--json")
     rows = []
     for case in CASES:
@@ -149,7 +149,6 @@ def bench_mapping_faults(worlds: int, seed: int, seconds: float, json_file: Path
                     rows.append({"case": case, "seed": building, "odometry": odometry, **map_drive(drive, odometry)})
     print(table(rows))
     write_json(json_file, {"rows": rows, "seconds": seconds, **provenance(seed)})
-    return 0
 
 
 def map_drive(disturbed: DisturbedDrive, odometry: bool) -> dict[str, Any]:

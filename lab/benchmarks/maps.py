@@ -32,8 +32,8 @@ ROOM_WIDTH_M, DOOR_WIDTH_M = 6.0, 1.2
 
 def bench_map(
     world: str, size: int, beams: int, out: Path | None, seed: int, json_file: Path | None, console: Console
-) -> int:
-    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0.
+) -> None:
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given.
 
     Without ``world``, it makes a map of ``size`` by ``size`` cells in the folder ``out``, if that is given.
     """
@@ -50,7 +50,6 @@ def bench_map(
         table.add_row(name, f"{value:.3g} {unit}" if value < 1000 else f"{value:.0f} {unit}")
     console.print(table)
     write_json(json_file, {"rows": [{"name": n, "value": v, "unit": u} for n, v, u in rows], **provenance(seed)})
-    return 0
 
 
 def measure(path: str, beams: int, seed: int) -> list[tuple[str, float, str]]:

@@ -90,8 +90,8 @@ def observation_us() -> float:
     return (time.process_time() - began) / MESSAGES * 1e6
 
 
-def bench_metrics(seconds: float, rounds: int, json_file: Path | None, console: Console) -> int:
-    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
+def bench_metrics(seconds: float, rounds: int, json_file: Path | None, console: Console) -> None:
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given."""
     check_file(json_file, "--json")
     unscraped, scraped = measure(seconds, rounds, console)
     table = Table(title=f"{rounds} x {seconds:g} s each, one scrape a second", title_justify="left")
@@ -118,4 +118,3 @@ def bench_metrics(seconds: float, rounds: int, json_file: Path | None, console: 
         highlight=False,
     )
     write_json(json_file, result)
-    return 0

@@ -9,15 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from rich.console import Console
 
 from common.geometry import se2
 from common.geometry.ros_map_writer import write_grid
 from common.geometry.se2 import Array
-from common.geometry.world import World, load_world
+from common.geometry.world import World, load_world, save_world
 from lab.accuracy.scenes import Scene
-from lab.benchmarks.visits import PERIOD_S, building_of, drive_through_rooms, write_drive_log
+from lab.benchmarks.building_drives import PERIOD_S, building_of, drive_for, write_drive_log
 from lab.experiments.results import markdown, millimetres, number
 from lab.experiments.trials import run_trials
 from lab.integrity.buildings import Building
@@ -51,8 +50,8 @@ class RefinementJob:
 
 def bench_refinement(
     worlds: int, seed: int, seconds: float, out: Path, json_file: Path | None, workers: int, console: Console
-) -> int:
-    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0.
+) -> None:
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given.
 
     The maps, logs and models are written to ``out``.
     """
@@ -64,7 +63,6 @@ def bench_refinement(
     rows = [row for result in results for row in result["rows"]]
     print(table(rows))
     write_json(json_file, {"rows": rows, "seconds": seconds, **provenance(seed)})
-    return 0
 
 
 def refine_and_test(job: RefinementJob) -> dict[str, Any]:
@@ -177,20 +175,12 @@ def _world_and_rough_maps(job: RefinementJob, building: Building) -> tuple[World
     return world, {**roughs, NOTHING: None}
 
 
-def drive_for(scene: Scene, building: Building, seconds: float) -> Array:
-    """Poses (N, 3), `PERIOD_S` apart, of a drive through all rooms, once or several times, until the time is up."""
-    count = round(seconds / PERIOD_S)
-    path = drive_through_rooms(scene, building, 1.0)
-    laps = [path, path[::-1]]  # forth and back
-    return np.concatenate([laps[k % 2] for k in range(1 + count // len(path))])[:count]
-
-
 def _write(folder: Path, world: World) -> Path:
     """Writes a map of the benchmark to a file."""
     if world.grid is not None:
         return write_grid(folder, world.name, world.grid)
     path = folder / f"{world.name}.yaml"
-    path.write_text(yaml.safe_dump(world.model_dump(mode="json", exclude_defaults=True)), encoding="utf-8")
+    path.write_text(save_world(world), encoding="utf-8")
     return path
 
 

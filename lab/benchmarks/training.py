@@ -39,8 +39,8 @@ class TrainingJob:
 
 def bench_training(
     models: str, seeds: int, samples: int | None, out: Path, json_file: Path | None, console: Console
-) -> int:
-    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0.
+) -> None:
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given.
 
     ``models`` are comma-separated names of model cards, all of them if empty. Each is trained with its own number of
     ``samples`` if that is None. The trained models are written to ``out``. Raises UserError for an unknown model.
@@ -66,7 +66,6 @@ def bench_training(
     ]
     print(table(rows))
     write_json(json_file, {"rows": rows, "seeds": seeds, **provenance()})
-    return 0
 
 
 def read_card(folder: Path, name: str) -> dict[str, Any]:

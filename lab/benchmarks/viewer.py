@@ -175,8 +175,8 @@ def _report(without: ViewerCost, viewed: ViewerCost, seconds: float, rounds: int
     }
 
 
-def bench_viewer(seconds: float, rounds: int, beams: int, json_file: Path | None, console: Console) -> int:
-    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
+def bench_viewer(seconds: float, rounds: int, beams: int, json_file: Path | None, console: Console) -> None:
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given."""
     check_file(json_file, "--json")
     result = measure(seconds, rounds, beams, console)
     table = Table(title=f"{beams} beams, {rounds} x {seconds:g} s each, one visitor", title_justify="left")
@@ -192,4 +192,3 @@ def bench_viewer(seconds: float, rounds: int, beams: int, json_file: Path | None
         highlight=False,
     )
     write_json(json_file, result)
-    return 0

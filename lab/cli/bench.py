@@ -44,7 +44,7 @@ def bench_viewer(seconds: Seconds = 20.0, rounds: Rounds = 3, json_file: Json = 
     """
     from lab.benchmarks.viewer import bench_viewer as run
 
-    raise typer.Exit(run(seconds, rounds, BEAMS, json_file, console))
+    run(seconds, rounds, BEAMS, json_file, console)
 
 
 @app.command("cpu")
@@ -55,7 +55,7 @@ def bench_cpu(seconds: Seconds = 60.0, json_file: Json = None) -> None:
     """
     from lab.benchmarks.cpu import bench_cpu as run
 
-    raise typer.Exit(run(seconds, BEAMS, json_file, console))
+    run(seconds, BEAMS, json_file, console)
 
 
 @app.command("map")
@@ -71,7 +71,7 @@ def bench_map(
     """
     from lab.benchmarks.maps import bench_map as run
 
-    raise typer.Exit(run(world, size, BEAMS, out, 0, json_file, console))
+    run(world, size, BEAMS, out, 0, json_file, console)
 
 
 @app.command("area")
@@ -89,7 +89,7 @@ def bench_area(
     """
     from lab.benchmarks.area import bench_area as run
 
-    raise typer.Exit(run(areas, places, moved, seed, out, worker_count(), json_file, console))
+    run(areas, places, moved, seed, out, worker_count(), json_file, console)
 
 
 @app.command("mapping")
@@ -110,7 +110,7 @@ def bench_mapping(
     """
     from lab.benchmarks.mapping import bench_mapping as run
 
-    raise typer.Exit(run(log, relations, worlds, seed, seconds, json_file, console))
+    run(log, relations, worlds, seed, seconds, json_file, console)
 
 
 @app.command("mapping-faults")
@@ -127,7 +127,7 @@ def bench_mapping_faults(
     """
     from lab.benchmarks.mapping_faults import bench_mapping_faults as run
 
-    raise typer.Exit(run(worlds, seed, seconds, json_file, console))
+    run(worlds, seed, seconds, json_file, console)
 
 
 @app.command("training")
@@ -150,7 +150,7 @@ def bench_training(
     """
     from lab.benchmarks.training import bench_training as run
 
-    raise typer.Exit(run(models, seeds, samples, out or Path("training"), json_file, console))
+    run(models, seeds, samples, out or Path("training"), json_file, console)
 
 
 @app.command("refinement")
@@ -169,7 +169,7 @@ def bench_refinement(
     """
     from lab.benchmarks.refinement import bench_refinement as run
 
-    raise typer.Exit(run(worlds, seed, seconds, out or Path("refinement"), json_file, worker_count(), console))
+    run(worlds, seed, seconds, out or Path("refinement"), json_file, worker_count(), console)
 
 
 @app.command("visits")
@@ -191,7 +191,7 @@ def bench_visits(
     """
     from lab.benchmarks.visits import bench_visits as run
 
-    raise typer.Exit(run(worlds, visits, seed, scans, out or Path("visits"), json_file, worker_count(), console))
+    run(worlds, visits, seed, scans, out or Path("visits"), json_file, worker_count(), console)
 
 
 @app.command("metrics")
@@ -202,7 +202,7 @@ def bench_metrics(seconds: Seconds = 20.0, rounds: Rounds = 3, json_file: Json =
     """
     from lab.benchmarks.metrics import bench_metrics as run
 
-    raise typer.Exit(run(seconds, rounds, json_file, console))
+    run(seconds, rounds, json_file, console)
 
 
 @app.command("localisation")
@@ -217,7 +217,7 @@ def bench_localisation(
     """
     from lab.accuracy.paper_localisation import bench_localisation as run
 
-    raise typer.Exit(run(world, BEAMS, trials, 25, 1, json_file, console))
+    run(world, BEAMS, trials, 25, 1, json_file, console)
 
 
 @app.command("accuracy")
@@ -258,9 +258,8 @@ def bench_accuracy(
     """
     from lab.accuracy.report import bench_accuracy as run
 
-    code = run(
+    run(
         worlds,
-        "",
         estimators,
         tasks,
         trials,
@@ -274,7 +273,6 @@ def bench_accuracy(
         markdown=markdown,
         scanner=scanner,
     )
-    raise typer.Exit(code)
 
 
 @app.command("distortion")
@@ -337,7 +335,7 @@ def bench_integrity(
     laser_pose: Any = tuple(parse_pose(mount, "--mount").tolist()) if mount else None
     of_logs = [case for log in logs.split(",") if log for case in cases_of(log, laser_pose)]
     plan = IntegrityPlan(worlds, seed, names, tuple(estimators.split(",")), model, seconds, tuple(of_logs))
-    raise typer.Exit(run(plan, out, worker_count(), console))
+    run(plan, out, worker_count(), console)
 
 
 @app.command("speed")
@@ -348,7 +346,7 @@ def bench_speed(world: WorldName = "office", json_file: Json = None) -> None:
     """
     from lab.accuracy.speed import bench_speed as run
 
-    raise typer.Exit(run(world, "622,811", 1, json_file, console))
+    run(world, "622,811", 1, json_file, console)
 
 
 @app.command("decoders")
@@ -363,7 +361,7 @@ def bench_decoders(
     """
     from lab.accuracy.decoders import bench_decoders as run
 
-    raise typer.Exit(run(world, 5000, steps, 0, json_file, console))
+    run(world, 5000, steps, 0, json_file, console)
 
 
 @app.command("recorder")
@@ -429,7 +427,7 @@ def bench_fleet(
     from lab.benchmarks.fleet import bench_fleet as run
 
     plan = FleetPlan("corridor", BEAMS, rate=15.0, seconds=seconds, max_robots=most, share=0.999, seed=1)
-    raise typer.Exit(run(estimators, plan, json_file, console))
+    run(estimators, plan, json_file, console)
 
 
 @app.command("hosts")
@@ -442,4 +440,4 @@ def bench_hosts(seconds: Seconds = 30.0, json_file: Json = None) -> None:
     """
     from lab.fault_injection.links import bench_hosts as run
 
-    raise typer.Exit(run(seconds, BEAMS, json_file, console))
+    run(seconds, BEAMS, json_file, console)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from common.limits import MAX_BEAMS
+from common.names import split_names
 from lab.cli.options import Trials, show, worker_count
 from presage.terminal.options import console
 
@@ -65,9 +66,7 @@ def navigate(
         range_max=max_range,
         limit=limit,
     )
-    world_names, drive_names = (
-        tuple(part.strip() for part in text.split(",") if part.strip()) for text in (worlds, drives)
-    )
+    world_names, drive_names = tuple(split_names(worlds)), tuple(split_names(drives))
     driving.check(job, world_names, drive_names)
 
     def run() -> Result:
@@ -102,6 +101,5 @@ def explore(
     from lab.exploration import experiment
 
     seed, out = context.obj
-    names = [name.strip() for name in worlds.split(",") if name.strip()]
-    job = experiment.ExplorationJob(seed)
+    names, job = split_names(worlds), experiment.ExplorationJob(seed)
     show(experiment, lambda: experiment.run(job, starts, names, buildings, out, worker_count(), console), out)

@@ -41,7 +41,7 @@ class LockstepRun:
     beams: int
     seed: int
     estimator: tuple[str, ...]  # command-line arguments of the estimator
-    limit: int  # maximum number of iterations
+    limit: int  # maximum number of scans
     controller: tuple[str, ...] = ("--preset", "paper")  # command-line arguments of the controller
     simulator: tuple[str, ...] = ()  # command-line arguments of the simulator
     sweep: bool = False  # whether motion distorts the scans, as by default in the simulator
@@ -98,7 +98,7 @@ def session() -> Iterator[Stack]:
     clean = {name: value for name, value in os.environ.items() if not name.startswith("PRESAGE_")}
     environment = clean | dict.fromkeys(THREAD_COUNT_VARIABLES, "1")
     for tries_left in reversed(range(MAX_ROUTER_STARTS)):
-        with Stack("e3", quiet=True, environment=environment) as stack:
+        with Stack("lockstep", quiet=True, environment=environment) as stack:
             try:
                 stack.start_router()
             except UserError:
@@ -116,7 +116,7 @@ def run(params: LockstepRun, stack: Stack) -> RunTrace:
     trace's ``failure`` instead.
     """
     # A unique robot name, so that messages of earlier runs or other sessions are not received.
-    stack.robot = f"e3-{os.getpid()}-{time.monotonic_ns()}"
+    stack.robot = f"lockstep-{os.getpid()}-{time.monotonic_ns()}"
     (x, y), yaw = params.ends.start, float(np.rad2deg(params.yaw))
     pose, world, seed = f"{x!r},{y!r},{yaw!r}", ("--world", params.world), ("--seed", str(params.seed))
     with open_bus(stack.link()) as bus:
@@ -142,7 +142,7 @@ def run(params: LockstepRun, stack: Stack) -> RunTrace:
         stack.wait_alive(bus)
         x, y = params.ends.goal
         answer = _send_goal(messages, stack, params.goal or Goal(stamp_ns=0, seq=1, pose=Pose(x=x, y=y)))
-        if answer.state == "blocked" and not params.ends_with_status:
+        if answer.refused and not params.ends_with_status:
             raise UserError(answer.reason)
         bus.declare_alive(HARNESS_NAME)
         trace = RunTrace()

@@ -20,6 +20,7 @@ from typing_extensions import Self
 from common.bus.bus import wait_until
 from common.errors import UserError
 from common.processes import end_with_this_process
+from presage.interrupts import deferring_interrupts
 
 NAMESPACE_VARIABLE = "PRESAGE_CHAOS_INSIDE"  # set in a process that has its own namespaces
 SWITCH = "switch0"
@@ -161,9 +162,10 @@ def port_of(name: str) -> str:
 
 def _child(*command: str) -> subprocess.Popen[bytes]:
     """Starts a process that ends with this one."""
-    return subprocess.Popen(  # noqa: S603 - fixed commands
-        command,
-        stdin=subprocess.DEVNULL,
-        start_new_session=True,
-        preexec_fn=end_with_this_process(signal.SIGKILL),  # noqa: PLW1509 - one call, before any thread of the child
-    )
+    with deferring_interrupts():
+        return subprocess.Popen(  # noqa: S603 - fixed commands
+            command,
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,
+            preexec_fn=end_with_this_process(signal.SIGKILL),  # noqa: PLW1509 - one call, before any thread of the child
+        )

@@ -32,8 +32,8 @@ WARM_UP_S = 3.0
 SERVICES_ON_HOST = {"robot": "simulator, controller", "brain": "estimator"}
 
 
-def bench_hosts(seconds: float, beams: int, json_file: Path | None, console: Console) -> int:
-    """Runs the benchmark, prints traffic and delays and writes them to ``json_file`` if given. Returns exit status 0.
+def bench_hosts(seconds: float, beams: int, json_file: Path | None, console: Console) -> None:
+    """Runs the benchmark, prints traffic and delays and writes them to ``json_file`` if given.
 
     Raises UserError if this machine permits no network namespaces.
     """
@@ -65,7 +65,6 @@ def bench_hosts(seconds: float, beams: int, json_file: Path | None, console: Con
         "commit": commit(),
     }
     write_json(json_file, data)
-    return 0
 
 
 def _measure_links(

@@ -176,6 +176,10 @@ class System(Stack):
     def _latest(self, what: str) -> Row | None:
         return next((row for row in reversed(self.timeline.rows) if row["what"] == what), None)
 
+    def shows_output(self, name: str) -> bool:
+        """Shows no lines of the observer: they are events for the timeline."""
+        return name != "observer" and super().shows_output(name)
+
     def on_output(self, name: str, line: str) -> None:
         """Adds a line to the timeline: one of the observer as it is, a log line of another process with its fields."""
         now, fields = time.monotonic(), None

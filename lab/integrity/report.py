@@ -27,7 +27,7 @@ in any state. *Error*: median/RMS of correct scans. *NEES*: mean of x, y and hea
 JSON has intervals and more."""
 
 
-def bench_integrity(plan: IntegrityPlan, out: Path, workers: int, console: Console) -> int:
+def bench_integrity(plan: IntegrityPlan, out: Path, workers: int, console: Console) -> None:
     """Runs the benchmark, prints a Markdown table, and writes the results into ``out``."""
     _check(plan)
     make_folder(out)
@@ -40,7 +40,6 @@ def bench_integrity(plan: IntegrityPlan, out: Path, workers: int, console: Conso
     files = result.write(out, reliability_diagram(scores))
     print(text)
     console.print(*[out / "integrity.md", *files], sep="\n")
-    return 0
 
 
 def _check(plan: IntegrityPlan) -> None:

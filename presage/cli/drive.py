@@ -47,7 +47,6 @@ def goal(
     yaw: Annotated[
         float | None, typer.Argument(parser=_number, help="Heading at the goal, deg. Defaults to any heading.")
     ] = None,
-    yaw_option: Annotated[float | None, typer.Option("--yaw", hidden=True)] = None,
     tolerance: Annotated[
         float, typer.Option(min=0.001, help="Distance at which the goal counts as reached, m.")
     ] = 0.02,
@@ -72,7 +71,6 @@ def goal(
 
     if not cancel and (x is None or y is None):
         raise UserError("a goal is two numbers, X Y in m (or --cancel)")
-    yaw = yaw_option if yaw is None else yaw
     if approach is not None and not abs(approach) <= MAX_HEADING_DEG:
         raise UserError(f"--approach {approach:g}: give a direction from -{MAX_HEADING_DEG} to {MAX_HEADING_DEG} deg")
     if not np.isfinite(tolerance):
@@ -132,7 +130,8 @@ def teleport(
 def relocalise(
     context: typer.Context,
     x: Annotated[
-        float | None, typer.Argument(help="x in the map, m. Defaults to the estimator's initial pose.")
+        float | None,
+        typer.Argument(help="x in the map, m. Defaults to a search of the whole map (preset paper: its initial pose)."),
     ] = None,
     y: Annotated[float | None, typer.Argument(help="y in the map, m.")] = None,
     yaw: Annotated[float | None, typer.Argument(parser=_number, help="Heading, deg. Defaults to any heading.")] = None,

@@ -94,10 +94,9 @@ def localize(
     options = LocalizeOptions.of(
         file,
         estimator_options,
-        "global" if mode == "single" else mode,
+        mode,
         log.frame,
         log.reading(),
-        independent_scans=mode == "single",
         odometry=log.odometry,
         out=out,
         start=start,

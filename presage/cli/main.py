@@ -84,7 +84,11 @@ def up(
     seed: Seed = None,
     record: Annotated[Path | None, typer.Option(help="Record into this folder.")] = None,
     mapping: Annotated[
-        bool, typer.Option("--mapping", help="Map an unknown building by driving through it by hand (docs/mapping.md).")
+        bool,
+        typer.Option(
+            "--mapping",
+            help="Map an unknown building while `presage explore` or a person drives the robot (docs/mapping.md).",
+        ),
     ] = False,
     learn: Annotated[
         bool, typer.Option("--learn", help="Improve the model while driving, and follow changes (docs/refinement.md).")

@@ -35,7 +35,7 @@ def record(
 
     def build_service(settings: RecorderSettings) -> RecorderService:
         # The live page controls the session's own recorder, not this one.
-        return RecorderService(settings, remote=False)
+        return RecorderService(settings, serve_requests=False)
 
     link = chosen_link(context, ("recorder",))
     keys = None if link.security is None else link.security.folder.parent

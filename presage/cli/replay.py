@@ -87,9 +87,7 @@ def replay(
     """
     from presage.replay.bus_replay import replay_options, run_replay
 
-    bus_options = replay_options(
-        only, leave_out, rate, start, end, robot, loop=loop, force=force, paused=paused, stay=paused
-    )
+    bus_options = replay_options(only, leave_out, rate, start, end, robot, loop=loop, force=force, paused=paused)
     if not with_services:
         if json_file is not None or every_scan:
             raise UserError("--json and --every-scan go with --with: a plain replay compares nothing")

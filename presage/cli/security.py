@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from common.names import split_names
 from presage.terminal.options import console
 
 app = typer.Typer(
@@ -40,7 +41,7 @@ def init(
     """
     from presage.session import credentials as secure
 
-    members = secure.init(folder, _names(hosts), _names(robots), days, force=force)
+    members = secure.init(folder, split_names(hosts), split_names(robots), days, force=force)
     console.print(
         f"{len(members)} members in {folder}, valid until {_expiry_date(folder, members[0].name):%Y-%m-%d}. Keep "
         f"{folder / secure.AUTHORITY_FOLDER} secret. Copy to each host only the folders of the programs that run "
@@ -70,7 +71,7 @@ def add(
     from common.bus.security import ROUTER
     from presage.session import credentials as secure
 
-    member = secure.add(folder, role, name, _names(robots), days, hosts=_names(hosts), force=force)
+    member = secure.add(folder, role, name, split_names(robots), days, hosts=split_names(hosts), force=force)
     console.print(
         f"{folder / member.name}: {member.role}, valid until {_expiry_date(folder, member.name):%Y-%m-%d}. Copy "
         f"{folder / ROUTER} to the routers and restart them.",
@@ -141,10 +142,6 @@ def _nested(settings: dict[str, Any]) -> dict[str, Any]:
             node = node.setdefault(parent, {})
         node[key] = value
     return tree
-
-
-def _names(text: str) -> list[str]:
-    return [name.strip() for name in text.split(",") if name.strip()]
 
 
 def _expiry_date(folder: Path, name: str) -> dt.datetime:

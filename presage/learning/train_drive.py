@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,7 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from common.errors import UserError
 from common.geometry import se2
 from common.geometry.se2 import Array
-from common.geometry.world import World, load_world
+from common.geometry.world import World, load_world, world_name
 from common.robot.motion_distortion import beam_times, correct_beams, evenly_spaced
 from common.robot.ranges import is_surface
 from common.robot.robot import Robot
@@ -161,8 +160,7 @@ def rectangle(drive: ReferenceDrive, log: Path) -> World:
     ends = Beams.of(drive.poses, drive.mount, drive.angles, drive.ranges).ends()
     (x0, y0), (x1, y1) = np.quantile(ends, (0.001, 0.999), axis=0) + MARGIN_M * np.array([[-1], [1]])
     corners = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
-    name = re.sub(r"[^\w.-]", "-", log.stem) or "drive"
-    return World(name=name, boundary=[(round(float(x), 3), round(float(y), 3)) for x, y in corners])
+    return World(name=world_name(log), boundary=[(round(float(x), 3), round(float(y), 3)) for x, y in corners])
 
 
 def enough_scans(world: World) -> int:

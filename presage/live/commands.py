@@ -78,7 +78,7 @@ def send_goal(link: Link, goal: Goal, console: Console, *, wait: bool) -> int:
             return 0 if done else 1
         if (status := messages.wait_for(Status, lambda s: s.goal_seq == goal.seq, 3.0)) is None:
             raise UserError("the controller did not acknowledge the goal within 3 s")
-        if status.state == "blocked":
+        if status.refused:
             raise UserError(status.reason)
         console.print(f"going to {_place(goal.pose, goal.map_id)}")
         try:
@@ -264,8 +264,7 @@ def relocalise(link: Link, pose: Pose | None, console: Console, *, heading_known
         if not reply.ok:
             raise UserError(f"refused: {reply.reason}")
         heading = f", {np.rad2deg(pose.yaw):g} deg" if pose and heading_known else ""
-        start = f"{_place(pose, floor)}{heading}" if pose else "the initial pose, or anywhere if none was given"
-        console.print(f"localising again from {start}")
+        console.print(f"localising again from {_place(pose, floor)}{heading}" if pose else "localising again")
         messages = LatestMessages(bus, BELIEF)  # only now, so that no belief is from before
         with console.status("waiting for state tracking"):
             messages.wait_for(Belief, lambda belief: belief.state == "tracking", LOCALISATION_TIMEOUT_S)

@@ -171,7 +171,7 @@ def export_csv(
     if not keys:
         raise UserError(f"{recording.path}: no message of presage in it, so there is nothing to export")
     layouts = {topic.name: _TopicLayout(topic) for topic in dict.fromkeys(keys.values())}
-    counts = recording.counts()
+    counts = recording.counts
     with closing(CsvTables(folder, force=force)) as tables:
         messages = with_progress(entries(recording, name), sum(counts[key] for key in keys), "csv", console)
         for topic, message, raw in messages:

@@ -96,7 +96,7 @@ def export_foxglove(recording: Recording, out: Path, robot: str, console: Consol
 
 def _write(recording: Recording, robot: str, writer: Writer, console: Console) -> Counter[str]:
     """Writes all messages in the order of reception."""
-    keys, counts = keys_of(recording, robot), recording.counts()
+    keys, counts = keys_of(recording, robot), recording.counts
     pose_source = pose_source_of({topic.name for topic in keys.values()})
     about = {"recording": recording.path.name, "robot": robot, "base_link is driven by": pose_source, "times": CLOCK}
     writer.add_metadata("export", {**about, **versions()})
@@ -123,7 +123,7 @@ def _write(recording: Recording, robot: str, writer: Writer, console: Console) -
 def _paths(recording: Recording, robot: str, console: Console) -> tuple[np.ndarray, np.ndarray]:
     """Believed poses (N, 3) and true poses (M, 3); the whole paths are shown from the beginning of the file."""
     believed, true = list[np.ndarray](), list[np.ndarray]()
-    keys, counts = keys_of(recording, robot, BELIEF, TRUTH), recording.counts()
+    keys, counts = keys_of(recording, robot, BELIEF, TRUTH), recording.counts
     messages: Iterator[tuple[object, object, object]] = with_progress(
         entries(recording, robot, BELIEF, TRUTH), sum(counts[key] for key in keys), "paths", console
     )

@@ -194,7 +194,8 @@ class SessionConverter:
         if goal.cancel or goal.explore:
             self._goal = None
             yield "/goal/shape", SceneUpdate(deletions=[SceneEntityDeletion(timestamp=time, id="goal")])
-            yield from self._log("goal", f"cancelled {logged}", "the goal was cancelled", logged)
+            text = "exploring" if goal.explore and not goal.cancel else "the goal was cancelled"
+            yield from self._log("goal", f"{text} {logged}", text, logged)
             return
         with suppress(UserError):  # the controller refused it
             goal = goal.in_map(self._world)
@@ -234,7 +235,7 @@ class SessionConverter:
     def _health(self, health: Health, _: int, logged: int) -> Iterator[tuple[str, Any]]:
         yield f"/health/{health.service}", numbers.of_health(health)
         if health.note or health.service in self._last_log:
-            text = health.note or "no complaint any more"
+            text = health.note or "the problem is over"
             yield from self._log(health.service, health.note, text, logged, warn=bool(health.note), topic="health")
 
     def _log(

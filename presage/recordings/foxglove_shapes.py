@@ -188,7 +188,7 @@ def obstacle_points(plan: Plan, ns: int) -> PointCloud:
 
 
 def preference_grid(preference: Preference, ns: int) -> Grid:
-    """Distance to the goal from each cell, m, as float32 `distance`; infinite if the goal cannot be reached."""
+    """Cost of the path to the goal from each cell, m, as float32 `distance`; infinite if it cannot be reached."""
     return Grid(
         timestamp=time_of(ns),
         frame_id="map",

@@ -116,7 +116,7 @@ def collect_facts(recording: Recording, check: bool | None = None) -> RecordingF
         world=world.name if world else None,
         started=datetime.fromtimestamp(recording.start_ns * 1e-9, timezone.utc).isoformat(timespec="milliseconds"),
         duration_s=(recording.end_ns - recording.start_ns) * 1e-9,
-        messages=recording.counts().total(),
+        messages=recording.counts.total(),
         topics=_topic_facts(recording, checked),
         versions={name: text for name, text in about.items() if name not in {"robot", "command"}},
         metadata={name: list(record) for name, record in recording.metadata.items()},
@@ -131,7 +131,7 @@ def _topic_facts(recording: Recording, checked: _PayloadCheck | None) -> list[To
     """Facts by key, from the recorder's counts and, if there was a check, from the payloads."""
     counters = from_metadata(recording.metadata.get("counters", {}))
     dropped = {key: int(n) for key, n in recording.metadata.get("dropped", {}).items() if n.isdecimal()}
-    counts, duration = recording.counts(), (recording.end_ns - recording.start_ns) * 1e-9
+    counts, duration = recording.counts, (recording.end_ns - recording.start_ns) * 1e-9
     found = []
     for key in sorted(set(counts) | set(counters)):
         facts = TopicFacts(key, counts[key], counts[key] / duration if duration > 0 else None)
@@ -154,6 +154,6 @@ def _replace_by_checked(facts: TopicFacts, checked: _PayloadCheck) -> None:
     span = (checked.last.get(key, 0) - checked.first.get(key, 0)) * 1e-9
     facts.rate_hz = (checked.message_counts.written[key] - 1) / span if span > 0 else None
     if is_numbered(key):
-        numbers = checked.message_counts.lost(key)
+        numbers = checked.message_counts.sequence_totals(key)
         facts.gaps, facts.missing, facts.restarts = numbers.gaps, numbers.missing, numbers.restarts
         facts.reordered = numbers.reordered

@@ -143,7 +143,7 @@ def _keys(recording: Recording, name: str | None) -> Collection[str] | None:
     """Keys of the topic or key ``name``, None for all; raises UserError if the recording has none of them."""
     if name is None:
         return None
-    if name in recording.counts():
+    if name in recording.counts:
         return [name]
     keys = [key for key, topic in recording.topics().items() if topic == topic_named(name)]
     if not keys:

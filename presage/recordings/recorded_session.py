@@ -156,7 +156,7 @@ def gather_session(recording: Recording) -> RecordedSession:
         world=recording.world(),
         robot=robot or recording.metadata.get("presage", {}).get("robot", "unknown"),
         base=recording.robot(),
-        counts=dict(recording.counts()),
+        counts=dict(recording.counts),
         duration_s=(recording.end_ns - recording.start_ns) * 1e-9,
     )
     gatherer = _Gatherer(session)

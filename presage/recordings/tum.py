@@ -73,7 +73,7 @@ def export_tum(
         raise UserError(f"{recording.path}: neither belief nor truth nor odom in it, so there is no trajectory")
     make_folder(folder)
     refuse_to_overwrite(sorted(folder.iterdir())[:1], force=force)
-    counts = recording.counts()
+    counts = recording.counts
     with ExitStack() as stack:
         files = {topic.name: TrajectoryWriter(folder, topic.name, stack) for topic in keys.values()}
         messages = with_progress(entries(recording, name, *TOPICS), sum(counts[key] for key in keys), "tum", console)

@@ -14,12 +14,13 @@ from rich.progress import BarColumn, Progress, TextColumn
 from common.bus.bus import Link
 from common.errors import UserError
 from common.messages.requests import PlayerReply
+from common.messages.topics import ROBOT_NAME_PATTERN
+from common.names import split_names
 from presage.live.latest_messages import session_bus
 from presage.replay.keyboard import HELP, keyboard
-from services.recorder.replaying.replay import ReplayControl, ReplayOptions, names_of, replay
+from services.recorder.replaying.replay import ReplayControl, ReplayOptions, replay
 
 REFRESH_PERIOD_S = 0.1  # of the progress bar
-ROBOT_NAME = r"[A-Za-z0-9_.-]{1,64}"
 
 
 def run_replay(file: Path, link: Link, options: ReplayOptions, console: Console) -> None:
@@ -55,7 +56,7 @@ def describe(state: PlayerReply) -> str:
 
 def checked_robot(name: str) -> str:
     """Returns ``name``; raises UserError if it cannot be part of a key."""
-    if not re.fullmatch(ROBOT_NAME, name):
+    if not re.fullmatch(ROBOT_NAME_PATTERN, name):
         raise UserError(f"--robot {name!r}: only up to 64 letters, digits, _ . and - are allowed")
     return name
 
@@ -71,12 +72,9 @@ def replay_options(
     loop: bool,
     force: bool,
     paused: bool = False,
-    stay: bool = False,
 ) -> ReplayOptions:
     """Options of the replay from those of the command line; raises UserError if the robot's name is not allowed."""
     if robot:
         checked_robot(robot)
-    names, without = names_of(only), names_of(leave_out)
-    return ReplayOptions(
-        names or None, without, 1.0 if rate is None else rate, start, end, loop, robot, force, paused, stay
-    )
+    names, without = frozenset(split_names(only)), frozenset(split_names(leave_out))
+    return ReplayOptions(names or None, without, 1.0 if rate is None else rate, start, end, loop, robot, force, paused)

@@ -33,7 +33,7 @@ class ScanFeed:
         """``outputs`` are the topics that the services publish and that are compared."""
         self.recording, self.services, self.outcome = recording, services, outcome
         self.outputs, self.every_scan = outputs, every_scan
-        counts = recording.counts()
+        counts = recording.counts
         keys = {topic.key(services.robot): topic for topic in {SCAN, ODOM, GOAL, DRIVE, CMD_VEL, BELIEF} | outputs}
         self.topics = {key: topic for key, topic in keys.items() if counts[key]}
         # How many goals to send after each scan, by stamp, and their payloads in order; None if that is unknown, and
@@ -57,7 +57,7 @@ class ScanFeed:
         raws = progress(
             self.recording.payloads(self.topics.keys()),
             "replaying",
-            sum(self.recording.counts()[key] for key in self.topics),
+            sum(self.recording.counts[key] for key in self.topics),
             console,
             unit="messages",
         )

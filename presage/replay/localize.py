@@ -60,8 +60,7 @@ class LocalizeOptions:
 
     file: Path
     estimator_options: EstimatorOptions
-    mode: Literal["global", "track"] = "global"
-    independent_scans: bool = False  # every scan starts from an unknown pose, as if it were the first
+    mode: Literal["global", "track", "single"] = "global"  # single: each scan as if it were the first
     prior: Prior = "odometry"
     frame: Literal["base_link", "laser"] = "base_link"
     reading: Reading = Reading()  # noqa: RUF009 - frozen
@@ -79,7 +78,6 @@ class LocalizeOptions:
         frame: str,
         reading: Reading,
         *,
-        independent_scans: bool,
         odometry: bool,
         out: Path | None,
         start: float | None = None,
@@ -87,14 +85,14 @@ class LocalizeOptions:
         every: int = 1,
     ) -> LocalizeOptions:
         """Checks the options of the command line; raises UserError if a value is unknown."""
-        if mode not in ("global", "track"):
+        if mode not in ("global", "track", "single"):
             raise UserError(f"no mode {mode!r}: choose global, track or single")
         if frame not in ("base_link", "laser"):
             raise UserError(f"no frame {frame!r}: choose base_link or laser")
         if out is not None and out.suffix not in (".csv", ".json", ".tum"):
             raise UserError(f"{out}: the name of the result must end with .csv, .json or .tum")
         prior: Prior = "odometry" if odometry else "motion"
-        return cls(file, estimator_options, mode, independent_scans, prior, frame, reading, out, start, end, every)  # type: ignore[arg-type]
+        return cls(file, estimator_options, mode, prior, frame, reading, out, start, end, every)  # type: ignore[arg-type]
 
 
 def build_estimator_options(
@@ -171,7 +169,7 @@ def localize(options: LocalizeOptions, console: Console) -> list[dict[str, Any]]
     """
     check_file(options.out, "--out")
     if options.estimator_options.initial_pose is not None:
-        if options.mode == "global":
+        if options.mode != "track":
             raise UserError("--initial-pose is for mode track only: add --mode track, or leave it out")
         world = options.estimator_options.world
         check_start(options.estimator_options.initial_pose, load_world(world) if isinstance(world, str) else world)
@@ -190,7 +188,7 @@ def localize(options: LocalizeOptions, console: Console) -> list[dict[str, Any]]
     estimator.check(scans[0])
     rows: list[dict[str, Any]] = []
     try:
-        found = run_estimator(estimator, scans, independent_scans=options.independent_scans, start=start)
+        found = run_estimator(estimator, scans, independent_scans=options.mode == "single", start=start)
         with _output(options, count) as write, closing(_with_progress(options, found, count, console)) as localised:
             for k, timed in enumerate(localised):
                 row = _row(scans, k, timed, laser=laser)
@@ -203,7 +201,7 @@ def localize(options: LocalizeOptions, console: Console) -> list[dict[str, Any]]
             console.print(f"interrupted after {len(rows)} of {count} scans{where}", highlight=False, soft_wrap=True)
         raise
     _summarise(scans, rows, len(all_scans), console, laser=laser)
-    if not options.independent_scans and all(row["state"] != "tracking" for row in rows):
+    if options.mode != "single" and all(row["state"] != "tracking" for row in rows):
         console.print("the pose was never certain enough for state tracking: is this the right map?")
     return rows
 
@@ -234,8 +232,8 @@ def _with_progress(
 
 
 def _start(options: LocalizeOptions, scans: Scans) -> Array | None:
-    """The start of mode track, (3,) or (2,): given, or from the file or its reference. None for mode global."""
-    if options.mode == "global":
+    """The start of mode track, (3,) or (2,): given, or from the file or its reference. None for other modes."""
+    if options.mode != "track":
         return None
     if options.estimator_options.initial_pose is not None:
         return options.estimator_options.initial_pose
@@ -302,7 +300,6 @@ def _write_json(options: LocalizeOptions, out: Path, rows: list[dict[str, Any]],
         "model": options.estimator_options.model,
         "frame": options.frame,
         "mode": options.mode,
-        "fresh": options.independent_scans,
         "start": options.start,
         "end": options.end,
         "every": options.every,

@@ -81,7 +81,7 @@ def rerun_command(options: RerunOptions, json_file: Path | None, console: Consol
         localised = run_estimator(prepare_estimator(chosen, console), scans, start=chosen.initial_pose)
         with closing(progress(localised, "localising", len(scans), console)) as shown:
             old, new = write_recording(recording, robot, settings, scans, shown, out)
-    if foreign := sum(count for key, count in recording.counts().items() if topic_of(key) is None):
+    if foreign := sum(count for key, count in recording.counts.items() if topic_of(key) is None):
         console.print(f"{foreign} messages on keys that do not belong to presage are not copied")
     comparison = compare(old, new, scans.truth)
     console.print(comparison_table(comparison))

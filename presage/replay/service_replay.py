@@ -20,6 +20,7 @@ from rich.console import Console
 from common.errors import UserError
 from common.log import set_up_logging
 from common.messages.topics import BELIEF, CMD_VEL, SCAN
+from common.names import split_names
 from common.runtime.service import Service
 from common.versions import commit
 from presage.recordings.selection import robot_of
@@ -57,7 +58,7 @@ class ServiceReplayOptions:
 
     def names(self) -> tuple[str, ...]:
         """Names of the services; raises UserError for one that cannot be run on a recording."""
-        names = tuple(dict.fromkeys(part.strip() for part in self.services.split(",") if part.strip()))
+        names = tuple(dict.fromkeys(split_names(self.services)))
         if "estimator" not in names or set(names) - SETTINGS.keys():
             raise UserError(f"--with {self.services}: give estimator, or estimator,controller")
         return names
@@ -81,7 +82,7 @@ def run_service_replay(options: ServiceReplayOptions, console: Console) -> Repla
     if recording.warning:
         print(f"warning: {recording.warning}", file=sys.stderr)
     robot = robot_of(recording)
-    scans = recording.counts()[SCAN.key(robot)]
+    scans = recording.counts[SCAN.key(robot)]
     if not scans:
         raise UserError(f"{options.file}: no scan in it")
     if "log" in recording.metadata:

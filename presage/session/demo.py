@@ -35,6 +35,7 @@ ARRIVAL_TIMEOUT_S = 90.0  # from the goal; 12.5 m take about 15 s
 # Measured with the wall clock:
 FIRST_BELIEF_TIMEOUT_S = 30.0
 WALL_TIMEOUT_S = 120.0  # for localising, and again for the drive
+MAX_STANDING_SPEED_M_S = 0.01
 DEMO_BEAMS = 622  # as in the paper, unless the settings give another number
 
 
@@ -201,9 +202,12 @@ def _navigate(bus: Bus, messages: LatestMessages, stack: Stack, place: tuple[flo
                 console.print(f"[bold]not at the goal after {passed:.0f} s[/]: {status.state} {status.reason}")
                 return False
     # Wait until the robot stands, so that the recording and the figure contain the end of the drive.
-    return (
-        messages.wait_for(Truth, lambda truth: bool(np.hypot(truth.twist.vx, truth.twist.vy) < 0.01), 5.0) is not None
-    )
+    return messages.wait_for(Truth, is_standing, 5.0) is not None
+
+
+def is_standing(truth: Truth) -> bool:
+    """Whether the robot stands."""
+    return bool(np.hypot(truth.twist.vx, truth.twist.vy) < MAX_STANDING_SPEED_M_S)
 
 
 def demo_command(demo: DemoOptions, json_file: Path | None) -> int:

@@ -17,7 +17,8 @@ import psutil
 from common.bus.bus import DEFAULT_ENDPOINT, Link
 from common.bus.security import Credentials, read_credentials
 from common.errors import UserError
-from common.runtime.config import ROBOT_NAME_PATTERN, split_endpoints
+from common.messages.topics import ROBOT_NAME_PATTERN
+from common.names import split_names
 
 OPERATOR, OBSERVER = ("operator",), ("observer", "operator")  # roles for commands that act, and that only read
 
@@ -104,7 +105,7 @@ def link_of(connect: str, robot: str, roles: Sequence[str] = OPERATOR) -> Link:
         )
     robot = robot or session.robots[0]
     return Link(
-        robot, split_endpoints(session.endpoint), security=credentials_for(robot, roles, folder=session.security)
+        robot, tuple(split_names(session.endpoint)), security=credentials_for(robot, roles, folder=session.security)
     )
 
 

@@ -97,6 +97,10 @@ class Stack:
     def on_output(self, name: str, line: str) -> None:
         """Hook for subclasses: called for each line that the child ``name`` prints, in its reader thread."""
 
+    def shows_output(self, name: str) -> bool:  # noqa: ARG002 - for subclasses
+        """Whether the lines that the child ``name`` prints are shown."""
+        return not self.quiet
+
     def link(self) -> Link:
         """Link for a bus session of this process."""
         return Link(robot=self.robot, connect=(self.endpoint,), security=self.security)
@@ -212,7 +216,7 @@ class Stack:
         for line in process.child.stdout:
             process.lines = [*process.lines[-20:], line.rstrip()]
             self.on_output(process.name, line.rstrip())
-            if self.quiet or process.name == "observer":
+            if not self.shows_output(process.name):
                 continue
             if line.startswith("{"):  # a JSON log line contains the name of its service
                 print(line.rstrip(), file=sys.stderr)

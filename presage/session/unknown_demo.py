@@ -1,7 +1,7 @@
 """`presage demo --unknown`: a robot explores a building that it has never seen, is kidnapped, and returns.
 
-The demo plays the people around the robot: it starts the exploration, teleports the robot once, and sends a goal. It
-measures errors with the true world and the true pose, which no service but the simulator knows.
+The demo acts as the user: it starts the exploration, kidnaps the robot once, and sends a goal. It measures errors with
+the true world and the true pose, which no service but the simulator knows.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from common.messages.topics import BELIEF, GOAL, MAP, STATUS, TELEPORT, TRUTH
 from common.versions import commit
 from presage.live.latest_messages import LatestMessages
 from presage.recordings.session_figure import draw_session
-from presage.session.demo import DemoOptions, check_recorded, new_recording
+from presage.session.demo import DemoOptions, check_recorded, is_standing, new_recording
 from presage.session.page import show_page_link
 from presage.session.running_sessions import credentials_for, session_file
 from presage.session.session_plan import plan_session
@@ -40,9 +40,8 @@ DEFAULT_WORLD = "office"  # unless the options, the environment or the settings 
 # The robot is kidnapped when the map has this number of key scans. It must be clearly more than the key scans that are
 # taken until the robot is localised again, about 20.
 KIDNAP_AT_KEY_SCANS = 40
-MIN_KIDNAPPING_M = 5.0  # distance to the place to which the robot is teleported
+MIN_KIDNAPPING_M = 5.0  # distance to the place to which the robot is kidnapped
 LOCALISED_ERROR_M = 0.2  # error of a belief below which the robot counts as localised
-MAX_STANDING_SPEED_M_S = 0.01
 EXPLORATION_SEQ, GOAL_SEQ = 1, 2  # numbers of the two requests
 MAX_KEPT_TRUTHS = 256  # a belief arrives later than the truth of its stamp
 # Deadlines of the steps, by the wall clock. They are several times longer than a step takes on an idle machine.
@@ -116,7 +115,7 @@ class SessionObserver:
     @property
     def standing(self) -> bool:
         """Whether the robot stands."""
-        return bool(np.hypot(self.truth.twist.vx, self.truth.twist.vy) < MAX_STANDING_SPEED_M_S)
+        return is_standing(self.truth)
 
     def wait(self, doing: str, condition: Callable[[], bool], limit_s: float) -> None:
         """Takes messages until a condition is true.
@@ -181,7 +180,7 @@ def explore(observer: SessionObserver) -> None:
 
     def enough() -> bool:
         if observer.exploration == "finished":
-            raise StepError("exploring: all was mapped before the robot could be carried off; choose a larger --world")
+            raise StepError("exploring: all was mapped before the robot could be kidnapped; choose a larger --world")
         mapped = len(observer.key_scans) >= KIDNAP_AT_KEY_SCANS and np.isfinite(observer.belief_error_m)
         return bool(mapped and distance(farthest_key_scan(observer), observer.pose) >= MIN_KIDNAPPING_M)
 
@@ -191,30 +190,31 @@ def explore(observer: SessionObserver) -> None:
 
 
 def kidnap(bus: Bus, observer: SessionObserver) -> None:
-    """Teleports the robot to a mapped place, and waits until it is localised there."""
+    """Kidnaps the robot to a mapped place, and waits until it is localised there."""
     before, place = observer.pose, farthest_key_scan(observer)
     place = se2.compose(place, [0.0, 0.0, np.pi])  # with a view that is not the one in the map
     reply = bus.query(TELEPORT, PoseRequest(pose=Pose.of(se2.compose(observer.start, place))), Reply)
     if not reply.ok:
-        raise StepError(f"the simulator refuses to carry the robot off: {reply.reason}")
+        raise StepError(f"the simulator refuses to kidnap the robot: {reply.reason}")
     distance_m = distance(place, before)
     observer.wait(
-        "carrying the robot off", lambda: distance(observer.pose, before) > distance_m / 2, KIDNAPPING_TIMEOUT_S
+        "kidnapping the robot", lambda: distance(observer.pose, before) > distance_m / 2, KIDNAPPING_TIMEOUT_S
     )
-    carried_ns, carried_s = observer.truth.stamp_ns, observer.seconds
+    kidnapped_ns, kidnapped_s = observer.truth.stamp_ns, observer.seconds
 
     def found() -> bool:
         return (
             observer.belief is not None
-            and observer.belief.stamp_ns > carried_ns
+            and observer.belief.stamp_ns > kidnapped_ns
             and observer.belief_error_m < LOCALISED_ERROR_M
         )
 
     observer.wait("finding itself", found, STEP_TIMEOUT_S)
-    error_m, took_s = observer.belief_error_m, observer.seconds - carried_s
-    where = f"{mm(error_m)} from the truth"
+    error_m, took_s = observer.belief_error_m, observer.seconds - kidnapped_s
     observer.end_step(
-        f"was carried off by {distance_m:.1f} m and found itself in its map after {took_s:.0f} s, {where}", error_m
+        f"was kidnapped to a place {distance_m:.1f} m away, and found itself in its map after {took_s:.0f} s, "
+        f"{mm(error_m)} from the truth",
+        error_m,
     )
 
 

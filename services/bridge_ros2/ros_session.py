@@ -18,6 +18,7 @@ import zenoh.ext
 from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
 from common.messages.topics import Topic
+from common.names import split_names
 from services.bridge_ros2.keys import TOKEN_KEYS, BridgeNode, Qos, RosKeys, attachment, publisher_gid, read_attachment
 from services.bridge_ros2.ros_types import encode
 
@@ -52,7 +53,7 @@ def open_ros_session(endpoint: str, config: Path | None = None) -> zenoh.Session
 def _settings(endpoint: str) -> dict[str, Any]:
     return {
         "mode": "client",
-        "connect/endpoints": [each.strip() for each in endpoint.split(",") if each.strip()],
+        "connect/endpoints": split_names(endpoint),
         "connect/timeout_ms": 500,  # short, because it blocks the service loop, which tries again later
         "connect/exit_on_failure": True,
         "scouting/multicast/enabled": False,

@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING
 from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
 from common.log import LogRateLimiter, logger
-from common.messages.topics import SCAN
+from common.messages.topics import ROBOT_NAME_PATTERN, SCAN
+from common.names import split_names
 from common.runtime.runnable import Runnable
 from common.runtime.service import Service
 from common.runtime.service_loop import ServiceLoop
 from services.estimator.service import EstimatorService, SharedModels
-from services.estimator.settings import ROBOT_NAME, EstimatorSettings
+from services.estimator.settings import EstimatorSettings
 from services.estimator.shared.interface import SearchingEstimator
 
 if TYPE_CHECKING:
@@ -121,7 +122,7 @@ class FleetLoop:
         """``settings.robots`` are names and patterns of names, separated by commas."""
         self.settings, self.bus = settings, bus
         self.names = settings.robot_names
-        self.patterns = [name for name in settings.robots.split(",") if name and name not in self.names]
+        self.patterns = [name for name in split_names(settings.robots) if name not in self.names]
         self.log = logger(FleetService.name)
         self._robots: dict[str, FleetRobot] = {}
         self._alive: set[tuple[str, str]] = set()  # robot and service; changed by zenoh's threads
@@ -236,7 +237,8 @@ class FleetLoop:
                 self.log.warning("too many robots", not_served=name, max_robots=self.settings.max_robots)
 
     def _matches(self, name: str) -> bool:
-        return bool(ROBOT_NAME.fullmatch(name)) and any(fnmatchcase(name, pattern) for pattern in self.patterns)
+        is_name = re.fullmatch(ROBOT_NAME_PATTERN, name) is not None
+        return is_name and any(fnmatchcase(name, pattern) for pattern in self.patterns)
 
     def _update_robots(self, now: float) -> None:
         """Starts robots that can become active, and resets those that sent no scan and had no simulator for long.

@@ -10,10 +10,11 @@ from pydantic import Field
 
 from common.errors import UserError
 from common.geometry.pose_text import POSE_PATTERN
+from common.messages.topics import ROBOT_NAME_PATTERN
+from common.names import split_names
 from common.runtime.robot_settings import MotionLimitSettings
 
-ROBOT_NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
-_PATTERN = r"[A-Za-z0-9_.*?-]{1,64}"
+_PATTERN = r"[A-Za-z0-9_.*?-]{1,64}"  # name of a robot, or a pattern of names
 
 
 class EstimatorSettings(MotionLimitSettings):
@@ -96,7 +97,8 @@ class EstimatorSettings(MotionLimitSettings):
     @property
     def robot_names(self) -> list[str]:
         """The names in ``robots``, without the patterns."""
-        return list(dict.fromkeys(name for name in self.robots.split(",") if ROBOT_NAME.fullmatch(name)))
+        names = split_names(self.robots)
+        return list(dict.fromkeys(name for name in names if re.fullmatch(ROBOT_NAME_PATTERN, name)))
 
     def check_several_robots(self) -> None:
         """Raises UserError if a setting is only for one robot, or more robots are named than allowed."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
+from mcap.exceptions import EndOfFile
 from mcap.reader import SeekingReader
 from mcap.records import Attachment, Channel, Chunk, Header, Metadata
 from mcap.records import Message as McapMessage
@@ -22,7 +23,7 @@ from common.messages.wire import DecodeError
 from common.robot.robot import Robot
 from common.robot.scanner import Scanner
 from common.yaml_text import NOT_YAML, parse_yaml
-from services.recorder.files.chunks import MAGIC, records_of
+from services.recorder.files.chunks import MAGIC, unpacked_records
 from services.recorder.files.index import messages_in_order, summary_of
 from services.recorder.files.writer import PROFILE
 
@@ -53,7 +54,7 @@ class Recording:
     profile: str = ""
     start_ns: int = 0  # wall time at which the first message was received
     end_ns: int = 0  # wall time at which the last message was received
-    message_counts: Counter[str] = field(default_factory=Counter)  # by key
+    counts: Counter[str] = field(default_factory=Counter)  # messages by key
     indexed: bool = False  # the file has a valid index, so damage is only found when the damaged part is read
 
     @property
@@ -71,7 +72,7 @@ class Recording:
             if self.path.suffix == ".active"
             else "it is cut short or damaged"
         )
-        readable = "the messages" if self.indexed else f"the {sum(self.message_counts.values())} messages"
+        readable = "the messages" if self.indexed else f"the {sum(self.counts.values())} messages"
         return (
             f"{self.path}: incomplete ({self.problem}): {consequence}; {readable} before that can be used, and "
             "`presage recover` writes a complete file from the readable part"
@@ -93,33 +94,22 @@ class Recording:
         except OSError as error:
             raise _unreadable(self.path, error) from None
 
-    @property
-    def raw(self) -> list[RawMessage]:
-        """All payloads as a list, for short recordings."""
-        return list(self.payloads())
-
     def messages(self, *topics: Topic) -> Iterator[tuple[Topic, Stamped, RawMessage]]:
         """Yields topic, decoded message and payload. Defaults to all topics.
 
         Payloads that cannot be decoded are skipped and counted in `undecodable`.
         """
         self.undecodable.clear()
-        rows = {
-            key: topic for key in self.message_counts if (topic := topic_of(key)) and (not topics or topic in topics)
-        }
+        rows = {key: topic for key in self.counts if (topic := topic_of(key)) and (not topics or topic in topics)}
         for raw in self.payloads(rows.keys()):
             try:
                 yield rows[raw.key], rows[raw.key].message.decode(raw.payload), raw
             except DecodeError:
                 self.undecodable[raw.key] += 1
 
-    def counts(self) -> Counter[str]:
-        """Number of messages by key."""
-        return Counter(self.message_counts)
-
     def topics(self) -> dict[str, Topic]:
         """Topics of the recording, by key. Keys that are not in the table of topics are left out."""
-        return {key: topic for key in sorted(self.message_counts) if (topic := topic_of(key)) is not None}
+        return {key: topic for key in sorted(self.counts) if (topic := topic_of(key)) is not None}
 
     def world(self) -> World | None:
         """The simulator's world, or without a simulator the estimator's map.
@@ -160,7 +150,7 @@ class Recording:
         self, stream: BinaryIO, keys: Collection[str] | None, start_ns: int | None, end_ns: int | None
     ) -> Iterator[tuple[Channel, McapMessage]]:
         try:
-            if (summary := SeekingReader(stream).get_summary()) is not None:
+            if (summary := summary_of(stream)) is not None:
                 yield from messages_in_order(stream, summary, keys, start_ns, end_ns)
         except OSError:
             raise
@@ -223,7 +213,7 @@ def _read_summary(recording: Recording, stream: BinaryIO) -> bool:
         for attachment in reader.iter_attachments():
             recording.attachments[attachment.name] = attachment.data
         for number, count in summary.statistics.channel_message_counts.items():
-            recording.message_counts[summary.channels[number].topic] += count
+            recording.counts[summary.channels[number].topic] += count
         recording.start_ns, recording.end_ns = (
             summary.statistics.message_start_time,
             summary.statistics.message_end_time,
@@ -231,7 +221,7 @@ def _read_summary(recording: Recording, stream: BinaryIO) -> bool:
     except OSError:
         raise
     except Exception as error:  # noqa: BLE001 - a damaged index can raise any error
-        recording.metadata, recording.attachments, recording.message_counts = {}, {}, Counter()
+        recording.metadata, recording.attachments, recording.counts = {}, {}, Counter()
         recording.problem = str(error) if isinstance(error, ValueError) else "its index is damaged"
         return False
     recording.indexed = True
@@ -251,9 +241,9 @@ def _read_through(recording: Recording, stream: BinaryIO) -> None:
         elif isinstance(record, Attachment):
             recording.attachments[record.name] = record.data
         elif isinstance(record, McapMessage) and record.channel_id in keys:
-            if not recording.message_counts:
+            if not recording.counts:
                 recording.start_ns = record.log_time
-            recording.message_counts[keys[record.channel_id]] += 1
+            recording.counts[keys[record.channel_id]] += 1
             recording.end_ns = max(recording.end_ns, record.log_time)
 
 
@@ -268,13 +258,13 @@ def _records(recording: Recording, stream: BinaryIO, *, chunks: bool = True) -> 
     try:
         for record in StreamReader(stream, emit_chunks=True, validate_crcs=True, record_size_limit=size).records:
             if chunks and isinstance(record, Chunk):
-                yield from records_of(record)
+                yield from unpacked_records(record)
             else:
                 yield record
     except OSError:
         raise
     except Exception as error:  # noqa: BLE001 - each decompressor raises its own error types
-        recording.problem = "its end is missing" if "End" in type(error).__name__ else f"damaged: {error}"
+        recording.problem = "its end is missing" if isinstance(error, EndOfFile) else f"damaged: {error}"
 
 
 def _unreadable(path: Path, error: OSError) -> UserError:

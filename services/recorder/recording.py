@@ -9,12 +9,12 @@ import shlex
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
-from contextlib import nullcontext, suppress
+from collections.abc import Iterable
 from datetime import datetime, timezone
+from functools import partial
 from pathlib import Path
 
-from common.bus.inbox import OTHERS, Inbox, Sample
+from common.bus.inbox import Inbox, Sample, is_message_counter
 from common.errors import UserError
 from common.log import Logger
 from common.messages.requests import RecordReply
@@ -23,7 +23,7 @@ from common.versions import versions
 from services.recorder.files.message_counts import KeyCounts, MessageCounts, as_metadata
 from services.recorder.files.parts import PartLimits, PartsWriter
 from services.recorder.files.writer import UNFINISHED_SUFFIX, NameTakenError, RecordingWriter, is_being_written
-from services.recorder.session_description import DescriptionReply, MetadataRecord, records_of
+from services.recorder.session_description import DescriptionReply, MetadataRecord, description_records
 from services.recorder.settings import RecorderSettings
 
 
@@ -31,19 +31,21 @@ class OpenRecording:
     """A recording that is being written. Every method raises UserError if writing fails."""
 
     def __init__(
-        self, options: RecorderSettings, topics: Iterable[Topic], inbox: Inbox, *, numbered: bool = False
+        self, options: RecorderSettings, topics: Iterable[Topic], inbox: Inbox, *, may_rename: bool = False
     ) -> None:
-        """Opens the file. ``numbered`` is passed to `parts_of`.
+        """Opens the file. ``may_rename`` appends a number to a name chosen by the user if it is taken.
 
         The metadata known so far is written first, so that it is readable even in a file that is never finished.
         """
         self.message_counts = MessageCounts()
         self._inbox, self._before, self._began = inbox, inbox.handled_counts(), time.monotonic()
-        # Log times are wall time at the opening and monotonic time from there: a clock that is set does not bend them.
+        # Log times are wall time at the opening and monotonic time from there, so that setting the system clock does
+        # not change the times between messages.
         self._clock_ns = time.time_ns() - time.monotonic_ns()
         self._logged_ns = 0  # log time of the last message
+        path, first = open_first_part(options, may_rename=may_rename)
         limits = PartLimits(int(options.split_size * 1e6), options.split_minutes * 60)
-        writer = self.writer = PartsWriter(parts_of(options, numbered=numbered), limits, self._counters)
+        writer = self.writer = PartsWriter(first, partial(open_part, options, path), limits, self._counters)
         try:
             writer.metadata("presage", {"robot": options.robot, "command": shlex.join(sys.argv), **versions()})
             writer.metadata("config:recorder", {"config": json.dumps(options.effective())})
@@ -74,9 +76,9 @@ class OpenRecording:
 
     def missing(self) -> int:
         """Messages that were published and never received, by their sequence numbers."""
-        return sum(self.message_counts.lost(key).missing for key in self.message_counts.sequences)
+        return sum(self.message_counts.sequence_totals(key).missing for key in self.message_counts.sequences)
 
-    def lost(self) -> int:
+    def not_in_file(self) -> int:
         """Upper bound of the messages that were queued but are not in the file, after writing failed."""
         arrived, dropped, oversized = (sum(counts.values()) for counts in self._since(self._inbox.received_counts()))
         return arrived - dropped - oversized - self.writer.saved
@@ -92,36 +94,36 @@ class OpenRecording:
     def _since(self, now: tuple[Counter[str], ...]) -> list[dict[str, int]]:
         """Counts by key since the recording began, without requests, which the inbox counts by query name."""
         since = [after - before for after, before in zip(now, self._before, strict=True)]
-        return [{key: n for key, n in counts.items() if "/" in key or key == OTHERS} for counts in since]
+        return [{key: n for key, n in counts.items() if is_message_counter(key)} for counts in since]
 
     def _counters(self) -> dict[str, dict[str, str]]:
         return {"counters": as_metadata(self._counts())}
 
 
-def parts_of(options: RecorderSettings, *, numbered: bool = False) -> Callable[[int], RecordingWriter]:
-    """Returns a function that opens part k: NAME.mcap, or NAME-001.mcap, NAME-002.mcap, ... if the recording is split.
+def open_first_part(options: RecorderSettings, *, may_rename: bool = False) -> tuple[Path, RecordingWriter]:
+    """Opens the first part under a free name. Returns the path without the number of a part, and the writer.
 
-    If the name is taken, a generated name, or any name with ``numbered``, gets a number appended. A name chosen by the
-    user raises NameTakenError.
+    If the name is taken, a number is appended to a generated name, or to any with ``may_rename``. Otherwise raises
+    NameTakenError.
     """
-    first, several = file_path(options), bool(options.split_size or options.split_minutes)
-    chosen: list[Path] = []  # the name that was free for the first part
+    wanted = file_path(options)
+    for number in itertools.count(1):
+        path = wanted if number == 1 else wanted.with_stem(f"{wanted.stem}-{number}")
+        try:
+            return path, open_part(options, path, 1)
+        except NameTakenError:
+            if options.file and not may_rename:
+                raise
+    raise AssertionError
 
-    def open_part(part: int) -> RecordingWriter:
-        for number in itertools.count(1):
-            path = first if number == 1 else first.with_stem(f"{first.stem}-{number}")
-            path = chosen[0] if chosen else path
-            file = path.with_stem(f"{path.stem}-{part:03d}") if several else path
-            try_next_number = (numbered or not options.file) and not chosen
-            with suppress(NameTakenError) if try_next_number else nullcontext():
-                if several and not chosen:
-                    check_no_parts(path)
-                writer = RecordingWriter(file, options.compression, options.chunk_size)
-                chosen.append(path)
-                return writer
-        raise AssertionError
 
-    return open_part
+def open_part(options: RecorderSettings, path: Path, part: int) -> RecordingWriter:
+    """Opens NAME.mcap, or NAME-001.mcap, NAME-002.mcap, ... if the recording is split. Raises NameTakenError."""
+    if options.split_size or options.split_minutes:
+        if part == 1:
+            check_no_parts(path)
+        path = path.with_stem(f"{path.stem}-{part:03d}")
+    return RecordingWriter(path, options.compression)
 
 
 def check_no_parts(path: Path) -> None:
@@ -147,8 +149,8 @@ def file_path(options: RecorderSettings) -> Path:
 
 
 def write_description(writer: RecordingWriter | PartsWriter, service: str, reply: DescriptionReply) -> None:
-    """Writes a service's reply as the metadata and attachments of `records_of`."""
-    for record in records_of(service, reply):
+    """Writes a service's reply as the metadata and attachments of `description_records`."""
+    for record in description_records(service, reply):
         if isinstance(record, MetadataRecord):
             writer.metadata(record.name, record.values)
         else:

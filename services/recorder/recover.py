@@ -22,7 +22,7 @@ from mcap.records import Attachment, Channel, Chunk, DataEnd, Header, McapRecord
 from mcap.stream_reader import StreamReader
 
 from common.errors import UserError
-from services.recorder.files.chunks import MAGIC, PREFIX, mcap_writer, records_of
+from services.recorder.files.chunks import MAGIC, PREFIX, mcap_writer, unpacked_records
 from services.recorder.files.index import summary_of
 from services.recorder.files.message_counts import MessageCounts, as_metadata
 from services.recorder.files.writer import PROFILE, UNFINISHED_SUFFIX, claim, is_being_written
@@ -73,7 +73,7 @@ class RecoveryResult:
         lines += [
             f"missing: {numbers.missing} messages of {key} by their sequence numbers, in {numbers.gaps} gaps"
             for key in self.messages
-            if (numbers := self.message_counts.lost(key)).missing
+            if (numbers := self.message_counts.sequence_totals(key)).missing
         ]
         return lines
 
@@ -260,7 +260,7 @@ def _parse(data: mmap.mmap, offset: int) -> list[McapRecord] | None:
         record.write(written)
         if written.end() != stored:  # type: ignore[no-untyped-call]
             return None
-        return records_of(record) if isinstance(record, Chunk) else [record]
+        return unpacked_records(record) if isinstance(record, Chunk) else [record]
     except Exception:  # noqa: BLE001 - each decompressor raises its own error types
         return None
 

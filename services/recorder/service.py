@@ -12,6 +12,7 @@ from common.bus.inbox import OTHERS, Sample
 from common.errors import UserError
 from common.messages.requests import RecordReply, RecordRequest, Reply, Request
 from common.messages.topics import HEALTH, RECORDING, TOPICS, Query, Topic
+from common.names import split_names
 from common.runtime.service import Service
 from services.recorder.files.message_counts import MAX_COUNT
 from services.recorder.recording import OpenRecording, warn_about_unfinished
@@ -31,10 +32,10 @@ class RecorderService(Service):
     queries: ClassVar[tuple[Query, ...]] = (RECORDING,)
     keep_all: ClassVar[bool] = True
 
-    def __init__(self, settings: RecorderSettings, *, remote: bool = True) -> None:
-        """Opens no file yet: `open` or a request does. Without ``remote`` the query `recording` is not served."""
+    def __init__(self, settings: RecorderSettings, *, serve_requests: bool = True) -> None:
+        """Opens no file yet: `open` or a request does. ``serve_requests``: serve the query `recording`."""
         super().__init__(settings)
-        if not remote:
+        if not serve_requests:
             self.queries = ()  # type: ignore[misc]
         self.options = settings
         self.inputs = parse_topics(settings.topics)  # type: ignore[misc]
@@ -47,8 +48,8 @@ class RecorderService(Service):
         self._missing: Counter[str] = Counter()  # by key, in completed recordings
         self._flush_at = 0.0
         self._opened_at = 0.0
-        self._may_be_silent = True  # until a service or a message of another was noticed
-        self._silence = ""  # why no messages arrive, as far as is known
+        self._checks_reception = True  # until another service, or a message of one, was found
+        self._reception_problem = ""  # why no messages arrive, as far as is known
         self._failure = ""  # why the last recording ended by itself
 
     def open(self) -> None:
@@ -57,7 +58,7 @@ class RecorderService(Service):
         self.loop.inbox.capacity = INBOX_CAPACITY
         warn_about_unfinished(options.directory, self.log)
         if not options.idle:
-            self._begin(numbered=False)
+            self._begin(may_rename=False)
         self._update_note()
         self._opened_at = time.monotonic()
         self._flush_at = self._opened_at + options.flush
@@ -84,7 +85,7 @@ class RecorderService(Service):
         if request.action == "start":
             if self.recording is not None:
                 return state.model_copy(update={"ok": False, "reason": f"already recording, into {state.file}"})
-            self._begin(numbered=True)
+            self._begin(may_rename=True)
         elif request.action == "stop":
             if self.recording is None:
                 return state.model_copy(update={"ok": False, "reason": "not recording"})
@@ -95,9 +96,9 @@ class RecorderService(Service):
     def _state(self) -> RecordReply:
         return self._ended if self.recording is None else self.recording.state()
 
-    def _begin(self, *, numbered: bool) -> None:
+    def _begin(self, *, may_rename: bool) -> None:
         """Opens a new file, writes the known descriptions, and queries them again in case the world has changed."""
-        self.recording = OpenRecording(self.options, self.inputs, self.loop.inbox, numbered=numbered)
+        self.recording = OpenRecording(self.options, self.inputs, self.loop.inbox, may_rename=may_rename)
         self._failure = ""
         self._update_note()
         self.log.info("recording", file=self.recording.state().file)
@@ -116,7 +117,7 @@ class RecorderService(Service):
         self._update_note()
         for key, written in recording.message_counts.written.items():
             self._written[key] += written
-            self._missing[key] += recording.message_counts.lost(key).missing
+            self._missing[key] += recording.message_counts.sequence_totals(key).missing
         writer = recording.writer
         try:
             files = writer.finish()
@@ -127,7 +128,7 @@ class RecorderService(Service):
                     "recording is incomplete",
                     file=str(writer.part.active) if writer.part.active.exists() else "none",
                     messages=writer.saved,
-                    lost=recording.lost(),
+                    lost=recording.not_in_file(),
                     dropped=dropped,
                     missing=missing,
                 )
@@ -143,7 +144,8 @@ class RecorderService(Service):
         written, missing = self._written[key], self._missing[key]
         if self.recording is not None:
             message_counts = self.recording.message_counts
-            written, missing = written + message_counts.written.get(key, 0), missing + message_counts.lost(key).missing
+            written += message_counts.written.get(key, 0)
+            missing += message_counts.sequence_totals(key).missing
         return {"written": written, "missing": min(missing, MAX_COUNT)}
 
     def due(self) -> float | None:
@@ -157,7 +159,7 @@ class RecorderService(Service):
             self._write_descriptions()
             if self.recording is not None:
                 self.recording.writer.flush()
-        self._warn_if_silent()
+        self._warn_if_nothing_arrives()
 
     @contextmanager
     def _surviving_failures(self) -> Iterator[None]:
@@ -191,25 +193,25 @@ class RecorderService(Service):
                 self._end()
             descriptions.join()
 
-    def _warn_if_silent(self) -> None:
+    def _warn_if_nothing_arrives(self) -> None:
         """Warns once if the router is not reached or the robot has no services, and logs when that has changed."""
-        if not self._may_be_silent:
+        if not self._checks_reception:
             return
-        silence, advice = self._find_silence()
-        if silence == self._silence:
+        problem, advice = self._find_reception_problem()
+        if problem == self._reception_problem:
             return
-        if silence:
-            self.log.warning(silence, advice=advice)
+        if problem:
+            self.log.warning(problem, advice=advice)
         else:
             self.log.info("messages can arrive now", robot=self.options.robot)
-        self._silence = silence
+        self._reception_problem = problem
         self._update_note()
 
-    def _find_silence(self) -> tuple[str, str]:
+    def _find_reception_problem(self) -> tuple[str, str]:
         """Why no messages arrive, and what to do; both empty if they do, or if it is too early to tell."""
         open_for, connect = time.monotonic() - self._opened_at, self.options.link().connect
         if self._has_messages_of_others() or (self.descriptions is not None and self.descriptions.present):
-            self._may_be_silent = False
+            self._checks_reception = False
             return "", ""
         if connect and not self.loop.bus.linked():
             if open_for < LINK_WARNING_DELAY_S:
@@ -232,7 +234,7 @@ class RecorderService(Service):
         idle = (
             f"the recording has ended: {self._failure}" if self._failure else "not recording until a request starts it"
         )
-        self.note = self._silence or (idle if self.idle else "")
+        self.note = self._reception_problem or (idle if self.idle else "")
 
     def _write_descriptions(self) -> None:
         if self.descriptions is None:
@@ -246,7 +248,7 @@ class RecorderService(Service):
 def parse_topics(names: str) -> tuple[Topic, ...]:
     """Topics of the comma-separated names. Defaults to all recorded topics; raises UserError for an unknown name."""
     recorded = {topic.name: topic for topic in TOPICS if topic.recorded}
-    wanted = [part.strip() for part in names.split(",") if part.strip()]
+    wanted = split_names(names)
     if unknown := [name for name in wanted if name not in recorded]:
         raise UserError(f"no topic {', '.join(unknown)}: choose from {', '.join(recorded)}")
     return tuple(recorded[name] for name in dict.fromkeys(wanted)) if wanted else tuple(recorded.values())

@@ -44,17 +44,17 @@ class AttachmentRecord:
     media_type: str
 
 
-def records_of(service: str, reply: DescriptionReply) -> Iterator[MetadataRecord | AttachmentRecord]:
+def description_records(service: str, reply: DescriptionReply) -> Iterator[MetadataRecord | AttachmentRecord]:
     """Yields the records that store a reply. Attachments come before the metadata that refers to them."""
     if isinstance(reply, WorldReply):
-        yield from _records_of_world(reply)
+        yield from _world_records(reply)
     elif isinstance(reply, ModelReply):
-        yield from _records_of_model(reply)
+        yield from _model_records(reply)
     else:
         yield MetadataRecord(f"config:{service}", {"config": reply.config, **reply.versions})
 
 
-def _records_of_world(reply: WorldReply) -> Iterator[MetadataRecord | AttachmentRecord]:
+def _world_records(reply: WorldReply) -> Iterator[MetadataRecord | AttachmentRecord]:
     """The world as a file that `load_world` reads, and scanner and robot as JSON."""
     if reply.world is not None:
         yield AttachmentRecord("world.yaml", save_world(reply.world).encode(), "application/yaml")
@@ -62,7 +62,7 @@ def _records_of_world(reply: WorldReply) -> Iterator[MetadataRecord | Attachment
     yield MetadataRecord("world", {name: d.model_dump_json() for name, d in described.items() if d is not None})
 
 
-def _records_of_model(reply: ModelReply) -> Iterator[MetadataRecord | AttachmentRecord]:
+def _model_records(reply: ModelReply) -> Iterator[MetadataRecord | AttachmentRecord]:
     """A folder ``model/`` that can be passed to `--models`, with the estimator's map in it."""
     # The name comes from the bus and becomes a file name, so it must not contain a path.
     named = re.fullmatch(r"[\w.-]+\.safetensors", reply.file) is not None

@@ -33,10 +33,6 @@ class RecorderSettings(ServiceSettings):
     idle: Annotated[bool, Field(description="record nothing until a request (query `recording`) starts it")] = False
     topics: Annotated[str, Field(description="comma-separated topic names; defaults to all recorded topics")] = ""
     compression: Annotated[Literal["zstd", "lz4", "none"], Field(description="zstd, lz4 or none")] = "zstd"
-    # At most half of MAX_CHUNK_BYTES (chunks.py), because one message and declarations may exceed the chunk size.
-    chunk_size: Annotated[
-        int, Field(ge=1024, le=1 << 23, description="chunk size in bytes; a crash loses at most one chunk")
-    ] = 1 << 18
     flush: Annotated[
         float, Field(ge=0.05, le=60, description="flush period in s; a kill loses at most the messages since then")
     ] = 0.5

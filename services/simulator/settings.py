@@ -8,6 +8,7 @@ from pydantic import Field
 
 from common.geometry.pose_text import POSE_PATTERN, parse_pose
 from common.limits import MAX_BEAMS
+from common.names import split_names
 from common.robot.scanner import SCANNERS, Scanner
 from common.robot.scanner_options import build_scanner
 from common.runtime.robot_settings import RobotSettings
@@ -96,7 +97,7 @@ class SimulatorSettings(RobotSettings):
         """Names of the services that must be running before the first scan."""
         default = "estimator,controller" if self.pace == "lockstep" else ""
         text = default if self.wait_for is None else self.wait_for
-        return {name.strip() for name in text.split(",") if name.strip()}
+        return set(split_names(text))
 
     def start_pose(self) -> tuple[float, float, float] | None:
         """Start x m, y m, yaw rad; None if the world's start is to be used."""

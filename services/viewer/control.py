@@ -142,7 +142,7 @@ class RobotControl:
         status = self._wait_for_status(robot, lambda status: status.goal_seq == goal.seq)
         if status is None:
             raise UserError(f"the controller did not take the goal within {ANSWER_TIMEOUT_S:g} s")
-        if status.state == "blocked":
+        if status.refused:
             raise UserError(status.reason)
         return ActionResult(ok=True)  # the page knows on which floor the place is
 

@@ -10,11 +10,12 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from common.errors import first_fault
 from common.geometry.world import Obstacle
 from common.limits import Angle, Coordinate
+from common.messages.topics import ROBOT_NAME_PATTERN
 
 MAX_TEXT_CHARS = 4096  # enough for an obstacle with a hundred corners
 
 Speed = Annotated[float, Field(allow_inf_nan=False, ge=-100, le=100)]
-RobotName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
+RobotName = Annotated[str, Field(pattern=rf"^{ROBOT_NAME_PATTERN}$")]
 
 
 class InvalidRequestError(ValueError):

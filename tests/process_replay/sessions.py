@@ -254,7 +254,7 @@ def recorded_payloads() -> Iterator[tuple[Any, bytes]]:
 def _rows_of_file(path: Path) -> Iterator[Row]:
     recording = read_recording(path)
     yield {"file": {"complete": recording.complete, "profile": recording.profile}}
-    for raw in recording.raw:
+    for raw in recording.payloads():
         yield {"message": raw.key, "bytes": len(raw.payload), "logged_ns": raw.logged_ns - recording.start_ns}
     for name, data in sorted(recording.attachments.items()):
         yield {"attachment": name, "bytes": len(data)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 from collections.abc import Callable, Iterator
 
@@ -14,6 +15,8 @@ from common.messages.requests import RecordReply, RecordRequest, WorldReply
 from common.messages.topics import HEALTH, ODOM, RECORDING, WORLD
 from common.robot.robot import Robot
 from common.runtime.service import Service, ServiceLoop
+from services.recorder import recording
+from services.recorder.files.writer import RecordingWriter
 from services.recorder.settings import RecorderSettings
 from tests.conftest import WAIT_TIMEOUT_S, Running
 from tests.recorder import sessions
@@ -22,6 +25,12 @@ from tests.recorder import sessions
 @pytest.fixture
 def logs(tmp_path):
     return tmp_path / "logs"
+
+
+@pytest.fixture
+def small_chunks(monkeypatch):
+    """Lets `OpenRecording` write chunks of 1 kB."""
+    monkeypatch.setattr(recording, "RecordingWriter", functools.partial(RecordingWriter, chunk_size=1024))
 
 
 @pytest.fixture

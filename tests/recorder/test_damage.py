@@ -60,6 +60,14 @@ def test_info_of_a_damaged_index(tmp_path):
     assert messages_in(bad) == SENT
 
 
+def test_index_damaged_after_opening(tmp_path):
+    path, _ = write_chunks(tmp_path, closed=True)
+    recording = read_recording(path)
+    recording.path = damaged(path, path.stat().st_size - 60)
+    assert list(recording.payloads()) == []
+    assert "its index is damaged" in recording.problem
+
+
 def bomb(path, compression, stated):
     """A recording whose only chunk unpacks to 256 MiB of zeros; ``stated`` replaces its stated size."""
     size, piece = 1 << 28, bytes(1 << 20)
@@ -94,9 +102,9 @@ def test_huge_chunk(tmp_path, compression, stated):
         tracemalloc.stop()
 
 
-def test_losses_on_a_full_disk(tmp_path):
+def test_losses_on_a_full_disk(tmp_path, small_chunks):
     inbox = Inbox()
-    session = OpenRecording(RecorderSettings(directory=tmp_path, compression="none", chunk_size=1024), (), inbox)
+    session = OpenRecording(RecorderSettings(directory=tmp_path, compression="none"), (), inbox)
     part = on_full_disk(session.writer.part, 40_000)
     for number in range(200):
         topic, payload = message(number)
@@ -111,7 +119,7 @@ def test_losses_on_a_full_disk(tmp_path):
     session.writer.finish()
     recovered = recover(part.active).messages.total()
     assert recovered > 0
-    assert (session.writer.saved, session.lost()) == (recovered, 200 - recovered)
+    assert (session.writer.saved, session.not_in_file()) == (recovered, 200 - recovered)
 
 
 def test_full_disk_from_the_beginning(tmp_path, monkeypatch):
@@ -121,8 +129,8 @@ def test_full_disk_from_the_beginning(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_full_disk_of_a_recorder_on_request(tmp_path):
-    service = RecorderService(RecorderSettings(directory=tmp_path, idle=True, compression="none", chunk_size=1024))
+def test_full_disk_of_a_recorder_on_request(tmp_path, small_chunks):
+    service = RecorderService(RecorderSettings(directory=tmp_path, idle=True, compression="none"))
     loop = ServiceLoop(service, FakeBus(), Inbox())
     service.open()
     assert service.on_request(RECORDING, RecordRequest(action="start")).recording

@@ -17,7 +17,7 @@ def odometry_in(file, bus):
     recording = read_recording(Path(file))
     assert recording.complete
     counters = from_metadata(recording.metadata["counters"])
-    assert {key: count.written for key, count in counters.items()} == recording.counts()
+    assert {key: count.written for key, count in counters.items()} == recording.counts
     assert all(count.received == count.written and not count.dropped for count in counters.values())
     key = ODOM.key(bus.robot)
     return [raw.payload for raw in recording.payloads({key})], counters[key]

@@ -68,11 +68,11 @@ def test_every_payload_is_in_the_file(recorder, recorder_health, simulator, bus,
     recording = read_recording(path)
     assert recording.complete
     assert payloads_in([path], sent) == sent
-    assert all(0 < r.published_ns <= r.logged_ns + 1_000_000_000 for r in recording.raw)
+    assert all(0 < r.published_ns <= r.logged_ns + 1_000_000_000 for r in recording.payloads())
     counters = from_metadata(recording.metadata["counters"])
     assert counters[SCAN.key(bus.robot)].received == len(sent[SCAN.key(bus.robot)])
     assert all(c.received == c.written and c.dropped == c.missing == 0 for c in counters.values())
-    assert {key: c.written for key, c in counters.items()} == recording.counts()
+    assert {key: c.written for key, c in counters.items()} == recording.counts
     assert recording.world() == sessions.WORLD
     assert recording.robot().radius == 0.31
     metadata = recording.metadata
@@ -91,7 +91,9 @@ def test_chosen_topics(recorder, recorder_health, bus, logs):
     bus.put(ODOM, b"yes")
     recorder_health(lambda _, odom: odom.received == 1)
     assert running.stop(signal.SIGINT) == 0
-    assert [(r.key, r.payload) for r in read_recording(logs / "some.mcap").raw] == [(ODOM.key(bus.robot), b"yes")]
+    assert [(r.key, r.payload) for r in read_recording(logs / "some.mcap").payloads()] == [
+        (ODOM.key(bus.robot), b"yes")
+    ]
 
 
 def test_kill_9_keeps_what_was_flushed(recorder, bus, logs):
@@ -102,14 +104,14 @@ def test_kill_9_keeps_what_was_flushed(recorder, bus, logs):
     for payload in sent:
         bus.put(ODOM, payload)
     active = logs / "first.mcap.active"
-    assert wait_until(lambda: len(read_recording(active).raw) == len(sent), 20), killed.output
+    assert wait_until(lambda: len(list(read_recording(active).payloads())) == len(sent), 20), killed.output
     killed.kill()
     assert not read_recording(active).complete
     third = recorder("--file", "third")
     third.wait_for(f"presage recover {active}")
     assert "second.mcap.active" not in third.output
     assert alive.stop() == third.stop() == 0
-    assert [raw.payload for raw in read_recording(recover(active).path).raw] == sent
+    assert [raw.payload for raw in read_recording(recover(active).path).payloads()] == sent
 
 
 IMPATIENT = """
@@ -154,7 +156,9 @@ def test_invalid_settings(process, args, message):
 
 
 LIMITED = """
-import resource, runpy, sys
+import functools, resource, runpy, sys
+from services.recorder import recording
+recording.RecordingWriter = functools.partial(recording.RecordingWriter, chunk_size=20_000)
 resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))  # acts like a full disk
 sys.argv = ["recorder", *sys.argv[1:]]
 runpy.run_module("services.recorder", run_name="__main__")
@@ -163,8 +167,7 @@ runpy.run_module("services.recorder", run_name="__main__")
 
 def test_full_disk(process, bus, tmp_path, logs):
     (tmp_path / "limited.py").write_text(LIMITED)
-    small = ("--compression", "none", "--chunk-size", "20000")
-    running = process(tmp_path / "limited.py", "--directory", str(logs), *small)
+    running = process(tmp_path / "limited.py", "--directory", str(logs), "--compression", "none")
     running.wait_for("ready")
     sent = publish(bus, 400)
     assert running.wait() == 2, running.output
@@ -204,7 +207,7 @@ def test_invented_keys(recorder, recorder_health, bus, logs):
     recorder_health(messages_rejected)
     assert running.stop() == 0
     recording = read_recording(only_file(logs))
-    assert len(recording.counts()) <= MAX_KEYS
+    assert len(recording.counts) <= MAX_KEYS
     others = from_metadata(recording.metadata["counters"])["others"]
     assert others.dropped == others.received >= 200
     assert others.written == 0

@@ -18,7 +18,12 @@ from common.messages.requests import ConfigReply, ModelReply, WorldReply
 from common.messages.topics import CONFIG, MODEL, WORLD
 from common.robot.robot import Robot
 from services.recorder import session_description
-from services.recorder.session_description import AttachmentRecord, DescriptionCollector, MetadataRecord, records_of
+from services.recorder.session_description import (
+    AttachmentRecord,
+    DescriptionCollector,
+    MetadataRecord,
+    description_records,
+)
 from tests.conftest import WAIT_TIMEOUT_S
 from tests.recorder.sessions import SCANNER
 from tests.recorder.sessions import WORLD as HALL
@@ -30,7 +35,7 @@ MODEL_OF_HALL = ModelReply(estimator="precise", world=HALL, card='{"a": 1}', fil
 
 def stored(service, answer):
     """Metadata by name and attachments by name."""
-    records = list(records_of(service, answer))
+    records = list(description_records(service, answer))
     metadata = {r.name: r.values for r in records if isinstance(r, MetadataRecord)}
     attachments = {r.name: r.data for r in records if isinstance(r, AttachmentRecord)}
     assert len(metadata) + len(attachments) == len(records)

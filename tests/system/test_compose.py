@@ -101,7 +101,7 @@ def test_up_drives_two_robots_to_the_goal(compose):
     first, second = project.recordings()
     assert (first.name[:15], second.name[:15]) == ("presage-robot-1", "presage-robot-2")
     recording = read_recording(first)
-    counts = {key.split("/")[-1]: count for key, count in recording.counts().items()}
+    counts = {key.split("/")[-1]: count for key, count in recording.counts.items()}
     assert min(counts["scan"], counts["belief"]) > 50
     assert recording.world().name == "corridor"
 

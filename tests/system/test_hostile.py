@@ -154,6 +154,6 @@ def test_afterwards(system, before):
         assert 0 < running[name].output.count("payload dropped") < EXAMPLES  # at most once per second and key
     assert running["recorder"].stop() == 0
     (file,) = folder.glob("*.mcap")
-    counts = read_recording(file).counts()
+    counts = read_recording(file).counts
     for topic in TOPICS:
         assert counts[topic.key(bus.robot, "intruder")] >= EXAMPLES, topic.name

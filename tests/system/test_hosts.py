@@ -22,5 +22,5 @@ def test_documented_hosts(process, tmp_path):
     assert running.wait(170) == 0, running.output
     assert "reached: within 0.02 m of the goal" in running.output
     (file,) = (tmp_path / "recordings").glob("*.mcap")
-    counts = {key.split("/")[-1]: count for key, count in read_recording(file).counts().items()}
+    counts = {key.split("/")[-1]: count for key, count in read_recording(file).counts.items()}
     assert min(counts["scan"], counts["belief"], counts["cmd_vel"]) > 40

@@ -87,7 +87,7 @@ def test_demo_in_an_unknown_building(process, tmp_path):
     assert running.wait(170) == 0, running.output
     numbers = json.loads(file.read_text())
     assert numbers["world"] == "rooms"
-    for step, words in zip(numbers["steps"], ("explored a", "carried off", "a goal", "returned"), strict=True):
+    for step, words in zip(numbers["steps"], ("explored a", "kidnapped", "a goal", "returned"), strict=True):
         assert words in step["what"]
         assert step["error_m"] < 0.1, numbers
     assert numbers["steps"][-1]["mapped_share"] > 0.9

@@ -102,7 +102,7 @@ class FreeSpace:
         """Free space of a world; clearances are exact at the cell centres."""
         grid = Grid.over(world, resolution)
         centres = grid.centres().reshape(*grid.shape, 2)
-        clearance = world.clearances(centres[0, :, 0], centres[:, 0, 1])
+        clearance = world.clearance_on_lattice(centres[0, :, 0], centres[:, 0, 1])
         return cls(grid, clearance, np.zeros(grid.shape, bool), tuple(world.floors))
 
     @classmethod

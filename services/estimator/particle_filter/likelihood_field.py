@@ -47,7 +47,7 @@ class SurfaceDistances:
             )
         x = self.origin[0] + resolution * np.arange(self.shape[0])
         y = self.origin[1] + resolution * np.arange(self.shape[1])
-        nodes = world.surface_distances(x, y, max_dist).T
+        nodes = world.surface_distance_on_lattice(x, y, max_dist).T
         # In a cell d = a + b u + c v + e u v, with u and v in [0, 1). The four numbers are stored side by side, so that
         # each point needs one memory access.
         a, right, up, both = nodes[:-1, :-1], nodes[1:, :-1], nodes[:-1, 1:], nodes[1:, 1:]

@@ -47,6 +47,7 @@ from services.estimator.precise.precision import Precision
 from services.estimator.precise.protection import EstimateError
 from services.estimator.precise.search import search_around, search_everywhere, search_near
 from services.estimator.precise.settings import PreciseSettings
+from services.estimator.precise.swept_scan import SweptEvidence
 from services.estimator.shared.interface import (
     Hypothesis,
     Observation,
@@ -55,7 +56,7 @@ from services.estimator.shared.interface import (
     State,
     start_belief,
 )
-from services.estimator.shared.motion_correction import correct_motion, pose_at_stamp
+from services.estimator.shared.motion_correction import correct_motion, pose_at_stamp, times_from_middle
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -97,6 +98,7 @@ class ScanMatch:
     poses: Array  # (N, 3), one per hypothesis
     evidence: Evidence  # at these poses
     local_pose: Array | None = None  # (3,) in the local frame, if the motion comes from the local map
+    swept: SweptEvidence | None = None  # if the scan took time, and was corrected for the motion
 
     @cached_property
     def explained(self) -> Array:
@@ -202,10 +204,10 @@ class PreciseEstimator:
         if (
             observation.time_increment
             and not observation.is_earlier_than(self._stamp)
-            and any(each.is_near(match.poses[0]) for each in motions[0][:-1])
+            and motions[0][-1].is_near(match.poses[0])
         ):
-            # Only if the match is one of the predicted motions: otherwise the robot may have been carried to another
-            # place, and may have stood still during the scan.
+            # Only if the robot can have moved like this: otherwise it may have been carried to another place, and may
+            # have stood still during the scan.
             match = self._correct_motion_again(match, observation, period)
         # Fusion of match and motion prior
         view = match.view
@@ -277,7 +279,8 @@ class PreciseEstimator:
     def _correct_motion(self, view: View, observation: Observation, velocity: Array | None) -> View:
         """The view of the observation, corrected for a motion with ``velocity`` (3,) in base_link, and thinned."""
         corrected = correct_motion(observation, velocity, self.mount)
-        return replace(view, angles=corrected.angles, ranges=corrected.ranges).thinned(TARGET_BEAMS)
+        times = times_from_middle(observation) if velocity is not None else np.zeros(1)
+        return replace(view, angles=corrected.angles, ranges=corrected.ranges, times=times).thinned(TARGET_BEAMS)
 
     def _velocity(self, hypothesis: TrackedHypothesis, observation: Observation) -> Array | None:
         """Velocity (3,) in base_link from the last poses or else from odometry, or None if it is unknown."""
@@ -384,8 +387,11 @@ class PreciseEstimator:
         # Not `between(last, this)`: beams are moved in base_link at this scan.
         velocity = -se2.between(match.poses[0], self.hypotheses[0].pose) / period
         view = self._correct_motion(match.view, observation, velocity)
-        poses, evidence = view.descend(match.poses, _prior_of([each[-1] for each in match.motions]))
-        return replace(match, view=view, poses=poses, evidence=evidence)
+        poses, _ = view.descend(match.poses, _prior_of([each[-1] for each in match.motions]))
+        noise = self.settings.motion
+        limits = np.array([noise.acceleration, noise.acceleration, noise.turn_acceleration])
+        swept = SweptEvidence.from_scan(view, poses, limits, period)
+        return replace(match, view=view, poses=poses, evidence=swept.of_pose(), swept=swept)
 
     def _fuse(
         self, k: int, match: ScanMatch, predicted: list[MotionCandidate], observation: Observation
@@ -420,6 +426,11 @@ class PreciseEstimator:
         ]
         best = min(fused, key=lambda each: each.negative_log_evidence)
         updated = update_hypothesis(hypothesis, best, evidence, k, period, unobserved=unknown_motion)
+        stands = len(fused) > 1 and best is fused[0]
+        if match.swept is not None and not stands:
+            mean_velocity = se2.between(hypothesis.pose, updated.pose) / period
+            interpolated = pose_at_stamp(updated.pose, mean_velocity, period, observation)
+            updated = replace(updated, displacement=match.swept.displacement(k, updated.pose, interpolated))
         if observation.is_earlier_than(self._stamp):
             updated = replace(updated, velocity=None)
         else:
@@ -763,7 +774,10 @@ class PreciseEstimator:
         self.hypotheses = clip_to_map(self.hypotheses, self.bounds)
         period = self._period(observation.stamp)
         poses = [
-            pose_at_stamp(each.pose, self._velocity(each, observation), period, observation) for each in self.hypotheses
+            pose_at_stamp(each.pose, self._velocity(each, observation), period, observation)
+            if each.displacement is None
+            else each.displacement.pose_at_stamp(each.pose)
+            for each in self.hypotheses
         ]
         self._stamp, self._odom = observation.stamp, observation.odom
         # Only now, because nothing around the robot has changed if a search has shown that it was carried.
@@ -790,8 +804,11 @@ class PreciseEstimator:
     def _posterior(self, view: View, poses: list[Array], predicted: Predicted) -> Posterior:
         """The posterior, with the hypotheses at their ``poses`` at the stamp of the scan."""
         best = self.hypotheses[0]
-        error = EstimateError.from_scan(view, best.pose, self._covariance(best), best.explained)
-        covariances = [error.total_covariance(float(best.pose[2])), *map(self._covariance, self.hypotheses[1:])]
+        error = EstimateError.from_scan(view, best.pose, self._covariance_at_stamp(best), best.explained)
+        covariances = [
+            error.total_covariance(float(best.pose[2])),
+            *map(self._covariance_at_stamp, self.hypotheses[1:]),
+        ]
         hypotheses = tuple(
             Hypothesis(pose, covariance, hypothesis.weight)
             for pose, covariance, hypothesis in zip(poses, covariances, self.hypotheses, strict=True)
@@ -813,6 +830,12 @@ class PreciseEstimator:
     def _covariance(self, hypothesis: TrackedHypothesis) -> Array:
         floor = np.array([self.settings.floor_position] * 2 + [self.settings.floor_heading])
         return np.asarray(hypothesis.covariance(self.settings.inflation) + np.diag(floor**2))
+
+    def _covariance_at_stamp(self, hypothesis: TrackedHypothesis) -> Array:
+        covariance = self._covariance(hypothesis)
+        if hypothesis.displacement is None:
+            return covariance
+        return hypothesis.displacement.covariance_at_stamp(covariance)
 
     def _probability(self) -> float:
         """Probability that the best hypothesis is within 0.2 m and 5 degrees of the truth."""

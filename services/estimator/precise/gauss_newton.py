@@ -109,6 +109,9 @@ class View:
     map_cell: float = 0.0  # m, edge of the cells if the map is a grid
     map_offset: float = 0.0  # m, mean distance of the real surfaces behind those that the model predicts
     log_map_error_prior: float = 0.0  # nats, log probability that the map's error is this large
+    times: Array = field(
+        default_factory=lambda: np.zeros(1)
+    )  # (B,) s after the middle of the sweep; (1,) if all at once
     _last: deque[_PredictedScans] = field(default_factory=lambda: deque(maxlen=2), init=False, repr=False)
 
     def thinned(self, beams: int) -> View:
@@ -116,7 +119,7 @@ class View:
         k = max(1, len(self.angles) // beams)
         # numba would compile every loop once more for strided arrays, so these are contiguous.
         angles, ranges = np.ascontiguousarray(self.angles[::k]), np.ascontiguousarray(self.ranges[::k])
-        return replace(self, angles=angles, ranges=ranges)
+        return replace(self, angles=angles, ranges=ranges, times=self.times[::k])
 
     def descend(
         self, poses: Array, prior: Prior | None = None, schedule: tuple[float, ...] = TRACKING_SCHEDULE_M

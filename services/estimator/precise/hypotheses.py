@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from services.estimator.precise.gauss_newton import View
     from services.estimator.precise.likelihood import Evidence
     from services.estimator.precise.motion_model import FusedMotion
+    from services.estimator.precise.swept_scan import Displacement
 
 NEAR_POSITION_M, NEAR_HEADING_RAD = 0.2, math.radians(5)  # a pose with a larger error is wrong
 SAME_POSITION_M, SAME_HEADING_RAD = 0.1, 0.1  # of hypotheses nearer to one another, the best is kept
@@ -57,6 +58,7 @@ class TrackedHypothesis:
     # (3, 3) covariance of the pose with the scale errors of odometry, as in `MotionCandidate`
     slip_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
     weight: float = 1.0
+    displacement: Displacement | None = None  # of the pose at the stamp of a swept scan, while the robot moves
     # number of consecutive scans at which neither the map nor the local map showed the motion along some direction
     unobserved_scans: int = 0
 

@@ -25,7 +25,7 @@ def correct_motion(observation: Observation, velocity: Array | None, mount: Arra
     """
     if velocity is None or not observation.time_increment:
         return observation
-    times = beam_times(len(observation.angles), observation.time_increment) - _middle(observation)
+    times = times_from_middle(observation)
     ranges, angles = correct_beams(observation.ranges, observation.angles, times[:, None] * velocity, mount)
     return replace(observation, ranges=ranges, angles=angles, time_increment=0.0)
 
@@ -39,6 +39,11 @@ def pose_at_stamp(pose: Array, velocity: Array | None, period: float, observatio
         return pose
     back = se2.inverse(velocity * period)
     return se2.compose(pose, back * (_middle(observation) / period))
+
+
+def times_from_middle(observation: Observation) -> Array:
+    """Times (B,) in s of the beams, from the middle of the sweep."""
+    return beam_times(len(observation.angles), observation.time_increment) - _middle(observation)
 
 
 def _middle(observation: Observation) -> float:

@@ -17,7 +17,9 @@ from services.mapper.slam.grid import grid_of_scans
 from services.mapper.slam.submaps import KEY_SCANS_PER_SUBMAP
 from services.mapper.slam.trajectory import poses_of_all_scans
 
-WINDOWS_M = (1.0, 3.0, 10.0, 30.0)  # of the rounds of loop closing after each submap
+# The `window` of each round of loop closing after a submap, smallest first as in `trajectory`. Each is used only once,
+# because all are used again after the next submap.
+WINDOWS_M = (1.0, 3.0, 10.0, 30.0)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,10 @@ from services.mapper.slam.drive import RawDrive
 from services.mapper.slam.front_end import TrackedDrive, track_drive
 from services.mapper.slam.loop_closure import LoopClosure
 
-WINDOWS_M = (1.0, 1.0, 3.0, 3.0, 10.0, 10.0, 30.0, 30.0, 1.0, 1.0)  # of the rounds of loop closing
+# The `window` of each round of loop closing: first only pairs of submaps whose relative position is well known, because
+# their closures make it better known for other pairs. Each window is used twice, because a round tries only few pairs
+# with each submap. The last rounds try those that became well known only after the wide windows.
+WINDOWS_M = (1.0, 1.0, 3.0, 3.0, 10.0, 10.0, 30.0, 30.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType, Writer
 
 COMPRESSION = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
-MAX_CHUNK_BYTES = 1 << 24  # the recorder writes at most half of this
+CHUNK_BYTES = 1 << 18  # the recorder ends a chunk when it is this large; a crash loses at most one chunk
+MAX_CHUNK_BYTES = 1 << 24  # read at most; far more than CHUNK_BYTES, which one message and declarations may exceed
 MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of every file
 PREFIX = Struct("<BQ")  # first bytes of every record: opcode and length (MCAP specification, "Records")
 # Private in mcap 1.6, whose writer declares each channel in one chunk only and has no option to repeat declarations.
@@ -74,7 +75,7 @@ def mcap_writer(stream: BinaryIO, compression: str, chunk_size: int) -> tuple[Wr
     return writer, chunk
 
 
-def records_of(chunk: Chunk) -> list[McapRecord]:
+def unpacked_records(chunk: Chunk) -> list[McapRecord]:
     """The schemas, channels and messages of a chunk, after checking its checksum.
 
     Raises ValueError, or the decompressor's own error, if the chunk is damaged or too large.
@@ -83,7 +84,7 @@ def records_of(chunk: Chunk) -> list[McapRecord]:
 
 
 def uncompressed(chunk: Chunk) -> bytes:
-    """The uncompressed records of a chunk, at most `MAX_CHUNK_BYTES`. Raises the errors of `records_of`.
+    """The uncompressed records of a chunk, at most `MAX_CHUNK_BYTES`. Raises the errors of `unpacked_records`.
 
     mcap's own decompression has no limit, and a file of 200 kB can unpack to chunks of gigabytes.
     """

@@ -19,7 +19,7 @@ from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, ChunkIndex, Message
 from mcap.summary import Summary
 
-from services.recorder.files.chunks import MAGIC, PREFIX, records_of
+from services.recorder.files.chunks import MAGIC, PREFIX, unpacked_records
 
 FOOTER = Struct("<BQQQI")  # opcode, length, offset of the summary, offset of the summary offsets, summary checksum
 CRC_BYTES = 4  # size of the checksum, which itself is not part of the checksummed data
@@ -73,7 +73,7 @@ def messages_in_order(
         ):
             continue
         stream.seek(offset + PREFIX.size)
-        for number, record in enumerate(records_of(Chunk.read(ReadDataStream(stream)))):
+        for number, record in enumerate(unpacked_records(Chunk.read(ReadDataStream(stream)))):
             if not isinstance(record, Message) or record.channel_id not in ids:
                 continue
             log_time = record.log_time

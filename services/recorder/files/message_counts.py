@@ -77,8 +77,8 @@ class MessageCounts:
                 instance = ""
             instances.setdefault(instance, SequenceNumbers()).add(number)
 
-    def lost(self, key: str) -> SequenceNumbers:
-        """Gaps and missing messages of a key, summed over all instances."""
+    def sequence_totals(self, key: str) -> SequenceNumbers:
+        """Gaps, missing messages and restarts of a key, summed over all instances."""
         total = SequenceNumbers()
         for sequence in self.sequences.get(key, {}).values():
             total.gaps += sequence.gaps
@@ -94,7 +94,7 @@ class MessageCounts:
         keys = sorted(set(received) | set(self.written))
         found = {}
         for key in keys:
-            numbers = self.lost(key)
+            numbers = self.sequence_totals(key)
             found[key] = KeyCounts(
                 received=received.get(key, 0),
                 written=self.written.get(key, 0),

@@ -24,11 +24,20 @@ class PartLimits:
 class PartsWriter:
     """Writes one file after another and repeats metadata and attachments in each.
 
-    Has the interface of RecordingWriter and raises the same errors.
+    Methods have the meaning and errors of those of `RecordingWriter`; `finish` returns all files.
     """
 
-    def __init__(self, open_part: Callable[[int], RecordingWriter], limits: PartLimits, ending: Ending = dict) -> None:
-        """Opens part 1. ``ending`` returns the metadata records that are written at the end of each part."""
+    def __init__(
+        self,
+        first: RecordingWriter,
+        open_part: Callable[[int], RecordingWriter],
+        limits: PartLimits,
+        ending: Ending = dict,
+    ) -> None:
+        """Starts with the part ``first``; ``open_part`` opens later ones by their numbers from 2.
+
+        ``ending`` returns the metadata records that are written at the end of each part.
+        """
         self._open, self._limits, self._ending = open_part, limits, ending
         self._metadata: dict[str, dict[str, str]] = {}  # by name; the last record of each name
         self._attachments: dict[str, tuple[bytes, str, int]] = {}
@@ -37,7 +46,7 @@ class PartsWriter:
         self._saved_before = 0  # messages in completed parts
         self._repeated = 0  # bytes of this part that each part repeats; they do not count for its size
         self.finished: list[Path] = []
-        self.part = open_part(1)
+        self.part = first
 
     @property
     def failed(self) -> bool:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from common.errors import UserError
 from common.messages.topics import Topic
-from services.recorder.files.chunks import mcap_writer
+from services.recorder.files.chunks import CHUNK_BYTES, mcap_writer
 
 if sys.platform != "win32":
     import fcntl
@@ -34,7 +34,7 @@ class NameTakenError(UserError):
 class RecordingWriter:
     """Writes NAME.mcap.active, which `finish` renames to NAME.mcap. Every method raises UserError if writing fails."""
 
-    def __init__(self, path: Path, compression: str = "zstd", chunk_size: int = 1 << 18) -> None:
+    def __init__(self, path: Path, compression: str = "zstd", chunk_size: int = CHUNK_BYTES) -> None:
         """Opens the file. Raises UserError if that fails, and NameTakenError if the name is taken."""
         self.path, self.active = path, path.with_name(path.name + UNFINISHED_SUFFIX)
         self.written: Counter[str] = Counter()  # by key

@@ -17,8 +17,8 @@ from common.runtime.service_monitor import SUBSTITUTES
 MAX_LAG_S = 1.0  # a replay that lags further behind continues from its position instead of catching up
 MAX_STEPS = 10_000  # in one request
 LOOP_GAP_S = 0.1  # pause between the end of a loop and its next pass
-# The services that move the robot as these topics say
-OBEYED_BY = {
+# Topics that make a robot move, and the services that execute them
+EXECUTED_BY = {
     CMD_VEL: frozenset({"simulator", SUBSTITUTES["simulator"]}),
     GOAL: frozenset({"controller"}),
     DRIVE: frozenset({"controller"}),
@@ -172,7 +172,7 @@ def find_conflicts(keys: Mapping[str, Topic], alive: Mapping[str, Collection[str
         publishers = {publisher, SUBSTITUTES.get(publisher, publisher), "replay"}
         for service in publishers & services if topic.rate else ():
             found.setdefault((robot, service), []).append(key)
-        if OBEYED_BY.get(topic, frozenset()) & services:
+        if EXECUTED_BY.get(topic, frozenset()) & services:
             driven.append(key)
     reasons = [
         f"the {service} of {robot!r} is alive and publishes {', '.join(held)}"

@@ -52,8 +52,7 @@ class ReplayOptions:
     loop: bool = False
     robot: str = ""  # replaces the recorded robot's name
     force: bool = False  # publish even beside a live publisher of the same keys
-    paused: bool = False  # start paused
-    stay: bool = False  # pause at the end instead of ending
+    paused: bool = False  # start paused, and pause at the end instead of ending
 
 
 class ReplayControl:
@@ -141,7 +140,7 @@ class Replay:
                 break
             if player.loop and not player.seek_pending:
                 player.restart(time.monotonic())
-            elif self.options.stay and not player.seek_pending:
+            elif self.options.paused and not player.seek_pending:
                 self._wait_at_end(on_progress, stop)
 
     def _window(self, position: float) -> tuple[int, int | None]:
@@ -255,8 +254,3 @@ def replay(
     if recording.problem and recording.indexed:  # damage inside a finished file is only found while reading
         print(f"warning: {recording.warning}", file=sys.stderr)
     return running.counts
-
-
-def names_of(text: str) -> frozenset[str]:
-    """Set of the comma-separated names in ``text``."""
-    return frozenset(part.strip() for part in text.split(",") if part.strip())

@@ -64,9 +64,9 @@ def test_lattice_distances(seed):
     world = world_of(speckled(seed), origin=(1.0, -2.0, 0.0))
     x, y = np.sort(rng.uniform(-1, 11, 12)), np.sort(rng.uniform(-5, 7, 9))
     nodes = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    np.testing.assert_allclose(world.clearances(x, y).ravel(), world.clearance(nodes), atol=1e-9)
+    np.testing.assert_allclose(world.clearance_on_lattice(x, y).ravel(), world.clearance(nodes), atol=1e-9)
     away = np.clip(world.grid.geometry.distance(OCCUPIED, nodes), -0.7, 0.7)
-    np.testing.assert_allclose(world.surface_distances(x, y, 0.7).ravel(), away, atol=1e-9)
+    np.testing.assert_allclose(world.surface_distance_on_lattice(x, y, 0.7).ravel(), away, atol=1e-9)
 
 
 def test_distances_to_uniform_cells():

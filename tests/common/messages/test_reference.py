@@ -30,7 +30,7 @@ def test_the_page_lists_all_topics_and_fields():
     assert "\n    mount: Pose = " in text  # a type and a default
     assert "\n    yaw=0.0 " in text  # a default that shows the type
     assert "+inf is nothing within range_max" in text  # a comment beside its field
-    assert "the negative gradient of accuracy" in " ".join(text.split())  # a comment below its field
+    assert "the negative gradient of accuracy" in " ".join(text.split())  # a comment above its field
 
 
 def test_links_have_targets():

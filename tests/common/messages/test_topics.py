@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.messages.topics import QUERIES, ROOT, TOPICS, alive_key, topic_of
+from common.messages.topics import QUERIES, ROBOT_NAME_PATTERN, ROOT, TOPICS, alive_key, topic_of
 from common.runtime.config import ServiceSettings
 
-ROBOTS = st.from_regex(r"[A-Za-z0-9_.-]{1,64}", fullmatch=True)  # what the settings let through
+ROBOTS = st.from_regex(ROBOT_NAME_PATTERN, fullmatch=True)  # what the settings let through
 CHUNK = re.compile(r"[A-Za-z0-9_.-]+")
 
 

@@ -14,7 +14,7 @@ from common.bus.bus import DEFAULT_ENDPOINT, Link
 from common.errors import UserError
 from common.geometry.pose_text import POSE_PATTERN, parse_initial_pose, parse_pose
 from common.router.router import RouterSettings
-from common.runtime.config import ServiceSettings, load_section, load_settings, split_endpoints
+from common.runtime.config import ServiceSettings, load_section, load_settings
 from presage.logs.options import LogSettings
 
 
@@ -171,11 +171,6 @@ def test_help(load, capsys):
     for part in ("usage: python -m services.thing", "python -m services.thing --size 3", "how large", "--log-json"):
         assert part in text
     assert "--robot" not in text.partition("usage: python -m common.router")[2]
-
-
-def test_endpoints_are_split_at_commas():
-    assert split_endpoints(" tcp/a:1, tcp/b:2,, ") == ("tcp/a:1", "tcp/b:2")
-    assert split_endpoints("") == ()
 
 
 def test_settings_of_a_router(load, monkeypatch):

@@ -29,7 +29,7 @@ def test_distances_of_a_learned_field():
     model = load_model(EstimatorOptions(world), world)[0]
     surfaces = LearnedSurfaces(model.field, world.bounds, world.name)
     x, y = np.array([3.0, 9.0, 100.0]), np.array([1.0, 1.5])
-    found = surfaces.surface_distances(x, y, 2.0)
+    found = surfaces.surface_distance_on_lattice(x, y, 2.0)
     assert found.shape == (2, 3)
-    assert found[:, :2] == pytest.approx(world.surface_distances(x[:2], y, 2.0), abs=0.03)
+    assert found[:, :2] == pytest.approx(world.surface_distance_on_lattice(x[:2], y, 2.0), abs=0.03)
     assert found[0, 2] == 2.0

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from lab.benchmarks import visits
+from lab.benchmarks import building_drives
 from lab.benchmarks.live_changes import AFTER, BEFORE, PRESENT, follow_changes, table
 
 
 def test_short_drive(monkeypatch):
-    monkeypatch.setattr(visits, "PRESENT_SCANS", 60)  # that each model is learned from: enough to find single scans
+    monkeypatch.setattr(building_drives, "PRESENT_SCANS", 60)  # of each model: enough to find single scans
     row = follow_changes("office", seed=2, seconds=4.0, scans=3)
     assert [len(row[model]) for model in (BEFORE, AFTER, PRESENT)] == [3, 3, 3]
     assert None in row[BEFORE]  # because of the moved furniture

@@ -8,7 +8,8 @@ import pytest
 from common.geometry import se2
 from common.geometry.world import World
 from lab.accuracy.scenes import Scene
-from lab.benchmarks.refinement import drive_for, wall_errors
+from lab.benchmarks.building_drives import drive_for
+from lab.benchmarks.refinement import wall_errors
 from lab.integrity.buildings import make_building
 from services.estimator.shared.generative_models import RayCaster
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from lab.accuracy.scenes import Scene
-from lab.benchmarks.visits import MODELS, contains, drive_through_rooms, move_furniture_in, table
+from lab.benchmarks.building_drives import contains, drive_through_rooms
+from lab.benchmarks.visits import MODELS, move_furniture_in, table
 from lab.integrity.buildings import make_building
 
 

@@ -113,7 +113,7 @@ def test_velocities(tmp_path):
 
 def position_errors(file, world):
     estimator_options = build_estimator_options(file, world, "precise", "exact", None, 0.02, 0, "")
-    options = {"independent_scans": False, "odometry": True, "out": file.with_name("p.json")}
+    options = {"odometry": True, "out": file.with_name("p.json")}
     rows = localize(LocalizeOptions.of(file, estimator_options, "track", "base_link", Reading(), **options), CONSOLE)
     return np.hypot(*(np.array([[row["x"], row["y"]] for row in rows]) - truth(STAMPS)[:, :2]).T)
 

@@ -220,14 +220,23 @@ def test_log_lines(tmp_path):
         ("goal", "goal (8, 1) m, within 0.25 m", 2),
         ("estimator", "uses version 1 of its field, learned while driving", 2),
         ("controller", "navigating: on the way", 2),
-    ] + [("estimator", "no complaint any more", 2)] * (len(lines) - 7)
+    ] + [("estimator", "the problem is over", 2)] * (len(lines) - 7)
     assert len(lines) == 8
 
 
-def test_cancelled_goal(tmp_path):
-    cancel = Goal(stamp_ns=0, pose=Pose(x=0.0, y=0.0), cancel=True).encode()
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"cancel": True}, "the goal was cancelled"),
+        ({"explore": True}, "exploring"),
+        ({"explore": True, "cancel": True}, "the goal was cancelled"),
+    ],
+)
+def test_goal_ends(tmp_path, change, text):
+    request = Goal(stamp_ns=0, pose=Pose(x=0.0, y=0.0), **change).encode()
     late = driven.BEGAN_NS + driven.STEPS * driven.PERIOD_NS
-    found, _ = decoded(exported(tmp_path, also=[(GOAL, GOAL.key("rob"), cancel, late)])[0])
+    found, _ = decoded(exported(tmp_path, also=[(GOAL, GOAL.key("rob"), request, late)])[0])
+    assert [line.message for _, line in found["/log"] if line.name == "goal"][1:] == [text]
     shown, gone = (message for _, message in found["/goal/shape"])
     assert [e.id for e in shown.entities] == [d.id for d in gone.deletions] == ["goal"]
     assert shown.entities[0].cylinders[0].size.x == pytest.approx(0.5)

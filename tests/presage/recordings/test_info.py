@@ -121,7 +121,7 @@ def test_echo_of_a_file(tmp_path, capsys):
     assert lines[0]["key"] == BELIEF.key("rob")
     assert lines[0]["time_s"] == pytest.approx(0.509)
     assert lines[0]["pose"]["x"] == driven.believed(5)[0]
-    assert len(echoed(capsys, path)[1]) == sum(read_recording(path).counts().values())
+    assert len(echoed(capsys, path)[1]) == sum(read_recording(path).counts.values())
     assert echoed(capsys, path, SCAN.key("rob"), 1, full=True)[1][0]["ranges"] == [1.0, "inf", "-inf", 2.5]
     assert echoed(capsys, path, "belief", start=100.0) == (1, [])
     (bad,) = (line for line in echoed(capsys, path, "truth")[1] if "undecodable" in line)

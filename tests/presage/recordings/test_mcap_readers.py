@@ -33,7 +33,7 @@ def split(folder):
     def part(number):
         return RecordingWriter(folder / f"run-{number}.mcap")
 
-    return fill(PartsWriter(part, PartLimits(seconds=0.4), lambda: {"end": {"a": "b"}}))
+    return fill(PartsWriter(part(1), part, PartLimits(seconds=0.4), lambda: {"end": {"a": "b"}}))
 
 
 def recovered(folder):

@@ -58,7 +58,7 @@ def job(file, mode="global", frame="base_link", estimator="precise", model="lear
     estimator_options = build_estimator_options(
         file, world, estimator, model, models, 0.02, 0, more.pop("initial_pose", "")
     )
-    given = {"independent_scans": False, "odometry": True, "out": out, **more}
+    given = {"odometry": True, "out": out, **more}
     return LocalizeOptions.of(file, estimator_options, mode, frame, given.pop("reading", Reading()), **given)
 
 
@@ -66,10 +66,10 @@ def errors(rows, path=PATH):
     return np.hypot(*(np.array([[r["x"], r["y"]] for r in rows]) - path[:, :2]).T)
 
 
-@pytest.mark.parametrize("independent_scans", [False, True])
+@pytest.mark.parametrize("mode", ["global", "single"])
 @pytest.mark.parametrize("model", ["learned", "exact"])
-def test_csv(tmp_path, capsys, independent_scans, model):
-    localize(job(npz(tmp_path), independent_scans=independent_scans, model=model), Console(stderr=True))
+def test_csv(tmp_path, capsys, mode, model):
+    localize(job(npz(tmp_path), mode=mode, model=model), Console(stderr=True))
     rows = list(csv.DictReader(capsys.readouterr().out.splitlines()))  # nothing else on standard output
     assert tuple(rows[0]) == COLUMNS
     assert len(rows) == 10
@@ -81,9 +81,10 @@ def test_csv(tmp_path, capsys, independent_scans, model):
 
 def test_json(tmp_path):
     out = tmp_path / "poses.json"
-    rows = localize(job(npz(tmp_path), out=out), CONSOLE)
+    rows = localize(job(npz(tmp_path), mode="single", out=out), CONSOLE)
     data = json.loads(out.read_text())
     assert {"world", "estimator", "model", "frame", "seed", "commit"} <= set(data)
+    assert data["mode"] == "single"
     assert data["rows"] == rows
 
 

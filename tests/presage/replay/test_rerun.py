@@ -59,7 +59,7 @@ def test_copy_contains_every_old_byte(session, run):
 
 def test_new_beliefs_follow_the_old(run):
     new = read_recording(run[0])
-    counts = {key: count for key, count in new.counts().items() if key.startswith("presage/robot-rerun/")}
+    counts = {key: count for key, count in new.counts.items() if key.startswith("presage/robot-rerun/")}
     assert counts == {BELIEF.key("robot-rerun"): made.SCANS, PREDICTION.key("robot-rerun"): made.SCANS}
     beliefs = [(raw.key, Belief.decode(raw.payload).stamp_ns) for raw in new.payloads() if raw.key.endswith("/belief")]
     stamps = [i * made.PERIOD_NS for i in range(made.SCANS)]

@@ -80,8 +80,8 @@ def test_two_instances():
             message_counts.add(
                 key, Health(stamp_ns=0, seq=number, service="recorder", uptime=1, instance=name).encode()
             )
-    lost = message_counts.lost(key)
-    assert (lost.gaps, lost.missing, lost.restarts, lost.reordered) == (1, 1, 0, 0)
+    totals = message_counts.sequence_totals(key)
+    assert (totals.gaps, totals.missing, totals.restarts, totals.reordered) == (1, 1, 0, 0)
 
 
 def test_invented_instances():
@@ -103,4 +103,4 @@ def test_forged_numbers(numbers):
     message_counts = MessageCounts()
     for number in numbers:
         message_counts.add(SCAN, msgpack.packb({"seq": number}))
-    assert TopicHealth(key="k", missing=message_counts.lost(SCAN).missing).missing > 0
+    assert TopicHealth(key="k", missing=message_counts.sequence_totals(SCAN).missing).missing > 0

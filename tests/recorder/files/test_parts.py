@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -12,7 +14,7 @@ from common.messages.topics import SCAN, TRUTH
 from services.recorder.files.parts import PartLimits, PartsWriter
 from services.recorder.files.writer import NameTakenError, RecordingWriter
 from services.recorder.reader import read_recording
-from services.recorder.recording import parts_of
+from services.recorder.recording import open_first_part, open_part
 from services.recorder.settings import RecorderSettings
 from tests.recorder.sessions import on_full_disk
 
@@ -26,7 +28,8 @@ def truth(number):
 
 def writer_in(folder, limits, **changes):
     options = RecorderSettings(directory=folder, file="run", split_minutes=1, **changes)
-    return PartsWriter(parts_of(options), limits, lambda: {"counters": {"so": "far"}})
+    path, first = open_first_part(options)
+    return PartsWriter(first, partial(open_part, options, path), limits, lambda: {"counters": {"so": "far"}})
 
 
 @settings(max_examples=10)
@@ -56,8 +59,8 @@ def test_parts_by_time(tmp_path_factory, count, seconds):
     assert payloads == [truth(number) for number in range(count)]
 
 
-def test_parts_by_size(tmp_path):
-    writer = writer_in(tmp_path, PartLimits(size=20_000), compression="none", chunk_size=1024)
+def test_parts_by_size(tmp_path, small_chunks):
+    writer = writer_in(tmp_path, PartLimits(size=20_000), compression="none")
     for number in range(500):
         writer.write(TRUTH, KEY, truth(number), number, number)
     files = writer.finish()
@@ -65,8 +68,8 @@ def test_parts_by_size(tmp_path):
     assert all(20_000 <= file.stat().st_size < 30_000 for file in files[:-1])
 
 
-def test_what_each_part_repeats_does_not_count_for_its_size(tmp_path):
-    writer = writer_in(tmp_path, PartLimits(size=20_000), compression="none", chunk_size=1024)
+def test_what_each_part_repeats_does_not_count_for_its_size(tmp_path, small_chunks):
+    writer = writer_in(tmp_path, PartLimits(size=20_000), compression="none")
     writer.attachment("model", bytes(30_000), "application/octet-stream", 1)
     for number in range(500):
         writer.write(TRUTH, KEY, truth(number), number, number)
@@ -92,16 +95,16 @@ def test_parts_of_another_recording(tmp_path, name):
     with pytest.raises(NameTakenError, match=rf"{name}: is there already"):
         writer_in(tmp_path, PartLimits(seconds=1))
     options = RecorderSettings(directory=tmp_path, file="run", split_minutes=1)
-    assert parts_of(options, numbered=True)(1).finish() == tmp_path / "run-2-001.mcap"
+    assert open_first_part(options, may_rename=True)[1].finish() == tmp_path / "run-2-001.mcap"
 
 
 def test_part_that_cannot_begin(tmp_path):
     rooms = iter([1 << 20, 0])
 
-    def open_part(number):
+    def open_limited(number):
         return on_full_disk(RecordingWriter(tmp_path / f"run-{number}.mcap"), next(rooms))
 
-    writer = PartsWriter(open_part, PartLimits(seconds=1))
+    writer = PartsWriter(open_limited(1), open_limited, PartLimits(seconds=1))
     writer.write(TRUTH, KEY, truth(0), 0, 0)
     with pytest.raises(UserError, match=r"run-2\.mcap\.active: recording failed .* it holds no message"):
         writer.write(TRUTH, KEY, truth(1), 0, 5 * SECOND_NS)
@@ -111,10 +114,12 @@ def test_part_that_cannot_begin(tmp_path):
 def test_part_that_cannot_end(tmp_path):
     rooms = iter([20_000, 1 << 20])
 
-    def open_part(number):
+    def open_limited(number):
         return on_full_disk(RecordingWriter(tmp_path / f"run-{number}.mcap", "none", 100), next(rooms))
 
-    writer = PartsWriter(open_part, PartLimits(seconds=1), lambda: {"counters": {"long": "x" * 50_000}})
+    writer = PartsWriter(
+        open_limited(1), open_limited, PartLimits(seconds=1), lambda: {"counters": {"long": "x" * 50_000}}
+    )
     writer.write(TRUTH, KEY, truth(0), 0, 0)
     writer.flush()
     with pytest.raises(UserError, match=r"run-1\.mcap\.active: recording failed .* `presage recover"):

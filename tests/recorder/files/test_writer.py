@@ -18,7 +18,7 @@ from common.messages.topics import HEALTH, ODOM, SCAN, TOPICS, TRUTH
 from services.recorder.files.chunks import CHUNK_BUILDER, MAGIC
 from services.recorder.files.writer import NameTakenError, RecordingWriter
 from services.recorder.reader import read_recording
-from services.recorder.recording import parts_of
+from services.recorder.recording import open_first_part
 from services.recorder.service import RecorderService, parse_topics
 from services.recorder.settings import RecorderSettings
 from tests.recorder import sessions
@@ -43,10 +43,10 @@ def test_round_trip(tmp_path_factory, entries, compression, flushes):
     path = writer.finish()
     recording = read_recording(path)
     wanted = [(key, payload, published, received) for (_, key), payload, published, received in entries]
-    found = [(r.key, r.payload, r.published_ns, r.logged_ns) for r in recording.raw]
+    found = [(r.key, r.payload, r.published_ns, r.logged_ns) for r in recording.payloads()]
     assert found == sorted(wanted, key=lambda w: w[3])
     assert recording.complete
-    assert recording.counts() == writer.written
+    assert recording.counts == writer.written
     with path.open("rb") as stream:
         messages = make_reader(stream, validate_crcs=True).iter_messages(log_time_order=False)
         assert [(channel.topic, m.data, m.publish_time, m.log_time) for _, channel, m in messages] == wanted
@@ -100,19 +100,19 @@ def test_decoded_messages(tmp_path):
 
 def test_names(tmp_path):
     options = RecorderSettings(directory=tmp_path, file="run")
-    writer = parts_of(options)(1)
+    _, writer = open_first_part(options)
     assert [p.name for p in tmp_path.iterdir()] == ["run.mcap.active"]
     with pytest.raises(NameTakenError, match=r"run\.mcap\.active: is there already.*--file"):
-        parts_of(options)(1)
+        open_first_part(options)
     whole = writer.finish().read_bytes()
     with pytest.raises(NameTakenError, match=r"run\.mcap: is there already.*--file"):
-        parts_of(options)(1)
+        open_first_part(options)
     assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("run.mcap", whole)]
 
 
 def test_generated_names(tmp_path, monkeypatch):
     monkeypatch.setattr("services.recorder.recording.file_path", lambda _: tmp_path / "now.mcap")
-    writers = [parts_of(RecorderSettings(directory=tmp_path))(1) for _ in range(3)]
+    writers = [open_first_part(RecorderSettings(directory=tmp_path))[1] for _ in range(3)]
     assert [writer.finish().name for writer in writers] == ["now.mcap", "now-2.mcap", "now-3.mcap"]
 
 

@@ -280,7 +280,7 @@ def test_world_beside_a_simulator(start, session, bus):
 
 def test_pause_at_the_end(start, listening, control):
     """The page's replay begins paused, and stays at its end until a seek."""
-    start(ReplayOptions(rate=0, paused=True, stay=True, start=90.0))
+    start(ReplayOptions(rate=0, paused=True, start=90.0))
     assert control("status").paused
     assert len(listening) == 0
     for _ in range(2):
