@@ -15,6 +15,9 @@ MAX_DISTANCE_M = 30_000.0  # more than the diagonal of the square of all valid p
 MAX_ANGLE_RAD = 10_000.0  # about 1500 turns, because headings need not be wrapped
 MAX_SPEED = 1_000.0  # m/s or rad/s
 MAX_FIELD_SIDE = 4096  # cells along one side of a published cost field
+# Of the box around the walls: four times the largest building that was measured. A room of 6 m by 4 m, drawn in
+# centimetres, has more.
+MAX_WORLD_AREA_M2 = 200_000.0
 MAX_BEAMS = 32_768  # in a scan; the 2-D scanners with the finest resolution measure 25 200 points per turn
 
 Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE_M, le=MAX_COORDINATE_M, allow_inf_nan=False)]

@@ -51,7 +51,11 @@ def set_up_logging(level: str = "info", *, as_json: bool = False, service: str =
         else structlog.processors.TimeStamper(fmt="%H:%M:%S", utc=False),
     ]
     renderers: list[structlog.types.Processor] = [
-        structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty(), pad_event_to=0)
+        structlog.dev.ConsoleRenderer(
+            colors=sys.stderr.isatty(),
+            pad_event_to=0,
+            exception_formatter=structlog.dev.plain_traceback,  # Rich's prints all local variables, hundreds of lines
+        )
     ]
     if as_json:
         renderers = [

@@ -27,7 +27,7 @@ from common.geometry.floors import (
 )
 from common.geometry.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from common.geometry.shapes import Box, Circle, Degrees, Obstacle, Ring, WorldName, WorldPart, check_ring
-from common.limits import Coordinate
+from common.limits import MAX_WORLD_AREA_M2, Coordinate
 from common.yaml_text import NOT_YAML, TooLargeError, parse_yaml
 
 if TYPE_CHECKING:
@@ -91,6 +91,12 @@ class World(WorldPart):
         if self.floors and self.grid is None and self.boundary != _box_around(self.floors):
             raise ValueError("the boundary of a world with floors is the box around them: leave it out")
         check_floors(self.floors, self.lifts)
+        x0, y0, x1, y1 = self.bounds
+        if self.grid is None and (area := (x1 - x0) * (y1 - y0)) > MAX_WORLD_AREA_M2:
+            raise ValueError(
+                f"the walls are {x1 - x0:g} m by {y1 - y0:g} m, {area * 1e-6:.3g} km², but a world has at most "
+                f"{MAX_WORLD_AREA_M2 * 1e-6:g} km²: are the units metres?"
+            )
         return self
 
     @model_validator(mode="after")
@@ -399,7 +405,8 @@ def lack_of_room(clearance: float, radius: float) -> str:
     """What is wrong with a place for a robot of ``radius`` m, ``clearance`` m from the edge of free space."""
     if clearance < 0:
         return "is inside something, or off the map"
-    return f"is {clearance:.2f} m from a wall, and the robot needs {radius:g} m around it"
+    # Adding 0 turns -0, the clearance at a corner, into 0.
+    return f"is {clearance + 0.0:.2f} m from a wall, and the robot needs {radius:g} m around it"
 
 
 def known_worlds() -> list[str]:

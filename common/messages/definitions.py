@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from common.errors import UserError
 from common.geometry.occupancy_grid import OccupancyGrid
@@ -43,6 +43,21 @@ if TYPE_CHECKING:
 GOAL_TOLERANCE_M = 0.02  # default of Goal.tolerance
 # A message whose stamp is earlier than that of the last one by less is late; by more, time was reset.
 MAX_LATE_NS = 1_000_000_000
+COVARIANCE_ROUNDING = 1e-6  # of the largest element; more than what single precision loses
+
+
+def _check_covariance(covariance: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    if covariance.shape != (3, 3):
+        raise ValueError(f"covariance has shape {covariance.shape}, not (3, 3)")
+    relative = covariance / max(float(np.abs(covariance).max()), np.finfo(float).tiny)
+    if (np.abs(relative - relative.T) > COVARIANCE_ROUNDING).any():
+        raise ValueError("covariance is not symmetric")
+    if (np.diagonal(covariance) < 0).any() or np.linalg.eigvalsh(relative)[0] < -COVARIANCE_ROUNDING:
+        raise ValueError("covariance is not positive semidefinite")
+    return covariance
+
+
+Covariance = Annotated[Matrix3, AfterValidator(_check_covariance)]
 
 
 class Stamped(Message):
@@ -56,10 +71,10 @@ class Scan(Stamped):
     """One sweep of the scanner (sensor_msgs/LaserScan); its stamp is the time of the beam that was measured first."""
 
     angle_min: Angle  # rad, first beam in laser, counter-clockwise seen from above in any mounting
-    angle_increment: Angle  # rad, between beams; negative if they run clockwise, as of an upside-down scanner
+    angle_increment: Angle  # rad, between beams, not 0; negative if they run clockwise, as of an upside-down scanner
     range_min: Distance  # m
     range_max: PositiveDistance  # m
-    ranges: ScanRanges  # (B,) m; +inf is nothing within range_max, -inf is too close (REP-117), 0 is not measured
+    ranges: ScanRanges  # (B >= 2,) m; +inf is nothing within range_max, -inf too close (REP-117), 0 not measured
     mount: Pose = Pose(x=0.0, y=0.0)  # scanner in base_link
     scan_time: NotNegative = 0.0  # s, between scans
     # s, between beams; negative if the last was measured first; 0: at once, or unknown
@@ -67,6 +82,12 @@ class Scan(Stamped):
     frame_id: Name = "laser"
     sigma: Distance = 0.0  # m, standard deviation of a range; unknown if both sigmas are 0
     sigma_relative: Annotated[float, Field(ge=0, le=1)] = 0.0  # part proportional to the range, added in quadrature
+
+    @model_validator(mode="after")
+    def _has_directions(self) -> Scan:
+        if len(self.ranges) < 2 or not self.angle_increment:
+            raise ValueError(f"{len(self.ranges)} beams {self.angle_increment:g} rad apart: no scanner has those")
+        return self
 
     @classmethod
     def of_scanner(cls, scanner: Scanner, ranges: npt.ArrayLike, stamp_ns: int, **fields: Any) -> Scan:
@@ -120,14 +141,8 @@ class BeliefHypothesis(Message):
     """One Gaussian of a belief's mixture."""
 
     pose: Pose  # base_link in map
-    covariance: Matrix3 | None = None  # (3, 3) of x, y, yaw in map
+    covariance: Covariance | None = None  # (3, 3) of x, y, yaw in map
     weight: Annotated[float, Field(ge=0, le=1)]  # the weights sum to 1
-
-    @model_validator(mode="after")
-    def _shape(self) -> BeliefHypothesis:
-        if self.covariance is not None and self.covariance.shape != (3, 3):
-            raise ValueError(f"covariance has shape {self.covariance.shape}, not (3, 3)")
-        return self
 
 
 class Belief(Stamped):
@@ -138,7 +153,7 @@ class Belief(Stamped):
 
     state: Literal["localising", "tracking", "ambiguous", "lost"]  # operations.md explains these
     pose: Pose  # base_link in map
-    covariance: Matrix3 | None = None  # (3, 3) of x, y, yaw in map
+    covariance: Covariance | None = None  # (3, 3) of x, y, yaw in map, positive semidefinite
     xi: Floats | None = None  # (3,) dg' Pi (o - g), the negative gradient of accuracy in map: nats/m, nats/m, nats/rad
     curvature: Matrix3 | None = None  # (3, 3) dg' Pi dg, Gauss-Newton Hessian of accuracy in map
     free_energy: Finite | None = None  # nats, accuracy + complexity
@@ -159,10 +174,8 @@ class Belief(Stamped):
             vector = getattr(self, name)
             if vector is not None and vector.shape != (3,):
                 raise ValueError(f"{name} has shape {vector.shape}, not (3,)")
-        for name in ("covariance", "curvature"):
-            matrix = getattr(self, name)
-            if matrix is not None and matrix.shape != (3, 3):
-                raise ValueError(f"{name} has shape {matrix.shape}, not (3, 3)")
+        if self.curvature is not None and self.curvature.shape != (3, 3):
+            raise ValueError(f"curvature has shape {self.curvature.shape}, not (3, 3)")
         return self
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+import traceback
 from collections import Counter
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 HEALTH_PERIOD_S = 1.0
 RESTORE_PERIOD_S = 5.0  # after its start, a service keeps querying latched topics for this long until one answers
 MAX_REPORTED_KEYS, MAX_KEY_LENGTH = 200, 200  # in a health message
+MAX_ERROR_LENGTH = 300  # in the log line of an error that was logged in full before
 SOURCE_TIMEOUT_S = 0.3  # a source silent for longer is replaced by another source of the same topic
 
 
@@ -42,6 +44,7 @@ class ServiceLoop:
         self.published: Counter[str] = Counter()  # by key
         self.undecodable: Counter[str] = Counter()  # by key
         self.failed = 0  # steps that raised an exception
+        self._known_failures: set[tuple[type, str, int]] = set()  # error, file and line, logged in full
         self._request_number = 0
         self._may_log = LogRateLimiter()
         self._heartbeat = Heartbeat(service.settings.heartbeat, service.name, bus.robot)
@@ -210,10 +213,20 @@ class ServiceLoop:
             step()
         except UserError:
             raise
-        except Exception:
-            self.failed += 1
-            if self._may_log("failed"):
-                self.service.log.exception("step failed", so_far=self.failed)
+        except Exception as error:  # noqa: BLE001
+            self._log_failure("step failed", error)
+
+    def _log_failure(self, event: str, error: Exception, **details: str) -> None:
+        """Counts and logs an error: the first time with its traceback, then in one line, at most once a second."""
+        self.failed += 1
+        *_, (frame, line) = traceback.walk_tb(error.__traceback__)
+        failure = type(error), frame.f_code.co_filename, line
+        if failure not in self._known_failures:
+            self._known_failures.add(failure)
+            self.service.log.error(event, **details, so_far=self.failed, exc_info=error)
+        elif self._may_log(event):
+            repeated, text = f"{event} (as before)", " ".join(f"{type(error).__name__}: {error}".split())
+            self.service.log.error(repeated, **details, so_far=self.failed, error=text[:MAX_ERROR_LENGTH])
 
     def _answer(self, call: IncomingRequest) -> None:
         try:
@@ -226,10 +239,8 @@ class ServiceLoop:
             reply = self._config() if call.query is CONFIG else self.service.on_request(call.query, request)
         except UserError as error:
             reply = call.query.reply(ok=False, reason=str(error))
-        except Exception as error:
-            self.failed += 1
-            if self._may_log("request failed"):
-                self.service.log.exception("request failed", query=call.query.name, so_far=self.failed)
+        except Exception as error:  # noqa: BLE001
+            self._log_failure("request failed", error, query=call.query.name)
             call.refuse(f"{self.service.name} failed: {type(error).__name__}: {error}")
             return
         call.reply(reply.encode())

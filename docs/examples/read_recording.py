@@ -6,7 +6,7 @@ import sys
 import msgpack
 from mcap.reader import make_reader
 
-truth, errors = {}, []
+truth, beliefs = {}, []
 with open(sys.argv[1], "rb") as file:
     for _, channel, message in make_reader(file).iter_messages():
         fields = msgpack.unpackb(message.data)
@@ -15,7 +15,9 @@ with open(sys.argv[1], "rb") as file:
             ranges = memoryview(fields["ranges"]).cast("f")  # little-endian float32, m; inf: no return, 0: none
         elif name == "truth":
             truth[fields["stamp_ns"]] = fields["pose"]
-        elif name == "belief" and fields["stamp_ns"] in truth:
-            here, there = truth[fields["stamp_ns"]], fields["pose"]
-            errors.append(math.hypot(here["x"] - there["x"], here["y"] - there["y"]))
+        elif name == "belief":
+            beliefs.append(fields)
+# Only now, because a belief may be recorded before the truth of the same stamp.
+pairs = [(belief["pose"], truth[belief["stamp_ns"]]) for belief in beliefs if belief["stamp_ns"] in truth]
+errors = [math.hypot(here["x"] - there["x"], here["y"] - there["y"]) for here, there in pairs]
 print(f"{len(errors)} beliefs, {len(ranges)} beams, median error {sorted(errors)[len(errors) // 2]:.4f} m")

@@ -55,7 +55,7 @@ def publish_main() -> None:
     load, rng = RecorderLoad(**job["load"]), np.random.default_rng(0)
     ranges = rng.uniform(0.1, 25.0, (64, load.beams)).astype(np.float32)
     bodies = [
-        Scan(stamp_ns=0, angle_min=0, angle_increment=0, range_min=0, range_max=25, ranges=r).model_dump()
+        Scan(stamp_ns=0, angle_min=0, angle_increment=0.01, range_min=0, range_max=25, ranges=r).model_dump()
         for r in ranges
     ]
     from common.bus.bus import Link

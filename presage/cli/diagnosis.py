@@ -8,7 +8,7 @@ import typer
 
 from common.bus.bus import Link
 from presage.cli.session_options import chosen_link
-from presage.session.running_sessions import OBSERVER, find_session
+from presage.session.running_sessions import OBSERVER, check_robot_name, find_session
 from presage.terminal.options import Json, WorldName, console
 
 app = typer.Typer()
@@ -56,6 +56,8 @@ def top(
 
     chosen = context.find_root().params
     shown = robots or [name for name in (chosen["robot"],) if name] or find_session(chosen["connect"]).robots
+    for name in shown:
+        check_robot_name(name)
     link = chosen_link(context, OBSERVER, shown[0])
     raise typer.Exit(run_top(link, list(dict.fromkeys(shown)), console, once=once))
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from common.bus.bus import Link
-from presage.session.running_sessions import OPERATOR, link_of
+from presage.session.running_sessions import OBSERVER, OPERATOR, link_of, running_sessions
 
 RobotName = Annotated[
     str, typer.Option(envvar="PRESAGE_ROBOT", help="Robot name. Defaults to the only robot of the session.")
@@ -23,6 +23,13 @@ Connect = Annotated[
 
 
 def chosen_link(context: typer.Context, roles: Sequence[str] = OPERATOR, robot: str = "") -> Link:
-    """Link to the chosen robot and session; ``robot`` replaces the option `--robot`."""
+    """Link to the chosen robot and session; ``robot`` replaces the option `--robot`.
+
+    Says which session it is if a command acts on a running one that the user has not chosen.
+    """
     options = context.find_root().params
-    return link_of(options["connect"], robot or options["robot"], roles)
+    link = link_of(options["connect"], robot or options["robot"], roles)
+    if not options["connect"] and roles is not OBSERVER and running_sessions():
+        # Not to stdout, which may be read by a program.
+        typer.echo(f"session {', '.join(link.connect)}, robot {link.robot}", err=True)
+    return link

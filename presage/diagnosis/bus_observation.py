@@ -13,7 +13,7 @@ from common.bus.bus import Link, open_bus, wait_until
 from common.bus.inbox import Inbox, RequestResult, Sample
 from common.messages.definitions import Health, Scan
 from common.messages.requests import ConfigReply, Request
-from common.messages.topics import CONFIG, TOPICS
+from common.messages.topics import BELIEF, CONFIG, TOPICS
 from common.messages.wire import DecodeError
 from common.runtime.service_monitor import ServiceMonitor
 from presage.diagnosis.findings import Finding
@@ -38,6 +38,8 @@ class BusObservation:
     sequences: dict[str, SequenceNumbers] = field(default_factory=dict)  # sequence numbers, by key with one publisher
     undecodable: dict[str, str] = field(default_factory=dict)  # first decoding error, by key
     scan: Scan | None = None  # the last one
+    scan_stamps: list[tuple[int, int]] = field(default_factory=list)  # ns of arrival on a monotonic clock, and stamp
+    belief_stamps: list[int] = field(default_factory=list)
 
 
 def check_endpoint(endpoint: str) -> Finding | None:
@@ -117,7 +119,10 @@ def _add_sample(sample: Sample, observation: BusObservation, now: float) -> None
     elif sample.topic.rate:
         if isinstance(message, Scan) and sample.key == sample.topic.key(observation.robot):
             observation.scan = message
+            observation.scan_stamps.append((sample.received_ns, message.stamp_ns))
             observation.monitor.add_scan(now)
+        elif sample.key == BELIEF.key(observation.robot):
+            observation.belief_stamps.append(message.stamp_ns)
         observation.sequences.setdefault(sample.key, SequenceNumbers()).add(message.seq)
 
 

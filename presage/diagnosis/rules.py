@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 
 import numpy as np
@@ -9,16 +10,19 @@ import numpy as np
 from common.geometry import se2
 from common.messages.definitions import Health, TopicHealth
 from common.messages.requests import ConfigReply
-from common.messages.topics import CMD_VEL, PREDICTION, SCAN, TOPICS, TRUTH, expected_rate, topic_of
+from common.messages.topics import BELIEF, CMD_VEL, PREDICTION, SCAN, TOPICS, TRUTH, expected_rate, topic_of
 from common.robot.scan_geometry import Sweep
 from common.runtime.protocol_check import describe_version_differences, same_protocol
-from common.runtime.service_monitor import SUBSTITUTES, start_command
+from common.runtime.service_monitor import REPLAY, SUBSTITUTES, start_command
 from presage.diagnosis.bus_observation import BusObservation
 from presage.diagnosis.findings import Finding
 from presage.diagnosis.health_board import MIN_RATE_SHARE
 
 MAX_CLOCK_DIFFERENCE_S = 0.5  # as long as the time-outs of the robot
 MAX_DROPPED_SHARE = 0.1  # of the received messages; a service that drops more cannot keep up
+MIN_STAMPED_S = 1.0  # scans of a shorter time do not show whether their stamps advance
+MIN_SIMULATION_SPEED = 0.01  # times real time; stamps that advance more slowly are in another unit
+MIN_STAMPED_BELIEFS = 5  # fewer may all belong to scans that came before the observation
 MAY_SKIP_MESSAGES = {"viewer"}  # it shows only the newest messages
 MAY_RUN_SEVERAL_TIMES = {"recorder", "viewer"}  # of the other services, only one instance is active (`Service.single`)
 
@@ -31,6 +35,7 @@ def evaluate_observation(observation: BusObservation, own_config: ConfigReply) -
     yield from _clocks(observation)
     yield from _rates(observation)
     yield from _scanner(observation)
+    yield from _stamps(observation)
     yield from _counts(observation)
 
 
@@ -109,17 +114,19 @@ def _clocks(observation: BusObservation) -> Iterator[Finding]:
 def _rates(observation: BusObservation) -> Iterator[Finding]:
     # A real robot's scanner may have any rate, and there is no ground truth.
     real_robot = bool(_substitute(observation, "simulator"))
-    mapping = bool(_substitute(observation, "estimator"))  # a mapper publishes beliefs, but predicts no scans
     period = observation.scan.scan_time if observation.scan is not None else 0.0
     if real_robot and not period and (scans := observation.arrivals[SCAN.key(observation.robot)]):
         period = observation.seconds / scans  # some drivers do not fill in scan_time
     for topic in TOPICS:
-        if not topic.rate or topic.per_service or (real_robot and topic is TRUTH) or (mapping and topic is PREDICTION):
+        if not topic.rate or topic.per_service or (real_robot and topic is TRUTH):
             continue
         key = topic.key(observation.robot)
         rate = observation.arrivals[key] / observation.seconds
         expected = expected_rate(topic, period)
         ok = rate > 0 and rate >= MIN_RATE_SHARE * expected
+        if topic is PREDICTION and not rate and observation.arrivals[BELIEF.key(observation.robot)]:
+            yield Finding("rate", None, "prediction: none, which is right for an estimator that predicts no scans", key)
+            continue
         publisher = _substitute(observation, topic.publisher) or topic.publisher
         advice = f"published by the {publisher}: is it alive, paused, or are its inputs missing? See its log"
         if topic is CMD_VEL and rate > 1.5 * expected:
@@ -146,9 +153,6 @@ def _scanner(observation: BusObservation) -> Iterator[Finding]:
     if sweep.spacing * (sweep.beams - 1) > np.deg2rad(360.1):
         advice = "the beams cover more than one turn: angle_increment must be wrong"
         yield Finding("scanner", False, what, where, advice)
-    elif not sweep.increment or sweep.beams < 2:
-        advice = "the beams have no directions: angle_increment is 0, or there is only one beam"
-        yield Finding("scanner", False, what, where, advice)
     elif abs(se2.wrap(-view.centre)) > view.half:
         advice = "no beam points ahead; correct the yaw of `mount` if that is wrong (docs/scanners.md)"
         yield Finding("scanner", None, what, where, advice)
@@ -156,20 +160,54 @@ def _scanner(observation: BusObservation) -> Iterator[Finding]:
         yield Finding("scanner", True, what, where)
 
 
+def _stamps(observation: BusObservation) -> Iterator[Finding]:
+    """Checks that stamps of scans advance with time, and that beliefs have the stamps of scans."""
+    arrivals, stamps = np.array(observation.scan_stamps, np.int64).reshape(-1, 2).T
+    passed = float(np.ptp(arrivals)) * 1e-9 if len(arrivals) else 0.0
+    if passed >= MIN_STAMPED_S and not _time_may_stand(observation):
+        advance = float(np.maximum(np.diff(stamps), 0).sum()) * 1e-9
+        ok = advance >= MIN_SIMULATION_SPEED * passed
+        text = "advance with time" if ok else "do not advance with time"
+        what = f"scans: their stamps {text} ({advance:.3g} s in {passed:.3g} s)"
+        yield Finding("stamps", ok, what, SCAN.key(observation.robot), "" if ok else "stamp_ns is in nanoseconds")
+    if len(stamps) and len(observation.belief_stamps) >= MIN_STAMPED_BELIEFS:
+        matched = int(np.isin(observation.belief_stamps, stamps).sum())
+        ok = matched > len(observation.belief_stamps) / 2
+        what = f"beliefs: {matched} of {len(observation.belief_stamps)} have the stamp of a scan"
+        advice = "" if ok else "a belief has the stamp_ns of the scan that it follows from; others are taken for old"
+        yield Finding("stamps", ok, what, BELIEF.key(observation.robot), advice)
+
+
+def _time_may_stand(observation: BusObservation) -> bool:
+    """Whether the stamps of scans may rightly stand still: in a replay, and in lockstep."""
+    configs = [json.loads(reply.config) for reply in observation.replies.get("simulator", [])]
+    lockstep = any(isinstance(config, dict) and config.get("pace") == "lockstep" for config in configs)
+    return lockstep or observation.monitor.present(REPLAY, observation.seconds)
+
+
 def _counts(observation: BusObservation) -> Iterator[Finding]:
     for service, health in sorted(observation.health.items()):
-        first, last = health[0][1], health[-1][1]
-        if last.note:
-            unfit = _increase(first, last, "unfit_scans") > 0
-            yield Finding(
-                "weights" if unfit else "note", False if unfit else None, f"{service} reports: {last.note}", service
-            )
-        if (failed := _increase(first, last, "failed")) > 0:
-            what = f"{service}: {failed} steps failed during the observation"
-            yield Finding("failed", False, what, service, "its log contains the traceback")
-        before = {row.key: row for row in first.topics}
-        for row in last.topics:
-            yield from _counts_of_key(service, before.get(row.key, TopicHealth(key=row.key)), row)
+        by_instance: dict[str, list[Health]] = {}
+        for _, message in health:
+            by_instance.setdefault(message.instance, []).append(message)
+        # The recorder that `presage up` keeps ready is idle while `presage record` records.
+        active = [each for each in by_instance.values() if not each[-1].idle]
+        for messages in active or by_instance.values():
+            yield from _counts_of_instance(service, messages[0], messages[-1])
+
+
+def _counts_of_instance(service: str, first: Health, last: Health) -> Iterator[Finding]:
+    if last.note:
+        unfit = _increase(first, last, "unfit_scans") > 0
+        yield Finding(
+            "weights" if unfit else "note", False if unfit else None, f"{service} reports: {last.note}", service
+        )
+    if (failed := _increase(first, last, "failed")) > 0:
+        what = f"{service}: {failed} steps failed during the observation"
+        yield Finding("failed", False, what, service, "its log contains the traceback")
+    before = {row.key: row for row in first.topics}
+    for row in last.topics:
+        yield from _counts_of_key(service, before.get(row.key, TopicHealth(key=row.key)), row)
 
 
 def _counts_of_key(service: str, before: TopicHealth, row: TopicHealth) -> Iterator[Finding]:

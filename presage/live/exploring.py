@@ -50,8 +50,9 @@ def _follow(messages: LatestMessages, seq: int, console: Console) -> int:
                 )
             began_ns = began_ns or status.stamp_ns  # before the first belief, stamps are 0
             so_far = f"{progress.area:.0f} m² mapped, {progress.path:.1f} m driven"
-            state = f"{status.state} {status.reason}"
-            show(f"{progress.phase}: {so_far}; {state}", f"{progress.phase} {state}")
+            state = "" if status.state == "exploring" else status.state  # the phase says so already
+            doing = ": ".join(filter(None, (state, status.reason)))
+            show(f"{progress.phase}: {so_far}; {doing}", f"{progress.phase} {doing}")
             if progress.phase == "finished":
                 seconds = (status.stamp_ns - began_ns) * 1e-9
                 console.print(f"finished: {so_far} in {seconds:.0f} s; the robot is back where it began")

@@ -140,20 +140,18 @@ def write_recording(
         scanner = scanner_of(log, start, step, period, options.sigma)
         write_description(writer, "simulator", WorldReply(world=world, scanner=scanner))
         message_writer = _MessageWriter(writer, options.robot, written)
-        template = Scan(
-            stamp_ns=0,
-            angle_min=start,
-            angle_increment=step,
-            range_min=log.range_min,
-            range_max=log.range_max,
-            ranges=np.zeros(0, np.float32),
-            mount=Pose.of(log.mount),
-            scan_time=period,
-            time_increment=log.time_increment,
-            sigma=options.sigma or 0.0,
-        )
+        geometry = {
+            "angle_min": start,
+            "angle_increment": step,
+            "range_min": log.range_min,
+            "range_max": log.range_max,
+            "mount": Pose.of(log.mount),
+            "scan_time": period,
+            "time_increment": log.time_increment,
+            "sigma": options.sigma or 0.0,
+        }
         for stamp_ns, logged in itertools.chain(first_scans, stamped):
-            message_writer.write_scan(stamp_ns, logged, template)
+            message_writer.write_scan(stamp_ns, logged, geometry)
         facts = written.facts(options, log)
         writer.metadata("log", {k: v if isinstance(v, str) else json.dumps(v) for k, v in facts.items()})
         counts = written.message_counts.written
@@ -215,8 +213,11 @@ class _MessageWriter:
         self._writer, self._robot, self._written = writer, robot, written
         self._last: dict[Topic, tuple[int, Array]] = {}
 
-    def write_scan(self, stamp_ns: int, logged: LoggedScan, template: Scan) -> None:
-        """Writes odometry and reference pose before the scan, because the estimator needs the odometry first."""
+    def write_scan(self, stamp_ns: int, logged: LoggedScan, geometry: dict[str, Any]) -> None:
+        """Writes odometry and reference pose before the scan, because the estimator needs the odometry first.
+
+        ``geometry`` holds the fields that all scans have in common.
+        """
         written = self._written
         if logged.odom is not None:
             # Covariance zero means unknown; covariances in logs are not imported.
@@ -229,7 +230,7 @@ class _MessageWriter:
             self._put(TRUTH, Truth(stamp_ns=stamp_ns, seq=written.references, pose=pose, twist=twist), stamp_ns + 1)
             written.references += 1
         ranges = np.asarray(logged.ranges, np.float32)
-        scan = Scan(**{**dict(template), "stamp_ns": stamp_ns, "seq": written.scans, "ranges": ranges})
+        scan = Scan(stamp_ns=stamp_ns, seq=written.scans, ranges=ranges, **geometry)
         self._put(SCAN, scan, stamp_ns + 2)
         written.scans += 1
         written.last_ns = stamp_ns

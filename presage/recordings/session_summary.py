@@ -71,9 +71,16 @@ class SessionSummary:
         rows += [
             ("contacts", "unknown" if self.contacts is None else str(self.contacts)),
             ("scans", f"{self.scans}, of {self.messages} messages in {self.duration_s:.1f} s"),
-            ("dropped", f"{'unknown' if self.dropped is None else self.dropped}; undecodable {self.undecodable}"),
+            ("skipped by services", f"{self._skipped()}; undecodable {self.undecodable}"),
         ]
         return rows if self.complete else [*rows, ("incomplete", "the recording's end is missing or damaged")]
+
+    def _skipped(self) -> str:
+        """How many messages services did not use because newer ones had come, by topic."""
+        if not self.dropped:
+            return "unknown" if self.dropped is None else "none"
+        topics = ", ".join(f"{count} {key.rpartition('/')[2]}" for key, count in self.dropped_by_key.items())
+        return f"{topics}, for newer ones"
 
 
 def print_summary(summary: SessionSummary, recording: Path, figure: Path, console: Console) -> None:

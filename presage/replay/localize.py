@@ -202,6 +202,8 @@ def localize(options: LocalizeOptions, console: Console) -> list[dict[str, Any]]
             console.print(f"interrupted after {len(rows)} of {count} scans{where}", highlight=False, soft_wrap=True)
         raise
     _summarise(scans, rows, len(all_scans), console, laser=laser)
+    if options.mode != "single" and all(row["state"] != "tracking" for row in rows):
+        console.print("the pose was never certain enough for state tracking: is this the right map?")
     return rows
 
 

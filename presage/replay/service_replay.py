@@ -122,6 +122,11 @@ def build_services(recording: Recording, names: tuple[str, ...], folder: Path, n
                 f"the {name} yourself, and run `presage replay {recording.path} --only scan,odom,goal` beside it"
             )
         values: dict[str, Any] = recorded.values
+        if name == "estimator" and "estimator" not in values:  # a setting that every estimator of presage has
+            raise UserError(
+                f"{recording.path}: the recording was made with another program as estimator, which cannot be run "
+                f"here; `presage rerun {recording.path}` compares it with an estimator of presage"
+            )
         notes += recorded.notes
         if name == "estimator":
             if values.get("learn") == "refine":  # what it learned was recorded

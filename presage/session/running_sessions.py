@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -16,6 +17,7 @@ import psutil
 from common.bus.bus import DEFAULT_ENDPOINT, Link
 from common.bus.security import Credentials, read_credentials
 from common.errors import UserError
+from common.messages.topics import ROBOT_NAME_PATTERN
 from common.names import split_names
 
 OPERATOR, OBSERVER = ("operator",), ("observer", "operator")  # roles for commands that act, and that only read
@@ -90,7 +92,12 @@ def find_session(connect: str) -> RunningSession:
 
 
 def link_of(connect: str, robot: str, roles: Sequence[str] = OPERATOR) -> Link:
-    """Link to a robot of the session that `find_session` finds; ``robot`` defaults to the session's only one."""
+    """Link to a robot of the session that `find_session` finds; ``robot`` defaults to the session's only one.
+
+    Raises UserError for a name that no robot can have, such as `*`, which would address all robots.
+    """
+    if robot:
+        check_robot_name(robot)
     session = find_session(connect)
     if not robot and len(session.robots) > 1:
         raise UserError(
@@ -100,6 +107,12 @@ def link_of(connect: str, robot: str, roles: Sequence[str] = OPERATOR) -> Link:
     return Link(
         robot, tuple(split_names(session.endpoint)), security=credentials_for(robot, roles, folder=session.security)
     )
+
+
+def check_robot_name(name: str) -> None:
+    """Raises UserError if no robot can have the name."""
+    if not re.fullmatch(ROBOT_NAME_PATTERN, name):
+        raise UserError(f"--robot {name!r}: give the name of one robot, of up to 64 letters, digits, -, _ and .")
 
 
 def credentials_for(robot: str, roles: Sequence[str] = OPERATOR, *, folder: str = "") -> Credentials | None:

@@ -10,11 +10,13 @@ from rich.console import Console
 
 from common.bus.bus import open_bus
 from common.errors import UserError
+from common.runtime.config import load_settings
 from presage.session.page import show_page_link
-from presage.session.running_sessions import credentials_for, session_file
+from presage.session.running_sessions import check_robot_name, credentials_for, session_file
 from presage.session.session_plan import SessionPlan, plan_session
 from presage.session.stack import Stack
 from presage.terminal.options import arguments
+from services.estimator.settings import EstimatorSettings
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,8 @@ def run_up(options: UpOptions, console: Console) -> None:
     robot, pace = plan.estimator_settings.robot, plan.simulator_settings.pace
     robots = [robot] if options.robots == 1 else [f"{robot}-{k}" for k in range(1, options.robots + 1)]
     _check_combination(options, robots[0], simulated=simulated, pace=pace)
+    if len(robots) > 1:
+        _check_fleet(options, plan, robots)
     with Stack(robots[0], options.port or None, security=credentials_for(robots[0])) as stack:
         stack.start_router()
         page = "viewer" not in options.without
@@ -65,8 +69,9 @@ def run_up(options: UpOptions, console: Console) -> None:
         with session_file(stack.endpoint, robots, stack.security):
             if options.mapping:
                 console.print(
-                    "[bold green]mapping[/]: click a goal, press Explore or use the arrow keys on the page, then save "
-                    "the map there or with `presage save-map NAME`."
+                    "[bold green]mapping[/]: click a goal, press Explore or use the arrow keys on the page, or use "
+                    "`presage goal X Y` or `presage explore` in another terminal; then save the map on the page or "
+                    "with `presage save-map NAME`."
                 )
             else:
                 _show_hints(stack, plan.estimator_settings.world, robots, console)
@@ -86,6 +91,14 @@ def _check_combination(options: UpOptions, first_robot: str, *, simulated: bool,
         )
     if options.mapping and options.robots > 1:
         raise UserError("--mapping maps with one robot: leave out --robots")
+
+
+def _check_fleet(options: UpOptions, plan: SessionPlan, robots: list[str]) -> None:
+    """Raises UserError if the services of several robots would refuse a name or a setting."""
+    for name in robots:
+        check_robot_name(name)
+    if "estimator" not in options.without:
+        load_settings(EstimatorSettings, [*plan.estimator, *arguments(robots=",".join(robots))]).check_several_robots()
 
 
 def _start_services(stack: Stack, options: UpOptions, plan: SessionPlan, robots: list[str], *, page: bool) -> None:

@@ -155,13 +155,21 @@ class ControllerService(Service):
             self.navigator.on_goal(message)
             if isinstance(self._wait, NoBelief):
                 self.navigator.goal_state.lose_belief("no {}: {}".format(*self._missing_input()))
-            x, y, floor = message.pose.x, message.pose.y, message.map_id
-            self.log.info("goal", x=x, y=y, floor=floor, cancel=message.cancel, explore=message.explore)
+            self._log_goal(message)
             self.publish(STATUS, self.navigator.status(self._last_stamp_ns))
         elif isinstance(message, Belief):
             self._on_belief(message)
         elif isinstance(message, Map) and self.geodesic is not None and not self.settings.world:
             self._plan_in(message, self.geodesic.robot.radius)
+
+    def _log_goal(self, goal: Goal) -> None:
+        if goal.cancel:
+            self.log.info("goal cancelled")
+        elif goal.explore:
+            self.log.info("exploration requested")
+        else:
+            floor = {"floor": goal.map_id} if goal.map_id else {}
+            self.log.info("goal", x=goal.pose.x, y=goal.pose.y, **floor)
 
     def _plan_in(self, message: Map, radius: float) -> None:
         """Prepares a map for planning in a thread, unless it is the last one again, repeated for late subscribers."""

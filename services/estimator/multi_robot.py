@@ -100,10 +100,7 @@ class FleetService(Service):
     def __init__(self, settings: EstimatorSettings) -> None:
         """Raises UserError if a setting is only for one robot."""
         super().__init__(settings)
-        if settings.learn != "none":
-            raise UserError("--learn is for one robot: leave it out, or leave out --robots")
-        if settings.initial_pose:
-            raise UserError("--initial-pose is for one robot: with --robots, set each pose with `presage relocalise`")
+        settings.check_several_robots()
         if settings.metrics:
             self.log.warning("--metrics is ignored with --robots: read the health messages of each robot instead")
 
@@ -124,11 +121,8 @@ class FleetLoop:
     def __init__(self, settings: EstimatorSettings, bus: Bus) -> None:
         """``settings.robots`` are names and patterns of names, separated by commas."""
         self.settings, self.bus = settings, bus
-        wanted = split_names(settings.robots)
-        self.names = list(dict.fromkeys(name for name in wanted if re.fullmatch(ROBOT_NAME_PATTERN, name)))
-        self.patterns = [name for name in wanted if name not in self.names]
-        if len(self.names) > settings.max_robots:
-            raise UserError(f"{len(self.names)} robots are named, --max-robots is {settings.max_robots}: raise it")
+        self.names = settings.robot_names
+        self.patterns = [name for name in split_names(settings.robots) if name not in self.names]
         self.log = logger(FleetService.name)
         self._robots: dict[str, FleetRobot] = {}
         self._alive: set[tuple[str, str]] = set()  # robot and service; changed by zenoh's threads

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
+from common.errors import UserError
 from common.geometry.pose_text import POSE_PATTERN
+from common.messages.topics import ROBOT_NAME_PATTERN
+from common.names import split_names
 from common.runtime.robot_settings import MotionLimitSettings
 
 _PATTERN = r"[A-Za-z0-9_.*?-]{1,64}"  # name of a robot, or a pattern of names
@@ -89,3 +93,20 @@ class EstimatorSettings(MotionLimitSettings):
     iterations: Annotated[
         int, Field(ge=1, le=1000, description="paper: gradient steps per scan; 1 in the publication")
     ] = 10
+
+    @property
+    def robot_names(self) -> list[str]:
+        """The names in ``robots``, without the patterns."""
+        names = split_names(self.robots)
+        return list(dict.fromkeys(name for name in names if re.fullmatch(ROBOT_NAME_PATTERN, name)))
+
+    def check_several_robots(self) -> None:
+        """Raises UserError if a setting is only for one robot, or more robots are named than allowed."""
+        if self.learn != "none":
+            raise UserError("--learn is for one robot: leave it out, or leave out --robots")
+        if self.initial_pose:
+            raise UserError(
+                "initial_pose is for one robot: leave it out with --robots, and set each pose with `presage relocalise`"
+            )
+        if (count := len(self.robot_names)) > self.max_robots:
+            raise UserError(f"{count} robots are named, --max-robots is {self.max_robots}: raise it")

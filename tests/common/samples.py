@@ -14,7 +14,7 @@ from pydantic.fields import FieldInfo
 
 from common.geometry.occupancy_grid import OccupancyGrid
 from common.geometry.world import Box, Circle, Obstacle, World
-from common.messages.definitions import Belief, BeliefHypothesis, Map, Preference
+from common.messages.definitions import Belief, BeliefHypothesis, Map, Preference, Scan
 from common.messages.topics import QUERIES, TOPICS
 from common.messages.wire import Binary, Message
 from common.robot.robot import Robot
@@ -46,8 +46,10 @@ def message_of(cls: type[Message]) -> st.SearchStrategy:
     rows = {name: _field(field) for name, field in cls.model_fields.items()}
     if cls in (Belief, BeliefHypothesis):
         three = st.builds(np.array, st.lists(st.floats(-1e6, 1e6, width=64), min_size=9, max_size=9))
-        matrix = st.none() | three.map(lambda m: m.reshape(3, 3))
-        rows["covariance"] = matrix
+        rows["covariance"] = st.none() | three.map(lambda m: m.reshape(3, 3) @ m.reshape(3, 3).T)
+    if cls is Scan:
+        rows["angle_increment"] = st.sampled_from([-0.1, 1e-3, 1.0])
+        rows["ranges"] = rows["ranges"].filter(lambda ranges: len(ranges) >= 2)
     if cls is Preference:
         rows |= {"width": st.just(3), "height": st.just(2)}
         rows["distance"] = st.lists(st.floats(0, allow_nan=False, width=32), min_size=6, max_size=6)
@@ -55,7 +57,7 @@ def message_of(cls: type[Message]) -> st.SearchStrategy:
         rows |= {"poses": st.just(np.zeros((2, 3))), "connected": st.sampled_from([[], [1, 0, 1]])}
     if cls is Belief:
         vector = st.none() | st.lists(st.floats(-1e6, 1e6, width=32), min_size=3, max_size=3)
-        rows |= {"xi": vector, "protection": vector, "curvature": matrix}
+        rows |= {"xi": vector, "protection": vector, "curvature": st.none() | three.map(lambda m: m.reshape(3, 3))}
     return st.builds(cls, **rows)
 
 

@@ -147,6 +147,22 @@ def test_goal_without_beliefs():
     assert service.navigator.goal_state.status(0, None).state == "navigating"
 
 
+def test_log_of_goals():
+    """A line contains only what applies."""
+    service = ControllerService(ControllerSettings(world="", preset="paper"))
+    ServiceLoop(service, FakeBus(), Inbox())
+    service.open()
+    with capture_logs() as lines:
+        for changes in ({}, {"map_id": "first"}, {"explore": True}, {"cancel": True}):
+            service.on_message(GOAL, goal(8, 2).model_copy(update=changes))
+    assert [{name: value for name, value in line.items() if name != "log_level"} for line in lines] == [
+        {"event": "goal", "x": 8.0, "y": 2.0},
+        {"event": "goal", "x": 8.0, "y": 2.0, "floor": "first"},
+        {"event": "exploration requested"},
+        {"event": "goal cancelled"},
+    ]
+
+
 @pytest.mark.parametrize("drives", [False, True])
 def test_warning_without_beliefs(drives):
     """Only a robot that drives is stopped; one that stands may wait for a search of the whole map."""

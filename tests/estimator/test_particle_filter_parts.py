@@ -47,7 +47,7 @@ def test_surfaces_and_saturation():
 
 
 def test_too_large_world():
-    huge = World(name="huge", boundary=[(0, 0), (9000, 0), (9000, 9000), (0, 9000)])
+    huge = World(name="huge", boundary=[(0, 0), (440, 0), (440, 440), (0, 440)])
     with pytest.raises(UserError, match="coarser resolution"):
         SurfaceDistances(huge)
     with pytest.raises(UserError, match="too many"):

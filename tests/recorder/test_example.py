@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from common.messages.topics import TRUTH
+from services.recorder.files.writer import RecordingWriter
 from tests.recorder import sessions as made
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "read_recording.py"
@@ -18,6 +20,15 @@ def test_example(tmp_path):
     middle = sorted(made.error(i) for i in range(made.SCANS))[made.SCANS // 2]
     assert done.stdout.split() == f"{made.SCANS} beliefs, 91 beams, median error {middle:.4f} m".split()
     assert done.stderr == ""
+
+
+def test_beliefs_that_were_recorded_before_their_truth(tmp_path):
+    writer = RecordingWriter(tmp_path / "run.mcap")
+    for topic, service, message, at in made.events():
+        at_ns = at + (10_000_000 if topic is TRUTH else 0)
+        writer.write(topic, topic.key("robot", service), message.encode(), at_ns, at_ns)
+    done = subprocess.run([sys.executable, EXAMPLE, writer.finish()], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith(f"{made.SCANS} beliefs, ")
 
 
 def test_length_and_packages():

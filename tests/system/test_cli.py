@@ -105,7 +105,7 @@ def test_tools_beside_a_session(presage, process, bus, link, monkeypatch):
         ("hz goal --seconds 0.1", 2, "goal within 0.1 s: `presage top` shows which services run"),
         ("--robot other hz --seconds 0.1", 2, "no robot 'other' is running: choose one of"),
         ("teleport 3.5 1.5 -90", 0, ""),
-        ("teleport 0.1 0.1", 2, "from a wall of 'corridor'"),
+        ("teleport 0.1 0.1", 2, "from a wall, and the robot needs"),
         ("obstacle add crate 12 1.5 --yaw 30", 0, ""),
         ("obstacle move crate 13 1.5", 0, ""),
         ("obstacle list", 0, 'crate: {"box":{"center":[13.0,1.5],"size":[0.5,0.5],"yaw_deg":30.0}}'),

@@ -9,7 +9,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from common.errors import UserError
-from common.geometry.world import World, known_worlds, load_world, save_world
+from common.geometry.world import World, known_worlds, lack_of_room, load_world, save_world
 from common.robot.robot import Robot
 from services.controller.policies.geodesic_field import WALL_GAP_M
 from tests.common.geometry.maps import ROOM
@@ -121,6 +121,7 @@ def test_name_defaults_to_that_of_the_file(tmp_path):
         ("{name: x, boundary: [[0, 0], [1, 1]]}", "at least 3"),
         ("{name: x, boundary: [[0, 0], [2, 2], [2, 0], [0, 2]]}", "not simple"),
         ("{name: x, boundary: [[0, 0], [1, 0], [.nan, 1]]}", "finite"),
+        ("{name: x, boundary: [[0, 0], [600, 0], [600, 400], [0, 400]]}", "0.24 km², but a world has at most 0.2 km²"),
         ("{name: x, boundary: [[0, 0], [1, 0], [1, 1]], obstacles: [{}]}", "exactly one of"),
         ("{name: x, boundary: [[0, 0], [1, 0], [1, x]]}", "boundary, entry 3, entry 2: expected a number, not 'x'"),
         ("{name: x, boundary: [[0, 0], [1, 0], [1, 1]], walls: 3}", "unknown key 'walls'; the keys are boundary, "),
@@ -150,6 +151,10 @@ def test_invalid_files(tmp_path, text, message):
     assert message in str(error.value)
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_place_on_a_corner():
+    assert lack_of_room(-0.0, 0.3) == "is 0.00 m from a wall, and the robot needs 0.3 m around it"
 
 
 def test_unknown_world():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from common.messages.definitions import Pose, Scan, Stamped, Twist
+from common.messages.definitions import Belief, BeliefHypothesis, Pose, Scan, Stamped, Twist
 from common.messages.topics import QUERIES, TOPICS
 from tests.common.samples import all_messages
 
@@ -87,3 +87,30 @@ def test_poses_and_twists_convert_to_arrays():
 def test_beam_angles_follow_laserscan():
     scan = Scan(stamp_ns=0, angle_min=-1.0, angle_increment=0.25, range_min=0.0, range_max=9.0, ranges=np.ones(5))
     assert scan.angles().tolist() == [-1.0, -0.75, -0.5, -0.25, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("covariance", "problem"),
+    [
+        (-np.eye(3), "not positive semidefinite"),
+        ([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]], "not positive semidefinite"),
+        (np.diag([1.0, 1.0, -1e-12]), "not positive semidefinite"),
+        (np.triu(np.ones((3, 3))), "not symmetric"),
+        (np.eye(2, 3), r"shape \(2, 3\)"),
+    ],
+)
+def test_invalid_covariances(covariance, problem):
+    """The controller's arithmetic ends in NaN with a negative variance."""
+    with pytest.raises(ValueError, match=problem):
+        Belief(stamp_ns=0, state="tracking", pose=Pose(x=0.0, y=0.0), covariance=covariance)
+    with pytest.raises(ValueError, match=problem):
+        BeliefHypothesis(pose=Pose(x=0.0, y=0.0), covariance=covariance, weight=1.0)
+
+
+def test_rounded_covariances():
+    """Covariances of single precision are valid, also if one deviation is 0 or far smaller than another."""
+    for deviation in ([1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1e6, 1e-6, 1e-3], [1e150, 1e150, 1e150]):
+        turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+        factor = turn @ np.diag(deviation)
+        covariance = factor @ factor.T * np.random.default_rng(2).uniform(1 - 1e-7, 1 + 1e-7, (3, 3))
+        assert BeliefHypothesis(pose=Pose(x=0.0, y=0.0), covariance=covariance, weight=1.0).covariance is not None

@@ -117,7 +117,12 @@ def test_exceptions_and_user_errors(small):
     small.goal(-1)
     assert small.until(lambda h: h.counters["failed"] == 1)
     assert "a bug in on_message" in small.running.output
+    small.goal(-1)
+    assert small.until(lambda h: h.counters["failed"] == 2)
+    small.running.wait_for("step failed (as before)")
+    assert "so_far=2" in small.running.output
     assert small.running.output.count("Traceback") == 1
+    assert "locals" not in small.running.output
     small.goal(101)
     assert small.running.wait() == 2
     assert "small: the map ends before that" in small.running.output

@@ -127,6 +127,28 @@ def test_mapping():
     assert not any("estimator" in finding.what for finding in findings(seen, "missing"))
 
 
+def test_estimator_without_predictions():
+    """They are optional for an estimator of one's own; without beliefs, their lack is a problem."""
+    seen = observed()
+    seen.arrivals[PREDICTION.key("robot")] = 0
+    assert not problems(seen)
+    assert any("prediction: none" in finding.what for finding in findings(seen, "rate"))
+    seen.arrivals[BELIEF.key("robot")] = 0
+    assert [each.what.split(":")[0] for each in findings(seen, "rate") if each.ok is False] == ["belief", "prediction"]
+
+
+def test_recorder_beside_an_idle_one():
+    """`presage record` runs beside the idle recorder of `presage up`."""
+    seen = observed()
+    idle = Health(stamp_ns=0, service="recorder", uptime=9, instance="a", idle=True, note="not recording")
+    busy = Health(stamp_ns=0, service="recorder", uptime=2, instance="b", counters={"failed": 3})
+    seen.health["recorder"] = [(0, idle), (0, busy), (0, idle)]
+    assert not findings(seen, "note")
+    assert not problems(seen)
+    seen.health["recorder"] = [(0, idle), (0, idle)]
+    assert findings(seen, "note")[0].what == "recorder reports: not recording"
+
+
 def test_doubled_services():
     for name, codes in (("controller", {"doubled"}), ("recorder", set())):
         seen = observed([*NAMES, name], reporting=[*NAMES, name])
@@ -140,7 +162,6 @@ def test_doubled_services():
         ({}, True, "301 beams from -85.94 deg on, 0.573 deg apart, mounted at (0, 0) m, 0 deg"),
         ({"angle_min": 1.5, "angle_increment": -0.01}, True, "clockwise as if upside down"),
         ({"mount": Pose(x=-0.2, y=0.0, yaw=3.0)}, None, "mounted at (-0.2, 0) m, 171.9 deg"),
-        ({"angle_increment": 0.0}, False, "0 deg apart"),
         ({"angle_increment": 0.05}, False, "2.86 deg apart"),
     ],
 )
@@ -183,3 +204,33 @@ def test_rising_counts(service, counts, codes):
 @pytest.mark.parametrize("endpoint", ["udp/127.0.0.1:1", "serial//dev/ttyS0"])
 def test_only_tcp_endpoints_are_checked(endpoint):
     assert check_endpoint(endpoint) is None
+
+
+@pytest.mark.parametrize(
+    ("stamp_ns", "words"),
+    [
+        (lambda _: 0, "do not advance with time (0 s in 2.93 s)"),
+        (lambda t: int(1e3 * t), "do not advance with time (2.93e-06 s in 2.93 s)"),  # milliseconds
+        (lambda t: int(1e9 * (0.1 * t % 0.2)), ""),  # a slow simulation, which begins again
+    ],
+)
+def test_stamps_of_scans(stamp_ns, words):
+    seen = observed()
+    seen.scan_stamps = [(int(n / 15 * SECOND), stamp_ns(n / 15)) for n in range(45)]
+    (finding,) = findings(seen, "stamps")
+    assert (finding.ok, words in finding.what) == (not words, True)
+    for alive, config in (([*NAMES, "replay"], "{}"), (NAMES, '{"pace": "lockstep"}')):  # there, time may stand still
+        seen.monitor.set_alive(alive, 0.0)
+        seen.replies["simulator"] = [build_config_reply("simulator", config, 5.0)]
+        assert not problems(seen)
+
+
+@pytest.mark.parametrize(("delay_ns", "ok"), [(0, True), (1, False)])
+def test_stamps_of_beliefs(delay_ns, ok):
+    seen = observed()
+    stamps = [n * SECOND // 15 for n in range(45)]
+    seen.scan_stamps = list(zip(stamps, stamps, strict=True))
+    seen.belief_stamps = [stamp + delay_ns for stamp in [-SECOND // 15, *stamps]]
+    (_, finding) = findings(seen, "stamps")
+    assert finding.ok is ok
+    assert f"{45 if ok else 0} of 46" in finding.what

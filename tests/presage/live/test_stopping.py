@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import io
 import threading
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
 from common.bus.inbox import Inbox
-from common.messages.definitions import Goal, Pose, Status
+from common.messages.definitions import Exploration, Goal, Pose, Status
 from common.messages.topics import GOAL, STATUS
 from presage.live import commands, exploring
 from presage.live.latest_messages import LatestMessages
@@ -45,6 +46,23 @@ def test_goal_cancelled_without_statuses(bus, link, goals, monkeypatch, answers,
     controller.join()
     assert received == [CANCEL]
     assert console.file.getvalue() == output
+
+
+def test_progress_of_an_exploration():
+    statuses = [
+        Status(
+            stamp_ns=1, state=state, reason=reason,
+            exploration=Exploration(phase=phase, seq=7, area=40.0, path=0.0),
+        )
+        for state, reason, phase in (
+            ("exploring", "driving to a viewpoint", "exploring"),
+            ("exploring", "returning to the start", "finished"),
+        )
+    ]  # fmt: skip
+    messages = SimpleNamespace(wait_for=lambda *_: statuses.pop(0))
+    console = Console(file=io.StringIO(), width=150)
+    assert exploring._follow(messages, 7, console) == 0
+    assert console.file.getvalue().startswith("exploring: 40 m² mapped, 0.0 m driven; driving to a viewpoint\n")
 
 
 def test_exploration_that_may_go_on(bus, link, goals, monkeypatch):

@@ -37,6 +37,7 @@ def test_summary(recording):
     assert json.loads(json.dumps(summary)) == summary
     lines = dict(summarise(recording).lines())
     assert (lines["goal"], lines["distance to goal"]) == ("reached", "0.100 m, believed 0.100 m")
+    assert lines["skipped by services"] == "7 scan, for newer ones; undecodable 0"
     assert "incomplete" not in lines
 
 

@@ -260,6 +260,14 @@ def test_summary_of_selected_scans(tmp_path, capsys):
     assert (data["start"], data["end"], data["every"], data["complete"]) == (0.1, None, 4, True)
 
 
+def test_scans_that_do_not_fit_the_map(tmp_path, capsys):
+    far = np.tile(np.linspace(1.0, 2.0, 200), (10, 1))  # a spiral
+    for ranges, hint in ((far, True), (None, False)):
+        file = npz(tmp_path, ranges=ranges) if ranges is not None else npz(tmp_path)
+        localize(job(file, out=tmp_path / "poses.csv"), Console(width=150))
+        assert ("is this the right map?" in capsys.readouterr().out) is hint
+
+
 def test_selection_refusals(tmp_path):
     file = npz(tmp_path)
     scans, unstamped = read_scans(file), replace(read_scans(file), stamps=None)

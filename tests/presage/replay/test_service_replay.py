@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from common.errors import UserError
 from common.messages.definitions import Belief, CmdVel, Pose, Status, Twist
 from presage.replay.goal_times import GoalTimes
 from presage.replay.replay_outcome import MessagePairs, ReplayOutcome
-from presage.replay.service_replay import describe
+from presage.replay.service_replay import build_services, describe
+from services.recorder.files.writer import RecordingWriter
+from services.recorder.reader import read_recording
 
 
 def belief(stamp, x=0.0, state="tracking", covariance=None, free_energy=1.0):
@@ -111,3 +116,12 @@ def test_goal_times_at_a_cut_end():
     goals = controller(1, "g", 2)
     goals.add([Status(stamp_ns=3, state="navigating", goal=Pose(x=1.0, y=1.0), distance=1.0)])
     assert goals.accepted(1) == {1: 1, 3: 0}
+
+
+def test_estimator_of_ones_own(tmp_path):
+    """It cannot be run again: presage's estimator would be blamed on the session."""
+    writer = RecordingWriter(tmp_path / "run.mcap")
+    writer.metadata("config:estimator", {"config": json.dumps({"robot": "robot", "start": "0,0,0"})})
+    recording = read_recording(writer.finish())
+    with pytest.raises(UserError, match=r"made with another program as estimator.*`presage rerun "):
+        build_services(recording, ("estimator",), tmp_path, [])

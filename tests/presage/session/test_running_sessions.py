@@ -64,3 +64,10 @@ def test_stale_files_are_ignored():
     write_session(me.pid, me.create_time() - 1, HERE)  # an earlier process with the same pid
     (runtime_folder() / "broken.json").write_text("{")
     assert find_session("").endpoint == DEFAULT_ENDPOINT
+
+
+@pytest.mark.parametrize("name", ["*", "robot-*", "a?b", "#", "/", "robot 1", "$*", "x" * 65])
+def test_names_that_no_robot_can_have(name):
+    """The wildcards of zenoh would address all robots."""
+    with pytest.raises(UserError, match=r"--robot .*: give the name of one robot"):
+        link_of("", name)

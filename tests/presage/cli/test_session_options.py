@@ -1,0 +1,34 @@
+"""A command says which session it acts on, unless the user has chosen it."""
+
+from __future__ import annotations
+
+import pytest
+from typer.testing import CliRunner
+
+from presage.cli.main import app
+from presage.live import commands
+from presage.session.running_sessions import session_file
+
+HERE = "tcp/127.0.0.1:7001"
+
+
+@pytest.mark.parametrize(
+    ("options", "command", "line"),
+    [
+        ([], ["goal", "1", "1"], f"session {HERE}, robot truck\n"),
+        (["--connect", HERE], ["goal", "1", "1"], ""),
+        ([], ["doctor"], ""),  # it only reads
+    ],
+)
+def test_session(monkeypatch, options, command, line):
+    monkeypatch.setattr(commands, "send_goal", lambda *_, **__: 0)
+    monkeypatch.setattr("presage.diagnosis.doctor.run_doctor", lambda *_, **__: 0)
+    with session_file(HERE, ["truck"], None):
+        done = CliRunner(env={"PRESAGE_CONNECT": "", "PRESAGE_ROBOT": ""}).invoke(app, [*options, *command])
+    assert (done.exit_code, done.stderr, done.stdout) == (0, line, "")
+
+
+def test_no_session(monkeypatch):
+    monkeypatch.setattr(commands, "send_goal", lambda *_, **__: 0)
+    done = CliRunner(env={"PRESAGE_CONNECT": "", "PRESAGE_ROBOT": ""}).invoke(app, ["goal", "1", "1"])
+    assert (done.exit_code, done.stderr) == (0, "")
