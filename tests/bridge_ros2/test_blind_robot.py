@@ -5,16 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from common.bus.inbox import Inbox
 from common.messages.definitions import Scan
 from common.messages.topics import SCAN
 from common.robot.ranges import is_surface
 from common.runtime import safety
+from common.runtime.service_loop import ServiceLoop
 from services.bridge_ros2.ros_types import LASER_SCAN, decode
 from services.bridge_ros2.service import BridgeRos2Service
 from services.bridge_ros2.settings import BridgeRos2Settings
 from services.controller.service import ControllerService
 from services.controller.settings import ControllerSettings
 from tests.bridge_ros2 import cdr
+from tests.process_replay.harness import FakeBus
 
 SELF_FILTER = {"ignore_angles": "-5:5", "blind_radius": 0.3}
 
@@ -39,7 +42,9 @@ def test_the_bridge(monkeypatch, settings, visible):
 
 @pytest.mark.parametrize(("settings", "visible"), [({}, 3), (SELF_FILTER, 2)])
 def test_the_controller(monkeypatch, settings, visible):
-    service = ControllerService(ControllerSettings(**settings))
+    service = ControllerService(ControllerSettings(world="", preset="paper", **settings))
+    ServiceLoop(service, FakeBus(), Inbox())
+    service.open()
     used = []
     monkeypatch.setattr(service.navigator.policy, "prepare", used.append)
     monkeypatch.setattr(service.navigator, "step_without_belief", lambda stamp_ns: None)  # no manual driving
