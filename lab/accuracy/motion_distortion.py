@@ -130,7 +130,9 @@ def observations(scene: Scene, path: Array, kind: str, prior: str) -> list[Obser
     shares = beam_times(scanner.beams, increment) * rate
     smooth = path.copy()
     smooth[:, 2] = np.unwrap(path[:, 2])
-    poses_at = CubicHermiteSpline(np.arange(len(path)), smooth, np.gradient(smooth, axis=0))
+    velocity = np.gradient(smooth, axis=0)
+    velocity[0] = 0.0  # a drive begins at rest
+    poses_at = CubicHermiteSpline(np.arange(len(path)), smooth, velocity)
     odometer, found = Odometer(OdometryNoise(), scene.rng), []
     for k, pose in enumerate(path[:-1]):
         if k:
