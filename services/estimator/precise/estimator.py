@@ -47,7 +47,7 @@ from services.estimator.precise.precision import Precision
 from services.estimator.precise.protection import EstimateError
 from services.estimator.precise.search import search_around, search_everywhere, search_near
 from services.estimator.precise.settings import PreciseSettings
-from services.estimator.precise.swept_scan import SweptEvidence
+from services.estimator.precise.swept_scan import SweptEvidence, acceleration_factors
 from services.estimator.shared.interface import (
     Hypothesis,
     Observation,
@@ -276,9 +276,11 @@ class PreciseEstimator:
             view, observation, self._velocity(self.hypotheses[0], observation) if self.hypotheses else None
         )
 
-    def _correct_motion(self, view: View, observation: Observation, velocity: Array | None) -> View:
-        """The view of the observation, corrected for a motion with ``velocity`` (3,) in base_link, and thinned."""
-        corrected = correct_motion(observation, velocity, self.mount)
+    def _correct_motion(
+        self, view: View, observation: Observation, velocity: Array | None, displacements: Array | float = 0.0
+    ) -> View:
+        """The view of the observation, corrected for motion (see `correct_motion`), and thinned."""
+        corrected = correct_motion(observation, velocity, self.mount, displacements)
         times = times_from_middle(observation) if velocity is not None else np.zeros(1)
         return replace(view, angles=corrected.angles, ranges=corrected.ranges, times=times).thinned(TARGET_BEAMS)
 
@@ -383,14 +385,22 @@ class PreciseEstimator:
         return match if map_evidence + np.log(LOCAL_MISMATCH_PROBABILITY) > local_evidence else by_local_map
 
     def _correct_motion_again(self, match: ScanMatch, observation: Observation, period: float) -> ScanMatch:
-        """Corrects the scan for the motion that the match has shown, and matches it again."""
-        # Not `between(last, this)`: beams are moved in base_link at this scan.
-        velocity = -se2.between(match.poses[0], self.hypotheses[0].pose) / period
-        view = self._correct_motion(match.view, observation, velocity)
-        poses, _ = view.descend(match.poses, _prior_of([each[-1] for each in match.motions]))
-        noise = self.settings.motion
+        """Corrects the scan for the motion that the match has shown, and matches it again.
+
+        This is done twice, the second time also for the accelerations that the first has shown.
+        """
+        noise, prior = self.settings.motion, _prior_of([each[-1] for each in match.motions])
         limits = np.array([noise.acceleration, noise.acceleration, noise.turn_acceleration])
-        swept = SweptEvidence.from_scan(view, poses, limits, period)
+        factors = acceleration_factors(times_from_middle(observation), period)
+        view, poses, accelerations = match.view, match.poses, np.zeros(6)
+        for _ in range(2):
+            # Not `between(last, this)`: beams are moved in base_link at this scan.
+            velocity = -se2.between(poses[0], self.hypotheses[0].pose) / period
+            in_base = accelerations.reshape(2, 3) @ se2.rotation(float(poses[0, 2]))
+            view = self._correct_motion(view, observation, velocity, factors.T @ in_base)
+            poses, _ = view.descend(poses, prior)
+            swept = SweptEvidence.from_scan(view, poses, limits, period, accelerations)
+            accelerations = swept.accelerations(0)
         return replace(match, view=view, poses=poses, evidence=swept.of_pose(), swept=swept)
 
     def _fuse(

@@ -10,7 +10,7 @@ middles of both sweeps. Then the pose of the robot at that beam differs from tha
 For s = -m, this is the error of the pose at the stamp. Both accelerations are unknown, with the variance of a uniform
 distribution within the limits of the base. They are estimated together with the pose: the derivative of a range by an
 acceleration is that by the pose, times the factor of the acceleration above. The evidence for the pose alone follows by
-marginalisation (Schur complement).
+marginalisation (Schur complement). To first order only, so the scan is corrected again for the accelerations found.
 """
 
 from __future__ import annotations
@@ -48,25 +48,30 @@ class Displacement:
         return np.asarray(jacobian @ covariance @ jacobian.T + self.covariance)
 
 
+def acceleration_factors(times: Array, period: float) -> Array:
+    """The factors (2, B) in s² of both accelerations for beams at ``times`` (B,) s after the middle of the sweep."""
+    s, m, T = times, float(-times.min()), period
+    return np.array([s * (T - m) ** 2 / (2 * T), (s**2 + 2 * s * m - s * m**2 / T) / 2])
+
+
 @dataclass(frozen=True)
 class SweptEvidence:
     """The evidence of a swept scan for pose and accelerations together: x, y, yaw, and the same of a and b, in map."""
 
     poses: Array  # (N, 3) in the middle of the sweep, where this evidence was computed
-    joint: Evidence  # at these poses, by all nine unknowns: xi (N, 9), matrices (N, 9, 9)
+    joint: Evidence  # of scan and prior by all nine unknowns at these poses: xi (N, 9); of the scan: matrices (N, 9, 9)
     prior: Array  # (N, 6, 6) information of the accelerations before the scan
     at_stamp: Array  # (3, 6) the pose's displacement at the stamp, per acceleration: s²
+    assumed: Array  # (6,) accelerations in map for which the view was corrected
 
     @classmethod
-    def from_scan(cls, view: View, poses: Array, limits: Array, period: float) -> SweptEvidence:
+    def from_scan(cls, view: View, poses: Array, limits: Array, period: float, assumed: Array) -> SweptEvidence:
         """The evidence at ``poses`` (N, 3) of a view that was corrected to the middle of its sweep.
 
-        ``limits`` (3,) are those of the acceleration in base_link, ``period`` s is the time since the last scan.
+        It was also corrected for the ``assumed`` accelerations (6,) in map. ``limits`` (3,) are those in base_link, and
+        ``period`` s is the time since the last scan.
         """
-        s, m = view.times, float(-view.times.min())
-        factors = np.array(
-            [np.ones_like(s), s * (period - m) ** 2 / (2 * period), (s**2 + 2 * s * m - s * m**2 / period) / 2]
-        )
+        factors = np.array([np.ones_like(view.times), *acceleration_factors(view.times, period)])
         weights = view.surface_evidence(poses).weights
         products = {
             (i, j): view.evidence(poses, 0.0, weights * factors[i] * factors[j])
@@ -85,8 +90,9 @@ class SweptEvidence:
         to_map = np.array([se2.rotation(float(yaw)) for yaw in poses[:, 2]])
         prior = np.zeros((len(poses), 6, 6))
         prior[:, :3, :3] = prior[:, 3:, 3:] = to_map @ np.diag(3 / limits**2) @ to_map.transpose(0, 2, 1)
-        first = factors[1:, int(np.argmin(s))]
-        return cls(poses, joint, prior, np.kron(first, np.eye(3)))
+        joint.xi[:, 3:] -= prior @ assumed
+        at_stamp = np.kron(factors[1:, int(np.argmin(view.times))], np.eye(3))
+        return cls(poses, joint, prior, at_stamp, assumed)
 
     def of_pose(self) -> Evidence:
         """The evidence (N,) for the pose alone."""
@@ -103,6 +109,10 @@ class SweptEvidence:
             project @ self.joint.xi_model_covariance @ transposed,
         )
 
+    def accelerations(self, k: int) -> Array:
+        """The most probable accelerations (6,) in map at the k-th of the poses."""
+        return self.assumed + np.linalg.solve(self.joint.curvature[k, 3:, 3:] + self.prior[k], self.joint.xi[k, 3:])
+
     def displacement(self, k: int, pose: Array, interpolated: Array) -> Displacement:
         """The displacement at the stamp, if ``pose`` (3,) is that of the k-th hypothesis in the middle of the sweep.
 
@@ -110,7 +120,7 @@ class SweptEvidence:
         """
         covariance = np.linalg.inv(self.joint.curvature[k, 3:, 3:] + self.prior[k])
         jacobian = -covariance @ self.joint.curvature[k, 3:, :3]
-        accelerations = covariance @ self.joint.xi[k, 3:] + jacobian @ se2.difference(pose, self.poses[k])
+        accelerations = self.accelerations(k) + jacobian @ se2.difference(pose, self.poses[k])
         return Displacement(
             se2.difference(interpolated, pose) + self.at_stamp @ accelerations,
             self.at_stamp @ jacobian,

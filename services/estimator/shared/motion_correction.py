@@ -18,15 +18,20 @@ if TYPE_CHECKING:
     from services.estimator.shared.interface import Observation
 
 
-def correct_motion(observation: Observation, velocity: Array | None, mount: Array) -> Observation:
+def correct_motion(
+    observation: Observation, velocity: Array | None, mount: Array, displacements: Array | float = 0.0
+) -> Observation:
     """The observation as if all beams had been measured in the middle of the sweep; ``mount`` (3,) is the laser.
 
-    The robot moves with ``velocity`` (3,) in base_link. If that is unknown, the observation is unchanged.
+    The robot moves with ``velocity`` (3,) in base_link, and at each beam is displaced from there by ``displacements``
+    (B, 3). If the velocity is unknown, the observation is unchanged.
     """
     if velocity is None or not observation.time_increment:
         return observation
     times = times_from_middle(observation)
-    ranges, angles = correct_beams(observation.ranges, observation.angles, times[:, None] * velocity, mount)
+    ranges, angles = correct_beams(
+        observation.ranges, observation.angles, times[:, None] * velocity + displacements, mount
+    )
     return replace(observation, ranges=ranges, angles=angles, time_increment=0.0)
 
 
