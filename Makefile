@@ -125,13 +125,13 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	$(if $(LOGS),$(BIN)/presage map '$(LOGS)/uwb.npz' --mount 0,0,0 --poses reference --half first --no-learn -o $(RESULTS)/maps/uwb_first_half.yaml)
 	$(if $(LOGS),$(BIN)/presage experiment --out $(RESULTS) real --log '$(LOGS)/uwb.npz' --mount 0,0,0 --world $(RESULTS)/maps/uwb_first_half.yaml --every 10 --name uwb)
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity --worlds 3 --seed 3571 --model exact --seconds 10 --estimators precise,particle-filter,particle-filter-recovery
-	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-kidnapped-similar --worlds 20 --seed 3541 --model exact --seconds 10 --cases kidnapped-similar --estimators precise
-	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-long-corridor --worlds 40 --seed 3542 --model exact --seconds 10 --cases long-corridor --estimators precise
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-kidnapped-similar --worlds 20 --seed 3572 --model exact --seconds 10 --cases kidnapped-similar --estimators precise
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-long-corridor --worlds 40 --seed 3573 --model exact --seconds 10 --cases long-corridor --estimators precise
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-wrong-map --worlds 40 --seed 3543 --model exact --seconds 10 --cases wrong-map --estimators precise
-	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-noisy-map --worlds 20 --seed 3545 --model exact --seconds 40 --cases noisy-map
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-noisy-map --worlds 20 --seed 3575 --model exact --seconds 40 --cases noisy-map
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-50 --worlds 20 --seed 3415 --model exact --cases moved-50 --estimators precise,particle-filter,particle-filter-recovery
-	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-100 --worlds 40 --seed 3544 --model exact --seconds 10 --cases moved-100 --estimators precise
-	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-single-scan --worlds 40 --seed 3546 --model exact --cases single-scan-moved-50 --estimators precise
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-100 --worlds 40 --seed 3574 --model exact --seconds 10 --cases moved-100 --estimators precise
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-single-scan --worlds 40 --seed 3576 --model exact --cases single-scan-moved-50 --estimators precise
 	for folder in $(RESULTS)/integrity*/; do cp $$folder/integrity.json docs/experiments/$$(basename $$folder).json || exit 1; done
 	cp $(RESULTS)/integrity/integrity.png $(RESULTS)/*.json $(RESULTS)/*.csv $(RESULTS)/*.png $(RESULTS)/*.pdf docs/experiments/
 	mv docs/experiments/accuracy.png docs/accuracy.png
