@@ -109,7 +109,7 @@ def _grown(box: Box) -> Box:
 
 def hits(surfaces: Sequence[Obstacle], ranges: Array, lasers: Array, angles: Array) -> npt.NDArray[np.bool_]:
     """(N, B) whether beams of these ``ranges`` (N, B) m, from poses (N, 3) in map, meet one of the surfaces."""
-    far = 1e3
+    far = 200.0  # m, beyond every generated building and the range of a beam
     around = World(name="surfaces", boundary=[(-far, -far), (far, -far), (far, far), (-far, far)])
     return np.asarray(cast_rays(around.with_obstacles(list(surfaces)), lasers, angles) <= ranges)
 

@@ -112,7 +112,7 @@ def test_occupied_map_cells(make, rooms_map, kind):
     simulation = make(rooms_map)
     row, column = np.argwhere(rooms_map.grid.values == kind)[7]
     place = np.array([*rooms_map.grid.geometry.points_in_cells(np.array([[column, row]]), 0.5)[0], 0.0])
-    with pytest.raises(UserError, match="inside a wall or outside"):
+    with pytest.raises(UserError, match="is inside something, or off the map"):
         simulation.teleport(place)
     with pytest.raises(UserError, match="inside a wall or outside"):
         simulation.sample(place[None], 10, None)

@@ -42,7 +42,7 @@ def test_goal_on_another_floor(process, presage):
     going = process("presage.__main__", "goal", "2", "2", "--floor", "first", "--wait")
     going.wait_for("waiting to be taken to floor 'first'")
     for command, says in (
-        ("teleport 4 3.5 --floor first", "(4.00, 3.50) on floor 'first' is inside a wall"),
+        ("teleport 4 3.5 --floor first", "(4.00, 3.50) on floor 'first' in tower is inside something"),
         ("teleport -3 3 --floor first", "(-3, 3) is not on floor 'first', which reaches from (-0.1, -0.1) to"),
         ("relocalise 1 2 --floor attic", "there is no floor 'attic': choose one of ground, first"),
     ):

@@ -103,7 +103,7 @@ def test_death_and_restart(process, bus):
         ("simulator", ("--world", "nowhere"), "one of corridor, maze, office"),
         ("estimator", ("--world", "maze", "--estimator", "paper"), "presage train --world maze --preset paper"),
         ("estimator", ("--robots", "a b"), "robots"),
-        ("estimator", ("--robots", "a,b", "--initial-pose", "3,1.5"), "--initial-pose"),
+        ("estimator", ("--robots", "a,b", "--initial-pose", "3,1.5"), "initial_pose is for one robot"),
         ("estimator", ("--robots", "a,b,c", "--max-robots", "2"), "--max-robots"),
         ("simulator", ("--scanner", "sonar"), "no scanner 'sonar': choose one of tim571"),
         ("simulator", ("--start", "0.1,0.1"), "the robot needs 0.27 m around it"),
