@@ -236,7 +236,7 @@ def summary(card: weights.FieldCard) -> list[str]:
             f"return; noise {likelihood.sigma * 1e3:.1f} mm; usually {calibration.usual:.0%} of a scan is explained"
         ),
         (
-            f"pose from one scan against the reference: error floor {calibration.floor_position * 1e3:.0f} mm and "
+            f"pose from one scan against that of the drive: error floor {calibration.floor_position * 1e3:.0f} mm and "
             f"{np.rad2deg(calibration.floor_heading):.2f} deg, covariance scaled by {calibration.inflation:.1f}; NEES "
             f"then {calibration.nees_median:.2f} median (ideal: 2.37), {calibration.nees_mean:.2f} mean (ideal: 3)"
         ),

@@ -181,7 +181,7 @@ def _draw_ties(axes: Axes, session: RecordedSession) -> None:
             selected.append(int(row))
     believed, true = session.belief.poses[selected, :2], session.true_poses[selected, :2]
     ties = np.stack([believed, true, np.full_like(true, np.nan)], axis=1).reshape(-1, 2)
-    label = "same moment, each second" if every == 1 else f"same moment, every {every} s"
+    label = "truth and belief, each second" if every == 1 else f"truth and belief, every {every} s"
     axes.plot(*ties.T, color=INK, linewidth=0.9, alpha=0.6, label=label, zorder=3.5)
     axes.plot(*true.T, ".", color=TRUTH, markersize=5, zorder=5)
     axes.plot(*believed.T, ".", color=BELIEF, markersize=5, zorder=4)
