@@ -18,8 +18,8 @@ class LaserScan(Observation):
     """One scan, with its scanner's mount and noise.
 
     ``ranges`` are those of a driver: range_max and more mean no return; NaN, 0 and negative values are not used. They
-    are stored as estimators need them: +inf for no return, -inf for a beam that is not used. A NaN in any pose but the
-    mount means that the pose is unknown. Raises UserError if a shape does not fit, or another number is not finite.
+    are stored as estimators need them: +inf for no return, -inf for a beam that is not used. Any pose but the mount
+    with NaN or infinity is unknown. Raises UserError if a shape does not fit, or another number is not finite.
     """
 
     mount: Array = field(default_factory=lambda: np.zeros(3))  # (3,) laser in base_link: m, m, rad
@@ -33,7 +33,8 @@ class LaserScan(Observation):
         if ranges.ndim != 1 or ranges.shape != angles.shape:
             raise UserError(f"a scan needs as many ranges as angles, not shapes {ranges.shape} and {angles.shape}")
         mount = self._pose("mount")
-        needed = {"angles": angles, "mount": mount, "stamp": self.stamp, "range_max": self.range_max}
+        names = ("stamp", "range_max", "time_increment", "sigma", "sigma_relative")
+        needed = {"angles": angles, "mount": mount} | {name: getattr(self, name) for name in names}
         for name, numbers in needed.items():
             if numbers is not None and not np.isfinite(numbers).all():
                 raise UserError(f"{name} of a scan: NaN and infinity are not allowed")

@@ -141,7 +141,7 @@ class BeliefHypothesis(Message):
     """One Gaussian of a belief's mixture."""
 
     pose: Pose  # base_link in map
-    covariance: Covariance | None = None  # (3, 3) of x, y, yaw in map
+    covariance: Covariance | None = None  # (3, 3) of x, y, yaw in map, positive semidefinite
     weight: Annotated[float, Field(ge=0, le=1)]  # the weights sum to 1
 
 

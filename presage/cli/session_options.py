@@ -29,7 +29,7 @@ def chosen_link(context: typer.Context, roles: Sequence[str] = OPERATOR, robot: 
     """
     options = context.find_root().params
     link = link_of(options["connect"], robot or options["robot"], roles)
-    if not options["connect"] and roles is not OBSERVER and running_sessions():
+    if not options["connect"] and roles != OBSERVER and running_sessions():
         # Not to stdout, which may be read by a program.
-        typer.echo(f"session {', '.join(link.connect)}, robot {link.robot}", err=True)
+        typer.echo(f"using session {', '.join(link.connect)}, robot {link.robot}", err=True)
     return link

@@ -180,9 +180,17 @@ def _stamps(observation: BusObservation) -> Iterator[Finding]:
 
 def _time_may_stand(observation: BusObservation) -> bool:
     """Whether the stamps of scans may rightly stand still: in a replay, and in lockstep."""
-    configs = [json.loads(reply.config) for reply in observation.replies.get("simulator", [])]
-    lockstep = any(isinstance(config, dict) and config.get("pace") == "lockstep" for config in configs)
+    lockstep = any(_pace(reply) == "lockstep" for reply in observation.replies.get("simulator", []))
     return lockstep or observation.monitor.present(REPLAY, observation.seconds)
+
+
+def _pace(reply: ConfigReply) -> str:
+    """The setting `pace` of a simulator; empty if its reply, as that of another program, has none."""
+    try:
+        config = json.loads(reply.config)
+    except ValueError:
+        return ""
+    return str(config.get("pace", "")) if isinstance(config, dict) else ""
 
 
 def _counts(observation: BusObservation) -> Iterator[Finding]:

@@ -171,7 +171,7 @@ def export_csv(
         raise UserError(f"{recording.path}: no message of presage in it, so there is nothing to export")
     layouts = {topic.name: _TopicLayout(topic) for topic in dict.fromkeys(keys.values())}
     counts = recording.counts
-    with complete_files(folder / README) as new:
+    with complete_files(folder, folder) as new:
         with closing(CsvTables(new)) as tables:
             messages = with_progress(entries(recording, name), sum(counts[key] for key in keys), "csv", console)
             for topic, message, raw in messages:

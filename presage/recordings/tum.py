@@ -75,7 +75,7 @@ def export_tum(
     make_folder(folder)
     refuse_to_overwrite(sorted(folder.iterdir())[:1], force=force)
     counts = recording.counts
-    with complete_files(folder / "belief.tum") as partial, ExitStack() as stack:
+    with complete_files(folder, folder) as partial, ExitStack() as stack:
         files = {topic.name: TrajectoryWriter(partial, topic.name, stack) for topic in keys.values()}
         messages = with_progress(entries(recording, name, *TOPICS), sum(counts[key] for key in keys), "tum", console)
         for topic, message, _ in messages:

@@ -7,7 +7,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TextIO, get_args
@@ -21,7 +21,7 @@ from common.geometry.pose_text import parse_initial_pose
 from common.geometry.se2 import Array
 from common.geometry.tum import write_tum
 from common.geometry.world import load_world
-from common.writing import complete_files, naming
+from common.writing import complete_files, name_in_errors
 from presage.estimator import Estimator
 from presage.interrupts import ignoring_interrupts
 from presage.laser_scan import LaserScan
@@ -282,16 +282,27 @@ def _output(options: LocalizeOptions, count: int) -> Iterator[Callable[[dict[str
     with ExitStack() as stack:
         stream: TextIO = sys.stdout
         if options.out is not None:
-            stack.enter_context(naming(options.out))
-            stream = stack.enter_context(options.out.open("w", newline="", encoding="utf-8"))
+            stream = stack.enter_context(_closing_named(options.out))
         writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
         writer.writeheader()
 
         def write(row: dict[str, Any]) -> None:
-            writer.writerow(row)
-            stream.flush()  # so that the rows so far are in the file however the run ends
+            with nullcontext() if options.out is None else name_in_errors(options.out):
+                writer.writerow(row)
+                stream.flush()  # so that the rows so far are in the file however the run ends
 
         yield write
+
+
+@contextmanager
+def _closing_named(out: Path) -> Iterator[TextIO]:
+    """Opens a new file; an error while it is closed, when the last rows are written, names it."""
+    stream = out.open("w", newline="", encoding="utf-8")
+    try:
+        yield stream
+    finally:
+        with name_in_errors(out):
+            stream.close()
 
 
 def _write_json(options: LocalizeOptions, out: Path, rows: list[dict[str, Any]], *, complete: bool) -> None:

@@ -112,7 +112,7 @@ def link_of(connect: str, robot: str, roles: Sequence[str] = OPERATOR) -> Link:
 def check_robot_name(name: str) -> None:
     """Raises UserError if no robot can have the name."""
     if not re.fullmatch(ROBOT_NAME_PATTERN, name):
-        raise UserError(f"--robot {name!r}: give the name of one robot, of up to 64 letters, digits, -, _ and .")
+        raise UserError(f"robot {name!r}: give the name of one robot, of up to 64 letters, digits, -, _ and .")
 
 
 def credentials_for(robot: str, roles: Sequence[str] = OPERATOR, *, folder: str = "") -> Credentials | None:

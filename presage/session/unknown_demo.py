@@ -190,7 +190,7 @@ def explore(observer: SessionObserver) -> None:
 
 
 def kidnap(bus: Bus, observer: SessionObserver) -> None:
-    """Kidnaps the robot to a mapped place, and waits until it is localised there."""
+    """Carries the robot to a mapped place, and waits until it is localised there."""
     before, place = observer.pose, farthest_key_scan(observer)
     place = se2.compose(place, [0.0, 0.0, np.pi])  # with a view that is not the one in the map
     reply = bus.query(TELEPORT, PoseRequest(pose=Pose.of(se2.compose(observer.start, place))), Reply)
@@ -212,7 +212,7 @@ def kidnap(bus: Bus, observer: SessionObserver) -> None:
     observer.wait("finding itself", found, STEP_TIMEOUT_S)
     error_m, took_s = observer.belief_error_m, observer.seconds - kidnapped_s
     observer.end_step(
-        f"was kidnapped to a place {distance_m:.1f} m away, and found itself in its map after {took_s:.0f} s, "
+        f"was kidnapped, {distance_m:.1f} m away, and found itself in its map after {took_s:.0f} s, "
         f"{mm(error_m)} from the truth",
         error_m,
     )

@@ -12,7 +12,7 @@ from typing import Any
 
 from common.errors import UserError
 from common.versions import commit, versions
-from common.writing import naming
+from common.writing import name_in_errors
 
 
 def check_file(file: Path | None, option: str) -> None:
@@ -60,7 +60,7 @@ def output_folder(folder: Path, option: str = "--out") -> Iterator[None]:
 def write_json(file: Path | None, data: dict[str, Any]) -> None:
     """Writes ``data`` as indented JSON; does nothing if ``file`` is None."""
     if file is not None:
-        with naming(file):
+        with name_in_errors(file):
             file.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 

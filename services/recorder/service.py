@@ -33,7 +33,7 @@ class RecorderService(Service):
     keep_all: ClassVar[bool] = True
 
     def __init__(self, settings: RecorderSettings, *, serve_requests: bool = True) -> None:
-        """Opens no file yet: `open` or a request does. ``serve_requests``: serve the query `recording`."""
+        """Opens no file yet: `open` or a request does. It serves the query `recording` only if ``serve_requests``."""
         super().__init__(settings)
         if not serve_requests:
             self.queries = ()  # type: ignore[misc]

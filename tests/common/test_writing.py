@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from common.writing import complete_files, naming
+from common.writing import complete_files, name_in_errors
 
 FULL = OSError(28, "No space left on device")
 
@@ -46,6 +46,6 @@ def test_errors_name_the_file(tmp_path):
     with pytest.raises(FileNotFoundError) as error, complete_files(path):
         (tmp_path / "b.csv").read_bytes()
     assert error.value.filename == str(tmp_path / "b.csv")
-    with pytest.raises(OSError, match="No space left") as error, naming(path):
+    with pytest.raises(OSError, match="No space left") as error, name_in_errors(path):
         raise FULL
     assert error.value.filename == str(path)

@@ -30,7 +30,7 @@ from common.robot.scan_geometry import Sweep
 from services.controller.policies import expected_free_energy as efe
 from services.controller.policies.decision import Decision
 from services.controller.policies.expected_free_energy import NATS_PER_METRE, ExpectedFreeEnergy
-from services.controller.policies.motion_model import turn_to_lookahead
+from services.controller.policies.motion_model import STEP_S, period_of, turn_to_lookahead
 from services.controller.policies.motion_selection import Surroundings, select_motion
 from services.controller.policies.recovery import BACKING_OFF, back_off
 from services.controller.policies.scan_information import DEFAULT_SIGMA_M
@@ -158,6 +158,7 @@ class ActiveLocaliser:
         self.robot = robot.model_copy(update={"max_speed": min(robot.max_speed, MAX_SPEED)})
         self.min_point_distance = min_point_distance
         self._recovery = recovery
+        self._period = STEP_S  # s between the last scans
         self.use_graph(graph)
         self.reset()
 
@@ -231,6 +232,7 @@ class ActiveLocaliser:
 
     def decide(self, belief: Belief, scan: Scan, points: Array, velocity: Array, field_of_view: Sector) -> Decision:
         """Chooses a velocity; ``points`` (K, 2) m in base_link are obstacles."""
+        self._period = period_of(scan)
         motion = self._visited.integrate(belief.stamp_ns, velocity)
         self._stall_timer.add_motion(belief.stamp_ns, motion)
         if self._viewpoint is not None:
@@ -246,7 +248,7 @@ class ActiveLocaliser:
         )
         if self._recovery.is_active(belief.stamp_ns):
             self._stall_timer.restart()
-            action = back_off(velocity, surroundings, self.robot).action
+            action = back_off(velocity, surroundings, self.robot, self._period).action
             return Decision(action, BACKING_OFF, "blocked", recovering=True)
         poses, _ = _likely_hypotheses(belief)
         if len(poses) > 1 and self._requested_ns is not None and self._paths is None:
@@ -366,6 +368,7 @@ class ActiveLocaliser:
             self.robot,
             may_turn=self.may_turn,
             forward=surroundings.forward,
+            period=self._period,
         )
         if not action.any() and self.may_turn:  # no free motion: turn to look elsewhere
             action[2] = TURN_RATE if lookahead[1] >= 0 else -TURN_RATE

@@ -26,6 +26,11 @@ NEAR_LOOKAHEAD_M = 0.5  # nearer than this, the robot no longer turns to a looka
 STANDING_SPEED = 0.02  # m/s or rad/s; anything slower counts as standing
 
 
+def period_of(scan: Scan | None) -> float:
+    """Time in s between scans, and so between commands; `STEP_S` if the scanner does not state it."""
+    return (scan.scan_time if scan is not None else 0.0) or STEP_S
+
+
 def delay_until_effect(robot: Robot, scan: Scan | None) -> float:
     """Time in s from a scan's stamp until the command that responds to it takes effect."""
     return robot.latency + (scan.sweep_time if scan is not None else 0.0)
@@ -137,30 +142,38 @@ def turn_rate(angle: float, robot: Robot, hold: float = STEP_S) -> float:
 
 
 def turn_to_lookahead(
-    current: Array, action: Array, lookahead: Array, robot: Robot, *, may_turn: bool, forward: float = 0.0
+    current: Array,
+    action: Array,
+    lookahead: Array,
+    robot: Robot,
+    *,
+    may_turn: bool,
+    forward: float = 0.0,
+    period: float = STEP_S,
 ) -> Array:
     """Adds a turn to the action (3,) of a holonomic base, so that the scanner faces the direction of motion.
 
     The side at bearing ``forward`` rad in base_link is turned towards the lookahead point (2,) m, unless that is near
-    and lies ahead. ``current`` (3,) is the present velocity. Returns the action unchanged for a differential base, and
-    if ``may_turn`` is False.
+    and lies ahead. ``current`` (3,) is the present velocity, and ``period`` s the time until the next command. Returns
+    the action unchanged for a differential base, and if ``may_turn`` is False.
     """
     if robot.drive != "holonomic" or not may_turn:
         return np.array(action)
     bearing = float(se2.wrap(np.arctan2(lookahead[1], lookahead[0]) - forward))
     near_and_ahead = np.hypot(*lookahead) < NEAR_LOOKAHEAD_M and abs(bearing) < np.pi / 3
     # While the base turns, its velocity in base_link must rotate back to stay constant in map; that takes acceleration.
-    speed = max(float(np.hypot(*action[:2])), float(np.hypot(*current[:2])), 1e-3)
-    max_turn = TURN_ACCELERATION_SHARE * robot.acceleration / speed
-    turn = 0.0 if near_and_ahead else float(np.clip(turn_rate(bearing, robot), -max_turn, max_turn))
-    max_change = robot.turn_acceleration * STEP_S
-    turned = (current[2] + float(np.clip(turn - current[2], -max_change, max_change))) * STEP_S
-    # The action holds for a step, so it is that in the middle of its turn; the present velocity is from a step before.
-    kept, target = se2.rotate(-turned, current[:2]), se2.rotate(-turned / 2, action[:2])
-    # Both may take more acceleration than there is, then they share it. Without the first part, a base that brakes
-    # while it turns would drift off its line, as the second alone takes all of it.
-    steps = max(1.0, float(np.hypot(*(target - kept))) / (robot.acceleration * STEP_S))
-    return np.array([*(current[:2] + steps * (kept - current[:2]) + target - kept), turn])
+    brakes = not action.any()
+    speed = float(np.hypot(*(current if brakes else action)[:2]))
+    max_turn = TURN_ACCELERATION_SHARE * robot.acceleration / max(speed, 1e-3)
+    turn = 0.0 if near_and_ahead else float(np.clip(turn_rate(bearing, robot, period), -max_turn, max_turn))
+    if not brakes:
+        return np.array([*se2.rotate(-turn * period / 2, action[:2]), turn])
+    # Braking alone would take all the acceleration, and the base would drift off the line on which it is to stop.
+    max_change = robot.turn_acceleration * period
+    turned = (current[2] + float(np.clip(turn - current[2], -max_change, max_change))) * period
+    kept = se2.rotate(-turned, current[:2])
+    steps = max(1.0, speed / (robot.acceleration * period))
+    return np.array([*(current[:2] + steps * (kept - current[:2]) - kept), turn])
 
 
 def candidate_motions(current: Array, lookahead: Array, robot: Robot) -> Array:

@@ -19,7 +19,13 @@ from services.controller.policies.active_localisation import ActiveLocaliser, Vi
 from services.controller.policies.decision import Decision, DecisionState
 from services.controller.policies.free_space import NO_MAP, FreeSpace
 from services.controller.policies.geodesic_field import WALL_COST_RANGE_M, CostField, FreeSpaceGraph
-from services.controller.policies.motion_model import is_moving, stopping_distance, turn_rate, turn_to_lookahead
+from services.controller.policies.motion_model import (
+    is_moving,
+    period_of,
+    stopping_distance,
+    turn_rate,
+    turn_to_lookahead,
+)
 from services.controller.policies.motion_selection import PoseBelief, Surroundings, least_distance, select_motion
 from services.controller.policies.obstacles import MAX_RANGE_M, TemporaryObstacles
 from services.controller.policies.recovery import BACKING_OFF, MAX_GAP_NS, STUCK_AFTER_NS, Recovery, back_off
@@ -178,7 +184,7 @@ class GeodesicPolicy:
             return Decision(reason="no way to the goal from here", state="blocked")
         surroundings = self._surroundings(pose, points, moving)
         if self._recovery.is_active(stamp_ns):
-            selected = back_off(velocity, surroundings, self.robot)
+            selected = back_off(velocity, surroundings, self.robot, period_of(self._scan))
             motion = se2.transform(pose, selected.poses[:, :2])
             return Decision(selected.action, BACKING_OFF, "blocked", path, motion, recovering=True)
         assert self.field is not None  # noqa: S101 - there is a path
@@ -195,6 +201,7 @@ class GeodesicPolicy:
             self.robot,
             may_turn=surroundings.may_turn,
             forward=surroundings.forward,
+            period=period_of(self._scan),
         )
         # The velocity that was commanded counts, not the action: the limits may have stopped the robot.
         self._recovery.watch(stamp_ns, moving=is_moving(velocity))

@@ -54,13 +54,22 @@ class Recovery:
         self._standing_since_ns, self._backing_off_since_ns = None, stamp_ns
 
 
-def back_off(velocity: Array, surroundings: Surroundings, robot: Robot) -> SelectedMotion:
-    """The motion towards the largest gap to walls and obstacles; ``velocity`` (3,) is the latest command."""
+def back_off(velocity: Array, surroundings: Surroundings, robot: Robot, period: float) -> SelectedMotion:
+    """The motion towards the largest gap to walls and obstacles.
+
+    ``velocity`` (3,) is the latest command, and ``period`` s the time until the next one.
+    """
     angle = np.arange(16) * np.pi / 8
     targets = BACK_OFF_M * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     target = targets[int(np.argmax(surroundings.gaps(targets[:, None, :], np.zeros(1))[:, 0]))]
     selected = select_motion(velocity, target, surroundings, robot)
     action = turn_to_lookahead(
-        velocity, selected.action, target, robot, may_turn=surroundings.may_turn, forward=surroundings.forward
+        velocity,
+        selected.action,
+        target,
+        robot,
+        may_turn=surroundings.may_turn,
+        forward=surroundings.forward,
+        period=period,
     )
     return replace(selected, action=action)

@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from services.controller.policies import expected_free_energy as efe
 from services.controller.policies.free_space import Grid
-from services.controller.policies.motion_model import STEP_S
+from services.controller.policies.motion_model import period_of
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -56,7 +56,7 @@ class ScanInformation:
 
         The ambiguity is that of a robot at its ``max_speed`` m/s, which scans least often on a metre.
         """
-        scan_period = scan.scan_time or STEP_S
+        scan_period = period_of(scan)
         grid = _coarse_grid(graph.grid)
         information = _information(graph.free, _places_with_room(graph.free, grid, graph.radius), scan)
         ambiguity = _ambiguity(graph, grid, information / (max_speed * scan_period))

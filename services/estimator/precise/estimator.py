@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common.geometry import se2
+from common.robot.motion_distortion import sweep_time
 from services.estimator.precise.gauss_newton import COARSE_SIGMA_M, GaussNewton, Optimiser, Prior, View
 from services.estimator.precise.hypotheses import (
     SURROUNDINGS_PRIOR,
@@ -47,7 +48,7 @@ from services.estimator.precise.precision import Precision
 from services.estimator.precise.protection import EstimateError
 from services.estimator.precise.search import search_around, search_everywhere, search_near
 from services.estimator.precise.settings import PreciseSettings
-from services.estimator.precise.swept_scan import SweptEvidence, acceleration_factors
+from services.estimator.precise.swept_scan import SweptEvidence, acceleration_factors, acceleration_limits
 from services.estimator.shared.interface import (
     Hypothesis,
     Observation,
@@ -202,7 +203,7 @@ class PreciseEstimator:
                 match, self._predict_local_motion(period, odom, observation.command), predicted.covariance
             )
         if (
-            observation.time_increment
+            0 < sweep_time(len(observation.angles), observation.time_increment) / 2 < period
             and not observation.is_earlier_than(self._stamp)
             and motions[0][-1].is_near(match.poses[0])
         ):
@@ -390,7 +391,7 @@ class PreciseEstimator:
         This is done twice, the second time also for the accelerations that the first has shown.
         """
         noise, prior = self.settings.motion, _prior_of([each[-1] for each in match.motions])
-        limits = np.array([noise.acceleration, noise.acceleration, noise.turn_acceleration])
+        limits = acceleration_limits(noise, times_from_middle(observation), period)
         factors = acceleration_factors(times_from_middle(observation), period)
         view, poses, accelerations = match.view, match.poses, np.zeros(6)
         for _ in range(2):
@@ -436,8 +437,9 @@ class PreciseEstimator:
         ]
         best = min(fused, key=lambda each: each.negative_log_evidence)
         updated = update_hypothesis(hypothesis, best, evidence, k, period, unobserved=unknown_motion)
-        stands = len(fused) > 1 and best is fused[0]
-        if match.swept is not None and not stands:
+        # Standing still is the first candidate, unless the local map gives a single one.
+        is_standing = len(fused) > 1 and best is fused[0]
+        if match.swept is not None and not is_standing:
             mean_velocity = se2.between(hypothesis.pose, updated.pose) / period
             interpolated = pose_at_stamp(updated.pose, mean_velocity, period, observation)
             updated = replace(updated, displacement=match.swept.displacement(k, updated.pose, interpolated))

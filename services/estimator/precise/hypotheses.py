@@ -58,7 +58,7 @@ class TrackedHypothesis:
     # (3, 3) covariance of the pose with the scale errors of odometry, as in `MotionCandidate`
     slip_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
     weight: float = 1.0
-    displacement: Displacement | None = None  # of the pose at the stamp of a swept scan, while the robot moves
+    displacement: Displacement | None = None  # of a swept scan; None if it stands, or was not corrected
     # number of consecutive scans at which neither the map nor the local map showed the motion along some direction
     unobserved_scans: int = 0
 

@@ -2,7 +2,7 @@
 
 A scan is first corrected for the mean motion since the last one (`motion_correction`), as if the robot did not
 accelerate. It may have accelerated by a between the middle of the last sweep and the first beam, and by b during the
-sweep. Let s be the time of a beam after the middle of the sweep, the first at s = -m, and T the time between the
+sweep. Let s be the time of a beam after the middle of the sweep, the first at s = -m, and T > m the time between the
 middles of both sweeps. Then the pose of the robot at that beam differs from that of the correction by
 
     a s (T - m)² / (2 T)  +  b (s² + 2 s m - s m² / T) / 2
@@ -10,7 +10,8 @@ middles of both sweeps. Then the pose of the robot at that beam differs from tha
 For s = -m, this is the error of the pose at the stamp. Both accelerations are unknown, with the variance of a uniform
 distribution within the limits of the base. They are estimated together with the pose: the derivative of a range by an
 acceleration is that by the pose, times the factor of the acceleration above. The evidence for the pose alone follows by
-marginalisation (Schur complement). To first order only, so the scan is corrected again for the accelerations found.
+marginalisation (Schur complement). All this is to first order, so the scan is corrected again for the accelerations
+found. In a curve, the base also accelerates across its direction of motion.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from services.estimator.precise.likelihood import Evidence
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from services.estimator.precise.gauss_newton import View
+    from services.estimator.precise.motion_model import MotionNoise
 
 
 @dataclass(frozen=True)
@@ -54,12 +56,23 @@ def acceleration_factors(times: Array, period: float) -> Array:
     return np.array([s * (T - m) ** 2 / (2 * T), (s**2 + 2 * s * m - s * m**2 / T) / 2])
 
 
+def acceleration_limits(noise: MotionNoise, times: Array, period: float) -> Array:
+    """The limits (2, 3) of both accelerations in base_link, m/s², m/s² and rad/s²; arguments as above.
+
+    In a long time before the sweep, the base cannot accelerate by more than from full speed backwards to forwards.
+    """
+    speed, acceleration = np.array([noise.speed, noise.speed, noise.turn]), noise.acceleration
+    across = max(acceleration, noise.speed * noise.turn)
+    during = np.array([acceleration, across, noise.turn_acceleration])
+    return np.array([np.minimum(during, 2 * speed / (period + float(times.min()))), during])
+
+
 @dataclass(frozen=True)
 class SweptEvidence:
     """The evidence of a swept scan for pose and accelerations together: x, y, yaw, and the same of a and b, in map."""
 
     poses: Array  # (N, 3) in the middle of the sweep, where this evidence was computed
-    joint: Evidence  # of scan and prior by all nine unknowns at these poses: xi (N, 9); of the scan: matrices (N, 9, 9)
+    joint: Evidence  # by all nine unknowns: xi (N, 9) of scan and prior, matrices (N, 9, 9) of the scan alone
     prior: Array  # (N, 6, 6) information of the accelerations before the scan
     at_stamp: Array  # (3, 6) the pose's displacement at the stamp, per acceleration: s²
     assumed: Array  # (6,) accelerations in map for which the view was corrected
@@ -68,8 +81,8 @@ class SweptEvidence:
     def from_scan(cls, view: View, poses: Array, limits: Array, period: float, assumed: Array) -> SweptEvidence:
         """The evidence at ``poses`` (N, 3) of a view that was corrected to the middle of its sweep.
 
-        It was also corrected for the ``assumed`` accelerations (6,) in map. ``limits`` (3,) are those in base_link, and
-        ``period`` s is the time since the last scan.
+        It was also corrected for the ``assumed`` accelerations (6,) in map. ``limits`` (2, 3) are those in base_link,
+        and ``period`` s is the time since the last scan.
         """
         factors = np.array([np.ones_like(view.times), *acceleration_factors(view.times, period)])
         weights = view.surface_evidence(poses).weights
@@ -89,7 +102,8 @@ class SweptEvidence:
         )
         to_map = np.array([se2.rotation(float(yaw)) for yaw in poses[:, 2]])
         prior = np.zeros((len(poses), 6, 6))
-        prior[:, :3, :3] = prior[:, 3:, 3:] = to_map @ np.diag(3 / limits**2) @ to_map.transpose(0, 2, 1)
+        for row, part in zip(limits, (slice(3), slice(3, 6)), strict=True):
+            prior[:, part, part] = to_map @ np.diag(3 / row**2) @ to_map.transpose(0, 2, 1)
         joint.xi[:, 3:] -= prior @ assumed
         at_stamp = np.kron(factors[1:, int(np.argmin(view.times))], np.eye(3))
         return cls(poses, joint, prior, at_stamp, assumed)

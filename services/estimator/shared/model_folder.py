@@ -29,5 +29,4 @@ def write_weights_and_card(path: Path, weights: bytes, card: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with complete_files(path) as folder:
         (folder / path.name).write_bytes(weights)
-        (folder / path.name).chmod(0o644)
         (folder / path.with_suffix(".json").name).write_text(card, encoding="utf-8")

@@ -8,7 +8,7 @@ unknown, unless odometry and the local map agree on it.
 
 A scan that matches, but far from where the motion model expects it, or with more contradictions than usual, also begins
 a piece: the wheels may have slipped, a door may have moved, or the robot was carried to a place that looks alike. So
-does the first scan that matches after the stamps have stepped back or jumped ahead, because the robot may have been
+does a scan that matches at once after the stamps have stepped back or jumped ahead, because the robot may have been
 moved meanwhile. This piece is linked to the former one, but the link may turn out to be wrong.
 """
 
@@ -65,7 +65,8 @@ VELOCITY_CHANGE_DEVIATION = np.array([1.0, 1.0, 3.0])
 VELOCITY_DEVIATION = np.array([1.0, 1.0, 1.5])
 STANDING_DEVIATION = np.array([0.002, 0.002, 0.002])  # m, m, rad: in addition to both
 MAX_VELOCITY = 3 * VELOCITY_DEVIATION  # a robot that seems to move faster was kidnapped
-MAX_PERIOD_S = 2.0  # between two scans; after a longer time, or a step back, the velocity is unknown
+# After a longer time between two scans, both in s and relative to the time before, the velocity is unknown.
+MAX_PERIOD_S, MAX_PERIOD_RATIO = 2.0, 5.0
 # Scans over which these deviations are learned, and the largest error that counts, in deviations.
 LEARNING_SCANS, MAX_LEARNED_SIGMAS = 100, 10.0
 # Errors of a registration that do not average out, for each key scan: moving things, the surfaces' roughness.
@@ -144,6 +145,7 @@ class FrontEnd:
         # The motion.
         self._odom: Array | None = None  # (3,) of the last scan
         self._velocity: Array | None = None  # (3,) base_link
+        self._period: float | None = None  # s between the last two scans between which the clock did not step
         self._scale = np.ones(3)  # of the deviations of the motion, learned
         self._covariance_since_key = np.zeros((3, 3))  # of the motion since the last key scan, by the motion model
         self._suspect_scans = 0  # in a row until now
@@ -152,14 +154,12 @@ class FrontEnd:
     def add(self, stamp: float, ranges: Array, odom: Array | None = None) -> ScanPose:
         """Registers a scan and returns its pose in the frame of the first scan.
 
-        ``ranges`` (B,) are in m, +inf without a return and -inf if not measured. ``stamp`` is in s; it may step back,
-        as after a reset of the simulator, which also resets the odometry. ``odom`` (3,) is the pose of base_link in
-        odom, or None if it is unknown.
+        ``ranges`` (B,) are in m, +inf without a return and -inf if not measured. ``stamp`` is in s, and not that of the
+        scan before; it may step back, as after a reset of the simulator, which also resets the odometry. ``odom`` (3,)
+        is the pose of base_link in odom, or None if it is unknown.
         """
         period = stamp - self.stamps[-1] if self.stamps else 0.0
-        clock_stepped = not 0 <= period <= MAX_PERIOD_S
-        if clock_stepped:
-            self._velocity = None
+        clock_stepped = self._has_clock_stepped(period)
         if period < 0:
             period, self._odom = MAX_PERIOD_S, None
         motion, deviation = self._predict_motion(period, odom)
@@ -194,6 +194,15 @@ class FrontEnd:
         if suspect:
             return self._add_suspect(scan, prior.mean)
         return self._add_unmatched(scan, prior.mean, is_key=shows_first_surfaces)
+
+    def _has_clock_stepped(self, period: float) -> bool:
+        """Whether ``period``, the time in s since the last scan, is unusual; if so, the velocity becomes unknown."""
+        if not 0 <= period <= max(MAX_PERIOD_S, MAX_PERIOD_RATIO * (self._period or period)):
+            self._velocity = None
+            return True
+        if self.stamps:
+            self._period = period
+        return False
 
     @property
     def shows_too_little(self) -> bool:

@@ -121,7 +121,7 @@ def test_name_defaults_to_that_of_the_file(tmp_path):
         ("{name: x, boundary: [[0, 0], [1, 1]]}", "at least 3"),
         ("{name: x, boundary: [[0, 0], [2, 2], [2, 0], [0, 2]]}", "not simple"),
         ("{name: x, boundary: [[0, 0], [1, 0], [.nan, 1]]}", "finite"),
-        ("{name: x, boundary: [[0, 0], [600, 0], [600, 400], [0, 400]]}", "0.24 km², but a world has at most 0.2 km²"),
+        ("{name: x, boundary: [[0, 0], [600, 0], [600, 400], [0, 400]]}", "0.24 km², but a floor has at most 0.2 km²"),
         ("{name: x, boundary: [[0, 0], [1, 0], [1, 1]], obstacles: [{}]}", "exactly one of"),
         ("{name: x, boundary: [[0, 0], [1, 0], [1, x]]}", "boundary, entry 3, entry 2: expected a number, not 'x'"),
         ("{name: x, boundary: [[0, 0], [1, 0], [1, 1]], walls: 3}", "unknown key 'walls'; the keys are boundary, "),

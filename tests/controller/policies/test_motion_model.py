@@ -132,13 +132,13 @@ def test_unseen_directions():
     assert 0 < np.hypot(*kept[:2]) <= 0.25 + 1e-9
 
 
-@pytest.mark.parametrize("period", [0.025, 1 / 15, 0.1])
+@pytest.mark.parametrize("period", [0.025, 1 / 15, 0.1, 0.2])
 def test_braking_base_that_turns_stays_on_its_line(period):
     """It brakes along y with all its acceleration, and turns towards a point beside the line meanwhile."""
     pose, velocity = np.zeros(3), np.array([0.0, 0.7, -0.6])
     while np.hypot(*velocity[:2]) > 1e-3:
         lookahead = se2.rotate(-pose[2], np.array([2.0, 2.0]))
-        action = turn_to_lookahead(velocity, np.zeros(3), lookahead, ROBOT, may_turn=True)
+        action = turn_to_lookahead(velocity, np.zeros(3), lookahead, ROBOT, may_turn=True, period=period)
         velocity = safety.ramp(velocity, action, ROBOT, period)
         step = se2.rotate(pose[2] + velocity[2] * period / 2, velocity[:2]) * period
         pose = np.array([*(pose[:2] + step), pose[2] + velocity[2] * period])

@@ -11,13 +11,14 @@ from lab.accuracy.motion_distortion import DistortionJob, run
 from lab.accuracy.scenes import Scene
 from services.estimator.precise.gauss_newton import View
 from services.estimator.precise.likelihood import Likelihood
-from services.estimator.precise.swept_scan import SweptEvidence, acceleration_factors
+from services.estimator.precise.motion_model import MotionNoise
+from services.estimator.precise.swept_scan import SweptEvidence, acceleration_factors, acceleration_limits
 from services.estimator.shared.generative_models import RayCaster
 from tests.estimator.models import ROOM
 
 PERIOD, HALF_SWEEP = 1 / 15, 0.025  # s
 POSE = np.array([2.0, 1.5, 0.4])
-LIMITS = np.array([1.0, 1.0, 3.0])
+LIMITS = np.array([[1.0, 1.0, 3.0], [1.0, 2.0, 3.0]])
 
 
 def swept_view(seed):
@@ -83,6 +84,17 @@ def test_marginal_is_that_of_the_joint_gaussian():
     np.testing.assert_allclose(
         displacement.covariance_at_stamp(covariance[:3, :3]), at_stamp @ covariance @ at_stamp.T, rtol=1e-6
     )
+
+
+@pytest.mark.parametrize("period", [0.03, PERIOD, 1.0, 60.0])
+def test_a_pause_does_not_make_the_pose_uncertain(period):
+    """However long ago the last scan was, the robot does not move farther during the sweep than at full speed."""
+    view, noise = swept_view(1), MotionNoise()
+    limits = acceleration_limits(noise, view.times, period)
+    prior = SweptEvidence.from_scan(view, POSE[None], limits, period, np.zeros(6))
+    deviation = np.sqrt(np.diag(prior.at_stamp @ np.linalg.inv(prior.prior[0]) @ prior.at_stamp.T))
+    farthest = HALF_SWEEP * np.array([2 * noise.speed, 2 * noise.speed, 2 * noise.turn])
+    assert (deviation < farthest).all()
 
 
 @pytest.mark.parametrize("prior", ["laser only", "odometry"])

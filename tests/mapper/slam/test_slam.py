@@ -18,7 +18,7 @@ from services.mapper.slam.back_end import BackEnd
 from services.mapper.slam.correlative_search import correlative_search
 from services.mapper.slam.drive import Laser, RawDrive
 from services.mapper.slam.elements import Elements, concatenate
-from services.mapper.slam.front_end import NO_PIECE, track_drive
+from services.mapper.slam.front_end import NO_PIECE, FrontEnd, track_drive
 from services.mapper.slam.loop_closure import LoopClosure, find_closures
 from services.mapper.slam.pose_graph import ANCHOR, LinkTable, PoseLink, Uncertainty, optimise
 from services.mapper.slam.trajectory import build_trajectory
@@ -233,3 +233,15 @@ def test_look_alike_rooms_stay_apart():
     truth = np.column_stack([places, np.full(len(places), -np.pi / 2)])
     built = build_trajectory(driven(TWINS, truth))
     assert np.hypot(*(built.poses[-1] - built.poses[0])[:2]) == pytest.approx(TWIN_OFFSET, abs=0.3)
+
+
+@pytest.mark.parametrize("period", [1 / 15, 2.5])
+def test_a_slow_scanner_makes_one_piece(period):
+    """In a log of a slow scanner, or one with a scan every metre, the usual time between scans is no pause."""
+    scene = Scene.of(load_world("office"), 300, 5)
+    truth = scene.path(8)
+    laser = Laser(scene.scanner.angles(), np.array(scene.scanner.mount), scene.scanner.range_max)
+    front_end = FrontEnd(laser)
+    for k, pose in enumerate(truth):
+        front_end.add(k * period, scene.observe(scene.clean(pose[None])[0], k * period).ranges, pose)
+    assert set(front_end.key_scans().pieces.tolist()) == {0}

@@ -15,7 +15,7 @@ HERE = "tcp/127.0.0.1:7001"
 @pytest.mark.parametrize(
     ("options", "command", "line"),
     [
-        ([], ["goal", "1", "1"], f"session {HERE}, robot truck\n"),
+        ([], ["goal", "1", "1"], f"using session {HERE}, robot truck\n"),
         (["--connect", HERE], ["goal", "1", "1"], ""),
         ([], ["doctor"], ""),  # it only reads
     ],

@@ -93,7 +93,7 @@ def test_full_disk(tmp_path, monkeypatch):
     monkeypatch.setattr(csv_tables, "_readme", Mock(side_effect=OSError(28, "No space left on device")))
     with pytest.raises(OSError, match="No space left") as error:
         tables(tmp_path)
-    assert error.value.filename == str(tmp_path / "csv" / "README.md")
+    assert error.value.filename == str(tmp_path / "csv")
     assert list((tmp_path / "csv").iterdir()) == []
 
 
