@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,12 +11,11 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from common.bus.bus import Link
-from common.errors import UserError
 from common.messages.requests import PlayerReply
-from common.messages.topics import ROBOT_NAME_PATTERN
 from common.names import split_names
 from presage.live.latest_messages import session_bus
 from presage.replay.keyboard import HELP, keyboard
+from presage.session.running_sessions import check_robot_name
 from services.recorder.replaying.replay import ReplayControl, ReplayOptions, replay
 
 REFRESH_PERIOD_S = 0.1  # of the progress bar
@@ -54,13 +52,6 @@ def describe(state: PlayerReply) -> str:
     return f"{state.position_s:.1f} of {state.duration_s:.1f} s{mode}"
 
 
-def checked_robot(name: str) -> str:
-    """Returns ``name``; raises UserError if it cannot be part of a key."""
-    if not re.fullmatch(ROBOT_NAME_PATTERN, name):
-        raise UserError(f"--robot {name!r}: only up to 64 letters, digits, _ . and - are allowed")
-    return name
-
-
 def replay_options(
     only: str,
     leave_out: str,
@@ -75,6 +66,6 @@ def replay_options(
 ) -> ReplayOptions:
     """Options of the replay from those of the command line; raises UserError if the robot's name is not allowed."""
     if robot:
-        checked_robot(robot)
+        check_robot_name(robot)
     names, without = frozenset(split_names(only)), frozenset(split_names(leave_out))
     return ReplayOptions(names or None, without, 1.0 if rate is None else rate, start, end, loop, robot, force, paused)
