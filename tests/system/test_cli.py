@@ -52,7 +52,7 @@ NO_SESSION = ("--connect", "tcp/127.0.0.1:9")  # the discard port, on which noth
         (("echo", "nothing"), "no topic 'nothing': choose one of scan"),
         (("doctor", "--json", "{tmp}/no/x.json"), "x.json: cannot be written to"),
         (("replay", "{tmp}/no.mcap"), "no.mcap"),
-        (("replay", "{tmp}/run.mcap", "--robot", "a/b"), "--robot 'a/b'"),
+        (("replay", "{tmp}/run.mcap", "--robot", "a/b"), "robot 'a/b'"),
         (("replay", "{tmp}/run.mcap", "--every-scan"), "go with --with"),
         (("replay", "{tmp}/run.mcap", "--with", "simulator"), "give estimator, or estimator,controller"),
         (("replay", "{tmp}/run.mcap", "--with", "estimator"), "the estimator's configuration was not recorded"),
