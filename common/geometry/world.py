@@ -91,8 +91,9 @@ class World(WorldPart):
         if self.floors and self.grid is None and self.boundary != _box_around(self.floors):
             raise ValueError("the boundary of a world with floors is the box around them: leave it out")
         check_floors(self.floors, self.lifts)
-        for x0, y0, x1, y1 in [floor.bounds for floor in self.floors] or [self.bounds]:
-            if self.grid is None and (area := (x1 - x0) * (y1 - y0)) > MAX_WORLD_AREA_M2:
+        boxes = [floor.bounds for floor in self.floors] or [self.bounds]
+        for x0, y0, x1, y1 in boxes if self.grid is None else ():
+            if (area := (x1 - x0) * (y1 - y0)) > MAX_WORLD_AREA_M2:
                 raise ValueError(
                     f"the walls are {x1 - x0:g} m by {y1 - y0:g} m, {area * 1e-6:.3g} km², but a floor has at most "
                     f"{MAX_WORLD_AREA_M2 * 1e-6:g} km²: are the units metres?"

@@ -194,7 +194,9 @@ def bench_distortion(
         for prior in PRIORS
     ]
     rows = [row for job in track(jobs, "measuring", console=console, transient=True) for row in run(job)]
-    table = Table("world", "estimator", "motion from", "scans", *FULL, *ACCELERATING, "NEES", "exceeded", "lost", "ms")
+    table = Table(
+        "world", "estimator", "motion from", "scans", *FULL, *ACCELERATING, "NEES", "exceeded", "not found", "ms"
+    )
     for row in rows:
         table.add_row(
             row["world"],

@@ -20,7 +20,7 @@ from services.controller.goal_state import GoalState, Phase
 from services.controller.lifts import LiftRide, plan_ride
 from services.controller.manual_drive import ManualDrive
 from services.controller.policies.decision import Decision, Policy
-from services.controller.policies.motion_model import STEP_S, delay_until_effect, is_moving, turn_rate
+from services.controller.policies.motion_model import STEP_S, delay_until_effect, is_moving, period_of, turn_rate
 from services.controller.policies.paper_action import ActionParameters
 from services.controller.policies.straight_line import StraightLinePolicy
 from services.controller.velocity_command import VelocityCommand
@@ -415,7 +415,7 @@ class Navigator:
     @property
     def _command_period(self) -> float:
         """Time in s for which a command holds: until the next scan."""
-        return max(STEP_S, self._scan.scan_time) if self._scan is not None else STEP_S
+        return max(STEP_S, period_of(self._scan))
 
     def _motion_until_effect(self, stamp_ns: int) -> Array:
         """Motion (3,) in base_link from a stamp until a command with that stamp takes effect."""

@@ -168,7 +168,8 @@ def turn_to_lookahead(
     turn = 0.0 if near_and_ahead else float(np.clip(turn_rate(bearing, robot, period), -max_turn, max_turn))
     if not brakes:
         return np.array([*se2.rotate(-turn * period / 2, action[:2]), turn])
-    # Braking alone would take all the acceleration, and the base would drift off the line on which it is to stop.
+    # Braking alone would take all the acceleration, and the base would drift off the line on which it is to stop. In a
+    # period it gets only 1 / `steps` of the way to the action, so the action turns the velocity back `steps` times.
     max_change = robot.turn_acceleration * period
     turned = (current[2] + float(np.clip(turn - current[2], -max_change, max_change))) * period
     kept = se2.rotate(-turned, current[:2])

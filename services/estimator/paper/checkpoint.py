@@ -15,6 +15,7 @@ import numpy as np
 import safetensors.torch
 
 from common.errors import UserError
+from common.writing import complete_files
 from services.estimator.paper.training import Trainer, TrainingData
 
 DAMAGED_FILE_ERRORS = (zipfile.BadZipFile, zlib.error, safetensors.SafetensorError)
@@ -46,9 +47,9 @@ class Checkpoint:
 
     def save_samples(self, name: str, data: TrainingData) -> None:
         """Stores samples for a later run."""
-        partial = self.folder / f"{name}.partial.npz"
-        np.savez(partial, poses=data.poses, ranges=data.ranges.astype(np.float32))
-        partial.replace(self.folder / f"{name}.npz")
+        path = self.folder / f"{name}.npz"
+        with complete_files(path) as partial:
+            np.savez(partial / path.name, poses=data.poses, ranges=data.ranges.astype(np.float32))
 
     def save_state(self, trainer: Trainer) -> None:
         """Stores the state of the training atomically."""
@@ -58,9 +59,9 @@ class Checkpoint:
             tensors |= {f"adam.{index}.{name}": tensor.contiguous() for name, tensor in slots.items()}
         # Weights and progress are in one file, so that they are always consistent.
         meta = {"progress": json.dumps(state["progress"])}
-        partial = self.folder / "state.partial"
-        safetensors.torch.save_file(tensors, partial, metadata=meta)
-        partial.replace(self.folder / "state.safetensors")
+        path = self.folder / "state.safetensors"
+        with complete_files(path) as partial:
+            safetensors.torch.save_file(tensors, partial / path.name, metadata=meta)
 
     def restore_state(self, trainer: Trainer) -> bool:
         """Restores the stored state; returns False if there is none. Raises UserError if it cannot be read."""

@@ -391,8 +391,8 @@ class PreciseEstimator:
         This is done twice, the second time also for the accelerations that the first has shown.
         """
         noise, prior = self.settings.motion, _prior_of([each[-1] for each in match.motions])
-        limits = acceleration_limits(noise, times_from_middle(observation), period)
-        factors = acceleration_factors(times_from_middle(observation), period)
+        times = times_from_middle(observation)
+        limits, factors = acceleration_limits(noise, times, period), acceleration_factors(times, period)
         view, poses, accelerations = match.view, match.poses, np.zeros(6)
         for _ in range(2):
             # Not `between(last, this)`: beams are moved in base_link at this scan.

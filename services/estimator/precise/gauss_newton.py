@@ -109,9 +109,8 @@ class View:
     map_cell: float = 0.0  # m, edge of the cells if the map is a grid
     map_offset: float = 0.0  # m, mean distance of the real surfaces behind those that the model predicts
     log_map_error_prior: float = 0.0  # nats, log probability that the map's error is this large
-    times: Array = field(
-        default_factory=lambda: np.zeros(1)
-    )  # (B,) s after the middle of the sweep; (1,) if all at once
+    # (B,) s after the middle of the sweep; (1,) if all beams were measured at once, or are not corrected
+    times: Array = field(default_factory=lambda: np.zeros(1))
     _last: deque[_PredictedScans] = field(default_factory=lambda: deque(maxlen=2), init=False, repr=False)
 
     def thinned(self, beams: int) -> View:
