@@ -32,6 +32,10 @@ UNKNOWN_COST = 30.0  # additional cost of a metre where nothing is known: a path
 LOOKAHEAD_RANGE_M = 3.0  # length of the path within which the lookahead point is chosen, for slow robots
 MAX_LOOKAHEAD_CANDIDATES = 12  # points of the path that are tried, evenly spaced
 MAX_LINE_COST_RATIO = 1.02  # cost of the straight line to the lookahead point, relative to the path on the grid
+WAITING_RANGE_M = 4.0  # cost of the path to an occupied goal within which a robot chooses the place where it waits
+# Cost of a metre between that place and the goal. More than a metre along any path, so that the robot drives as near as
+# it can without a detour.
+REMAINING_COST = 2 * (1 + MAX_WALL_COST)
 # Half of the 16 neighbours as (rows, columns); the other half are their opposites. A knight's move passes over two more
 # cells, which must be free as well.
 MOVES = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (2, -1), (1, -2))
@@ -117,16 +121,38 @@ class FreeSpaceGraph:
         best = int(np.argmin(distance))
         return int(cells[best]) if distance[best] <= within else None
 
-    def cost_field(self, point: Array, within: float = np.inf) -> CostField | None:
-        """Costs from all cells to the free cell nearest to ``point`` (2,) m, or None if none is within ``within`` m."""
+    def cost_field(self, point: Array, within: float = np.inf, position: Array | None = None) -> CostField | None:
+        """Costs from all cells to the free cell nearest to ``point`` (2,) m, or None if none is within ``within`` m.
+
+        If the point is occupied, a ``position`` (2,) m of the robot makes this the best cell to wait at for a robot
+        that is near.
+        """
         cell = self.nearest_free(point, within)
         if cell is None:
             return None
+        if position is not None and cell != self.grid.cell_of(point):
+            cell = self._waiting_cell(point, within, position, cell)
         cost, predecessor = dijkstra(self._graph, indices=cell, return_predecessors=True)
         goal = np.array(point, float)
         if float(self.grid.interpolate(self.clearance, goal)) < self.min_clearance:
             goal = self._centres[cell]
         return CostField(self, goal, cost.reshape(self.grid.shape), predecessor)
+
+    def _waiting_cell(self, point: Array, within: float, position: Array, nearest: int) -> int:
+        """The free cell within ``within`` m of an occupied ``point`` with the least path and remaining distance to it.
+
+        Without the path from ``position``, the robot would drive around an obstacle that occupies its goal, because the
+        rear, which it does not see, seems free. Far from the point, it is the cell ``nearest`` to it.
+        """
+        start = self.nearest_free(position, self.min_clearance + 2 * self.grid.resolution)
+        if start is None:
+            return nearest
+        cells = self.grid.cells_near(point, within)
+        distance = np.hypot(*(self._centres[cells] - point).T)
+        limit = WAITING_RANGE_M + REMAINING_COST * float(np.hypot(*(self._centres[nearest] - point)))
+        cost = dijkstra(self._graph, indices=start, limit=limit)[cells] + REMAINING_COST * distance
+        best = int(np.argmin(np.where(distance <= within, cost, np.inf)))
+        return int(cells[best]) if cost[best] <= limit else nearest  # above the limit, costs are not known
 
     def clear_line(self, start: Array, ends: Array) -> tuple[Array, Array]:
         """Whether straight lines from (2,) to (N, 2) m are free, and their costs; both (N,)."""

@@ -23,9 +23,10 @@ if TYPE_CHECKING:
 
 HEADING_FADE_M = 0.3  # closer to the lookahead point, the cost of turning towards it fades out
 BLIND_SPEED = 0.25  # m/s into directions that the scanner does not see, for a base that may not turn; others turn first
-# The field of view must extend this far to either side of the direction of motion, because the body is wide. In a
-# field of view too narrow for that, motion is allowed in its middle third.
-FIELD_OF_VIEW_MARGIN_RAD, FIELD_OF_VIEW_DIVISOR = np.pi / 4, 3
+# The field of view must extend this far to either side of the direction of motion, because the body is wide: on a curve
+# of twice the body's radius, its inner side meets what was 60 degrees off that direction before. In a field of view too
+# narrow for that, motion is allowed in its middle third.
+FIELD_OF_VIEW_MARGIN_RAD, FIELD_OF_VIEW_DIVISOR = np.pi / 3, 3
 # Cost in m of a change of velocity by 1 m/s, so that the choice does not alternate between motions of equal merit.
 CHANGE_COST_S = 0.02
 WALKING_SPEED = 1.0  # m/s at which moving obstacles are assumed to approach

@@ -44,6 +44,7 @@ OBSTACLE_GAP_M = 0.06
 REPLAN_PERIOD_NS = 400_000_000  # minimum time between two plans when obstacles near the path change
 REPLAN_PERIOD_FAR_NS = 1_500_000_000  # the same when obstacles change elsewhere
 BLIND_AHEAD = "the scanner does not see ahead, where a differential base drives: mount it facing ahead"
+MAX_GOAL_SHIFT_M = 2.0  # maximum distance from an occupied goal at which the robot waits until it is free
 MIN_PROGRESS_M = 0.02  # near the goal, the robot counts as stuck if it moves by less than this
 MAX_COST_TO_GOAL_M = 100.0  # larger costs are clipped, also that of a goal to which no path leads
 
@@ -279,13 +280,12 @@ class GeodesicPolicy:
         if self.field is not None and not self._field_outdated:
             return
         self._field_outdated = False
-        max_goal_shift = self.robot.radius + 2 * self.free.grid.resolution
-        self.field, self.field_changed = self.graph.cost_field(self._goal, max_goal_shift), True
+        self.field, self.field_changed = self.graph.cost_field(self._goal, MAX_GOAL_SHIFT_M, position), True
         self.ignores_obstacles = False
         if self.field is None or not self.field.reaches(position):
             # Obstacles leave no path. Drive by the map alone, up to the obstacle that blocks the path, and wait there.
             self.graph.set_obstacles(np.zeros((0, 2)))
-            self.field, self.ignores_obstacles = self.graph.cost_field(self._goal, max_goal_shift), bool(len(points))
+            self.field, self.ignores_obstacles = self.graph.cost_field(self._goal, MAX_GOAL_SHIFT_M), bool(len(points))
 
     def _may_replan(self, field: CostField, position: Array, changed: npt.NDArray[Any], stamp_ns: int) -> bool:
         """Whether the plan is old enough to be replaced because obstacles in the cells ``changed`` came or went."""

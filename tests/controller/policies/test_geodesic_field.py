@@ -123,6 +123,17 @@ def test_path_around_an_obstacle(empty):
     assert path_length(empty.cost_field(goal).path(start)) == pytest.approx(free)
 
 
+def test_where_to_wait_for_an_occupied_goal(empty):
+    """A robot waits on its side of an obstacle, but as near to the goal as a straight way leads; others, nearest."""
+    goal = np.array([5.0, 3.0])
+    empty.set_obstacles(np.stack([np.linspace(4.0, 6.0, 41), np.full(41, 3.1)], axis=-1))
+    places = [empty.cost_field(goal, 2.0, np.array([x, y])).goal for x, y in ((5.0, 5.0), (5.0, 1.5), (1.0, 5.5))]
+    assert (places[0] - [5.0, 3.1])[1] > RADIUS
+    assert (places[1] - [5.0, 3.1])[1] < -RADIUS
+    for place, nearest in ((places[0], 0.5), (places[1], 0.3), (places[2], 0.3)):
+        assert np.hypot(*(place - goal)) < nearest
+
+
 @pytest.mark.parametrize("name", ["corridor", "office"])
 def test_graph_of_present_obstacles(name):
     graph, rng = FreeSpaceGraph(free_space(name), RADIUS), np.random.default_rng(2)
