@@ -85,17 +85,19 @@ WORKDIR /tmp
 USER presage
 CMD ["presage", "--help"]
 
-FROM base AS controller-packages
+FROM base AS controller
 RUN python install.py controller
-
-FROM controller-packages AS controller
 COPY --from=program /app /app
+# Numba's compiled code is stored in the image; on another type of processor it is compiled again. Numba needs a
+# writable cache, so each container starts with a copy.
+RUN NUMBA_CACHE_DIR=/numba python -c 'from services.controller.policies import grid_paths; grid_paths.prepare()'
+ENV NUMBA_CACHE_DIR=/tmp/numba
 WORKDIR /tmp
 USER presage
 HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.containers.healthcheck", "controller"]
-CMD ["python", "-m", "common.containers.run_per_robot", "each", "services.controller"]
+CMD ["sh", "-c", "cp -r /numba /tmp && exec python -m common.containers.run_per_robot each services.controller"]
 
-FROM controller-packages AS simulator
+FROM base AS simulator
 RUN python install.py simulator
 COPY --from=program /app /app
 WORKDIR /tmp
@@ -106,8 +108,7 @@ CMD ["python", "-m", "common.containers.run_per_robot", "each", "services.simula
 FROM base AS estimator
 RUN python install.py estimator
 COPY --from=program /app /app
-# Numba's compiled code is stored in the image; on another type of processor it is compiled again. Numba needs a
-# writable cache, so each container starts with a copy.
+# As for the controller.
 RUN NUMBA_CACHE_DIR=/numba python -c \
     'from services.estimator.factory import *; [prepare_factory(EstimatorOptions(model=m)) for m in ("learned", "exact")]'
 ENV NUMBA_CACHE_DIR=/tmp/numba

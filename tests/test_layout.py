@@ -210,7 +210,7 @@ def test_heavy_packages():
 @pytest.mark.parametrize(
     ("module", "absent"),
     [
-        ("services.controller.service", ["torch", "pybullet", "mcap", "numba"]),
+        ("services.controller.service", ["torch", "pybullet", "mcap"]),
         ("services.recorder.service", ["torch", "pybullet", "numba"]),
         ("services.simulator.service", ["torch", "mcap", "numba"]),
         ("services.estimator.service", ["pybullet", "mcap"]),

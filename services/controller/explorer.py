@@ -30,13 +30,14 @@ import numpy as np
 from common.geometry import se2
 from common.messages.definitions import Exploration, Goal, Pose, Status
 from services.controller.goal_state import Phase
+from services.controller.policies.exploration import ExplorationState, NoPath
 from services.controller.policies.recovery import MAX_GAP_NS
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from services.controller.goal_state import GoalState
     from services.controller.growing_map import AnchoredPose, PlanningMap
-    from services.controller.policies.exploration import ExplorationState, FieldOfView, NoPath, Viewpoint
+    from services.controller.policies.exploration import FieldOfView, Viewpoint
 
 PAUSE_NS = 2_000_000_000  # how long the robot stands at a goal of a user before it goes on exploring
 STALLED_NS = 8_000_000_000  # after this time without a motion of `STALLED_M` or a turn, the goal counts as unreachable
@@ -113,8 +114,6 @@ class Explorer:
 
     def exploration_state(self, field_of_view: FieldOfView, goal_count: int) -> ExplorationState:
         """The input for the choice of the next viewpoint, after ``goal_count`` goals of users."""
-        from services.controller.policies.exploration import ExplorationState  # slow: numba
-
         target = None
         if self.goal is not None and self.phase == "exploring":
             target = self.goal.pose.array()[:2]
@@ -195,8 +194,6 @@ class Explorer:
         Returns None if the present goal is kept, or the exploration has failed. The scanner sees ``half_field_of_view``
         rad to either side. ``under_way``: the robot drives to the last goal.
         """
-        from services.controller.policies.exploration import NoPath  # slow: numba
-
         self._can_plan = not isinstance(viewpoint, NoPath)
         home = self.home
         if isinstance(viewpoint, NoPath):

@@ -20,6 +20,7 @@ from services.controller.goal_state import GoalState, Phase
 from services.controller.lifts import LiftRide, plan_ride
 from services.controller.manual_drive import ManualDrive
 from services.controller.policies.decision import Decision, Policy
+from services.controller.policies.exploration import FieldOfView
 from services.controller.policies.motion_model import STEP_S, delay_until_effect, is_moving, period_of, turn_rate
 from services.controller.policies.paper_action import ActionParameters
 from services.controller.policies.straight_line import StraightLinePolicy
@@ -154,8 +155,6 @@ class Navigator:
         explorer.viewpoint_due = False
         if not explorer.sets_goals:
             return None
-        from services.controller.policies.exploration import FieldOfView  # slow: numba
-
         field_of_view = FieldOfView.of(self._scan, explorer.map.message.grid.resolution)
         return explorer.exploration_state(field_of_view, self._goal_count)
 

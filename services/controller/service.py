@@ -30,7 +30,10 @@ from common.runtime.service import Service
 from services.controller.background_job import BackgroundJob
 from services.controller.belief_wait import Answered, AwaitsPredictions, AwaitsScan, BeliefWait, NoBelief
 from services.controller.navigator import Answer, Navigator
+from services.controller.policies import grid_paths
+from services.controller.policies.exploration import choose_viewpoint
 from services.controller.policies.paper_action import ActionParameters
+from services.controller.policies.planner import GeodesicPolicy
 from services.controller.policies.straight_line import StraightLinePolicy
 from services.controller.settings import ControllerSettings
 
@@ -38,7 +41,6 @@ if TYPE_CHECKING:
     from services.controller.growing_map import PlanningMap
     from services.controller.policies.exploration import ExplorationState, NoPath, Viewpoint
     from services.controller.policies.geodesic_field import CostField
-    from services.controller.policies.planner import GeodesicPolicy
 
 PREDICTED_BEAMS = 61  # beams of a predicted scan: enough to tell places apart, and a short reply
 FIELD_PERIOD_NS = 5_000_000_000  # an unchanged cost field is published again after this time
@@ -115,9 +117,7 @@ class ControllerService(Service):
             self.log.info("loading the world", world=settings.world)
             world = load_world(settings.world)
         if settings.preset == "geodesic":
-            # scipy takes a third of a second to import, and preset paper does not need it.
-            from services.controller.policies.planner import GeodesicPolicy
-
+            grid_paths.prepare()
             keep_heading = settings.heading == "keep"
             self.geodesic = GeodesicPolicy(robot, world, keep_heading=keep_heading, epistemic=settings.epistemic)
         policy = self.geodesic or StraightLinePolicy(robot, ActionParameters(gamma=settings.gamma), world)
@@ -317,8 +317,6 @@ class ControllerService(Service):
     def _choose_viewpoint(self) -> None:
         """Starts to choose a viewpoint in a thread, if the exploration needs one."""
         if (exploration_state := self.navigator.take_exploration_state()) is not None:
-            from services.controller.policies.exploration import choose_viewpoint
-
             self._viewpoint_job.submit(lambda: (choose_viewpoint(exploration_state), exploration_state))
 
     def _send(self, answer: Answer) -> None:

@@ -23,7 +23,7 @@ from tests.system.compose import SERVICES, TIMEOUT_S, Compose, docker, engine, r
 pytestmark = [pytest.mark.docker, pytest.mark.timeout(1500)]
 HEAVY = ("pybullet", "torch", "numba", "scipy", "mcap", "starlette", "typer", "matplotlib", "rosbags")
 HOLDS = {
-    "router": set(), "none": set(), "recorder": {"mcap"}, "replay": {"mcap"}, "controller": {"scipy"},
+    "router": set(), "none": set(), "recorder": {"mcap"}, "replay": {"mcap"}, "controller": {"numba", "scipy"},
     "bridge_ros2": {"rosbags"}, "simulator": {"pybullet", "scipy"}, "estimator-precise": {"numba", "scipy"},
     "estimator-paper": {"torch", "numba", "scipy"},
     "mapper": {"numba", "scipy"},

@@ -5,7 +5,7 @@ is the geodesic distance to the goal and a metre near a wall counts for more. Th
 everywhere, as if it were a Gaussian whose precision, lambda / d, grows as the robot approaches, so the attraction does
 not vanish on the last metres.
 
-Distances come from Dijkstra's algorithm (scipy.sparse.csgraph) on a grid with 16 neighbours. They are at most 2.7 %
+Distances come from Dijkstra's algorithm on a grid with 16 neighbours (`grid_paths`). They are at most 2.7 %
 longer than the true ones. The robot does not follow the grid: it drives towards the lookahead point, which is the
 farthest point of the path to which a straight line is free.
 """
@@ -13,13 +13,14 @@ farthest point of the path to which a straight line is free.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.ndimage import label
 from scipy.spatial import cKDTree
+
+from services.controller.policies.grid_paths import NO_CELL, cheapest_paths, repaired_paths
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -36,65 +37,57 @@ WAITING_RANGE_M = 4.0  # cost of the path to an occupied goal within which a rob
 # Cost of a metre between that place and the goal. More than a metre along any path, so that the robot drives as near as
 # it can without a detour.
 REMAINING_COST = 2 * (1 + MAX_WALL_COST)
-# Half of the 16 neighbours as (rows, columns); the other half are their opposites. A knight's move passes over two more
-# cells, which must be free as well.
-MOVES = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (2, -1), (1, -2))
-NO_PREDECESSOR = -9999  # scipy's predecessor of the start node
+# Paths around obstacles are computed up to the robot's cost without obstacles and one of these margins: the next one
+# if the robot was not reached.
+SEARCH_MARGINS_M = (10.0, 60.0, np.inf)
 
 
 class FreeSpaceGraph:
-    """Graph of the free cells. Edge weights are costs, given the walls and the temporary obstacles."""
+    """The free cells, and what a metre costs in them, given the walls and the temporary obstacles."""
 
     def __init__(self, free: FreeSpace, radius: float) -> None:
-        """Builds the graph for a footprint of ``radius`` m, without temporary obstacles."""
+        """Starts without temporary obstacles, for a footprint of ``radius`` m."""
         self.free, self.grid, self.radius = free, free.grid, radius
         self.min_clearance = radius + WALL_GAP_M
-        self.clearance = free.clearance  # (rows, columns) m, to walls and temporary obstacles
-        self._graph = _edges(free.clearance >= self.min_clearance, self.grid.resolution)
-        self._length = self._graph.data.copy()
-        self._to = self._graph.indices
-        self._from = np.repeat(np.arange(self.grid.cell_count), np.diff(self._graph.indptr))
-        self._opposite = np.empty_like(self._from)  # for each edge, the index of the edge in the opposite direction
-        self._opposite[np.lexsort((self._to, self._from))] = np.lexsort((self._from, self._to))
-        self._near_obstacles = np.zeros(self.grid.cell_count, bool)  # cells whose cost temporary obstacles may change
-        self.cost_per_metre = np.zeros(self.grid.shape)
-        self._extra_cost_per_metre = UNKNOWN_COST * free.unknown.ravel()  # the part that does not depend on clearance
-        self._update_weights(~self._near_obstacles)
-        _, self.component = connected_components(self._graph, directed=False)  # (cells,), without temporary obstacles
+        self._extra_cost_per_metre = UNKNOWN_COST * free.unknown  # the part that does not depend on clearance
+        self.clearance = free.clearance.copy()  # (rows, columns) m, to walls and temporary obstacles
+        self.cost_per_metre = self._extra_cost_per_metre + cost_near_walls(free.clearance, self.min_clearance)
+        # (cells,) number of the part of the free space, without temporary obstacles
+        self.component = label(free.clearance >= self.min_clearance)[0].ravel()
         self._centres = self.grid.centres()
+        self._near_obstacles = np.zeros(0, np.intp)  # cells whose clearance temporary obstacles have reduced
+        self._known_paths: tuple[int, Array, npt.NDArray[np.int32]] | None = None  # to one cell, without obstacles
 
     def set_obstacles(self, points: Array) -> None:
         """Replaces the temporary obstacles by ``points`` (K, 2) m in map."""
-        range_m, before = self.min_clearance + WALL_COST_RANGE_M, self._near_obstacles
-        self.clearance, self._near_obstacles = self.free.clearance, np.zeros(self.grid.cell_count, bool)
-        if len(points):
-            self._near_obstacles[self.grid.cell_of(points)] = True
-            occupied = self._near_obstacles.reshape(self.grid.shape)
-            self._near_obstacles = _dilate(occupied, int(range_m / self.grid.resolution) + 1).ravel()
-            distance, _ = cKDTree(points).query(self._centres[self._near_obstacles], distance_upper_bound=range_m)
-            clearance = self.free.clearance.ravel().copy()
-            clearance[self._near_obstacles] = np.minimum(clearance[self._near_obstacles], distance)
-            self.clearance = clearance.reshape(self.grid.shape)
-        self._update_weights(before | self._near_obstacles)
+        self._set_clearance(self._near_obstacles, self.free.clearance.ravel()[self._near_obstacles])
+        self._near_obstacles = np.zeros(0, np.intp)
+        if not len(points):
+            return
+        range_m = self.min_clearance + WALL_COST_RANGE_M
+        cells = np.unique(self.grid.cell_of(points))
+        rows, columns = np.divmod(cells, self.grid.shape[1])
+        margin = int(range_m / self.grid.resolution) + 1
+        top, left = max(0, rows.min() - margin), max(0, columns.min() - margin)
+        window = np.zeros((rows.max() + margin + 1 - top, columns.max() + margin + 1 - left), bool)
+        window = window[: self.grid.shape[0] - top, : self.grid.shape[1] - left]
+        window[rows - top, columns - left] = True
+        rows, columns = np.nonzero(_dilate(window, margin))
+        near = (rows + top) * self.grid.shape[1] + columns + left
+        distance, _ = cKDTree(points).query(self._centres[near], distance_upper_bound=range_m)
+        reduced = distance < self.clearance.ravel()[near]
+        self._near_obstacles = near[reduced]
+        self._set_clearance(self._near_obstacles, distance[reduced])
+
+    def _set_clearance(self, cells: npt.NDArray[np.intp], clearance: Array) -> None:
+        self.clearance.ravel()[cells] = clearance
+        extra = self._extra_cost_per_metre.ravel()[cells]
+        self.cost_per_metre.ravel()[cells] = extra + cost_near_walls(clearance, self.min_clearance)
 
     def set_extra_cost_per_metre(self, cost: Array) -> None:
-        """Replaces the additional cost (cells,) of a metre in each cell, also that of unknown cells."""
-        self._extra_cost_per_metre = cost
-        self._update_weights(np.ones(self.grid.cell_count, bool))
-
-    @property
-    def lengths(self) -> csr_matrix:
-        """Lengths (cells, cells) in m of the edges, without temporary obstacles."""
-        return csr_matrix((self._length, self._graph.indices, self._graph.indptr), shape=self._graph.shape, copy=True)
-
-    def _update_weights(self, changed: npt.NDArray[np.bool_]) -> None:
-        """Recomputes the weights of all edges of the ``changed`` cells (cells,) bool."""
-        clearance, cost = self.clearance.ravel(), self.cost_per_metre.ravel()
-        cost[changed] = cost_near_walls(clearance[changed], self.min_clearance) + self._extra_cost_per_metre[changed]
-        outgoing = np.flatnonzero(changed[self._from])
-        edges = np.concatenate([outgoing, self._opposite[outgoing]])
-        cost = np.where(clearance >= self.min_clearance, cost, np.inf)
-        self._graph.data[edges] = self._length[edges] * (cost[self._from[edges]] + cost[self._to[edges]]) / 2
+        """Replaces the additional cost (rows, columns) of a metre in each cell, also that of unknown cells."""
+        self._extra_cost_per_metre, self._known_paths = cost, None
+        self.cost_per_metre = cost + cost_near_walls(self.clearance, self.min_clearance)
 
     def nearest_free(
         self, point: Array, within: float = np.inf, component: int | None = None, *, map_only: bool = False
@@ -121,36 +114,71 @@ class FreeSpaceGraph:
         best = int(np.argmin(distance))
         return int(cells[best]) if distance[best] <= within else None
 
-    def cost_field(self, point: Array, within: float = np.inf, position: Array | None = None) -> CostField | None:
-        """Costs from all cells to the free cell nearest to ``point`` (2,) m, or None if none is within ``within`` m.
-
-        If the point is occupied, a ``position`` (2,) m of the robot makes this the best cell to wait at for a robot
-        that is near.
-        """
+    def cost_field(self, point: Array, within: float = np.inf) -> CostField | None:
+        """Costs from all cells to the free cell nearest to ``point`` (2,) m, or None if none is within ``within`` m."""
         cell = self.nearest_free(point, within)
         if cell is None:
             return None
-        if position is not None and cell != self.grid.cell_of(point):
-            cell = self._waiting_cell(point, within, position, cell)
-        cost, predecessor = dijkstra(self._graph, indices=cell, return_predecessors=True)
+        return self._field(point, cell, *self._paths_to(cell))
+
+    def cost_field_around_obstacles(self, point: Array, within: float, position: Array) -> CostField | None:
+        """The `cost_field` for a robot at ``position`` (2,) m.
+
+        If obstacles occupy the point, it leads to the place where the robot should wait. Costs that exceed the robot's
+        by more than a margin may be those without obstacles, so that most of the map need not be searched.
+        """
+        goal = self.nearest_free(point, within, map_only=True)
+        start = self.nearest_free(position, self.min_clearance + 2 * self.grid.resolution)
+        end = self.nearest_free(point, within)
+        if goal is None or start is None or end is None:
+            return self.cost_field(point, within)
+        if end != goal:
+            end = self._waiting_cell(point, within, start, end)
+        if self._known_paths is None or self._known_paths[0] != goal:
+            self._known_paths = goal, *self._paths_to(goal, map_only=True)
+        known = self._known_paths[1:]
+        if not len(self._near_obstacles):
+            return self._field(point, goal, *known)
+        if not np.isfinite(known[0][end]):  # beside a goal in another part of the free space
+            return self._field(point, end, *self._paths_to(end))
+        for margin in SEARCH_MARGINS_M:
+            limit = known[0][start] + margin
+            cost, next_cell = repaired_paths(self._cell_cost(), known, self._near_obstacles, end, limit)
+            if cost[start] <= limit:
+                break
+        if np.isfinite(limit):
+            beyond = np.isinf(cost)
+            cost[beyond], next_cell[beyond] = known[0][beyond], known[1][beyond]
+        return self._field(point, end, cost, next_cell)
+
+    def _paths_to(self, cell: int, *, map_only: bool = False) -> tuple[Array, npt.NDArray[np.int32]]:
+        return cheapest_paths(self._cell_cost(map_only=map_only), np.array([cell]), np.zeros(1))
+
+    def _cell_cost(self, *, map_only: bool = False) -> Array:
+        """Cost (rows, columns) of a way as long as a cell's side; +inf where a cell is not free."""
+        cost, clearance = self.cost_per_metre, self.clearance
+        if map_only:
+            clearance = self.free.clearance
+            cost = self._extra_cost_per_metre + cost_near_walls(clearance, self.min_clearance)
+        return np.where(clearance >= self.min_clearance, self.grid.resolution * cost, np.inf)
+
+    def _field(self, point: Array, cell: int, cost: Array, next_cell: npt.NDArray[np.int32]) -> CostField:
         goal = np.array(point, float)
         if float(self.grid.interpolate(self.clearance, goal)) < self.min_clearance:
             goal = self._centres[cell]
-        return CostField(self, goal, cost.reshape(self.grid.shape), predecessor)
+        return CostField(self, goal, cost.reshape(self.grid.shape), next_cell)
 
-    def _waiting_cell(self, point: Array, within: float, position: Array, nearest: int) -> int:
+    def _waiting_cell(self, point: Array, within: float, start: int, nearest: int) -> int:
         """The free cell within ``within`` m of an occupied ``point`` with the least path and remaining distance to it.
 
-        Without the path from ``position``, the robot would drive around an obstacle that occupies its goal, because the
-        rear, which it does not see, seems free. Far from the point, it is the cell ``nearest`` to it.
+        Without the path from the cell ``start``, the robot would drive around an obstacle that occupies its goal,
+        because the rear, which it does not see, seems free. Far from the point, it is the cell ``nearest`` to it.
         """
-        start = self.nearest_free(position, self.min_clearance + 2 * self.grid.resolution)
-        if start is None:
-            return nearest
         cells = self.grid.cells_near(point, within)
         distance = np.hypot(*(self._centres[cells] - point).T)
         limit = WAITING_RANGE_M + REMAINING_COST * float(np.hypot(*(self._centres[nearest] - point)))
-        cost = dijkstra(self._graph, indices=start, limit=limit)[cells] + REMAINING_COST * distance
+        path_cost, _ = cheapest_paths(self._cell_cost(), np.array([start]), np.zeros(1), limit)
+        cost = path_cost[cells] + REMAINING_COST * distance
         best = int(np.argmin(np.where(distance <= within, cost, np.inf)))
         return int(cells[best]) if cost[best] <= limit else nearest  # above the limit, costs are not known
 
@@ -173,7 +201,7 @@ class CostField:
     graph: FreeSpaceGraph
     goal: Array  # (2,) m in map, moved to the nearest place where the robot can stand
     cost: Array  # (rows, columns) m to go, more near walls; +inf where the goal cannot be reached
-    next_cell: Array  # (cells,) flat index of the next cell on the path to the goal
+    next_cell: npt.NDArray[np.int32]  # (cells,) flat index of the next cell on the path to the goal, or `NO_CELL`
 
     def reaches(self, point: Array) -> bool:
         """Whether the goal can be reached from a point (2,) m."""
@@ -190,7 +218,7 @@ class CostField:
         if cell is None:
             return np.zeros((0, 2))
         cells = [cell]
-        while (cell := int(self.next_cell[cell])) != NO_PREDECESSOR:
+        while (cell := int(self.next_cell[cell])) != NO_CELL:
             cells.append(cell)
         centres = self.graph.grid.centres(np.array(cells))
         return np.concatenate([np.atleast_2d(point), centres[1:-1], self.goal[None]])
@@ -245,41 +273,3 @@ def _dilate(cells: npt.NDArray[np.bool_], by: int) -> npt.NDArray[np.bool_]:
             dilated[:-shift] |= cells[shift:]
         cells = dilated.T
     return cells
-
-
-def _edges(free: npt.NDArray[np.bool_], resolution: float) -> csr_matrix:
-    """Matrix (cells, cells) of edge lengths in m between free cells, in both directions."""
-    rows, columns = free.shape
-    index = np.arange(free.size).reshape(free.shape)
-
-    def shifted(values: Any, down: int, right: int, move: tuple[int, int]) -> Any:
-        """``values`` at offset (down, right) from every cell from which ``move`` stays on the grid."""
-        d, r = move
-        top, left = max(0, -d), max(0, -r)
-        height, width = rows - abs(d), columns - abs(r)
-        return values[top + down : top + down + height, left + right : left + right + width]
-
-    # The empty arrays are for a map of one cell, on which no move is possible.
-    starts, ends = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-    lengths = [np.zeros(0)]
-    for move in MOVES:
-        d, r = move
-        if abs(d) >= rows or abs(r) >= columns:
-            continue
-        possible = shifted(free, 0, 0, move) & shifted(free, d, r, move)
-        for passed in _passed_cells(d, r):
-            possible = possible & shifted(free, *passed, move)
-        starts.append(shifted(index, 0, 0, move)[possible])
-        ends.append(shifted(index, d, r, move)[possible])
-        lengths.append(np.full(int(possible.sum()), resolution * float(np.hypot(d, r))))
-    a, b, length = np.concatenate(starts), np.concatenate(ends), np.tile(np.concatenate(lengths), 2)
-    both = np.concatenate([a, b]), np.concatenate([b, a])
-    return csr_matrix((length, both), shape=(free.size, free.size))
-
-
-def _passed_cells(down: int, right: int) -> list[tuple[int, int]]:
-    """Offsets of the cells that a move passes over, besides its start and end."""
-    if abs(down) + abs(right) == 3:
-        half = (int(np.sign(down)), 0) if abs(down) == 2 else (0, int(np.sign(right)))
-        return [half, (int(np.sign(down)), int(np.sign(right)))]
-    return [(down, 0), (0, right)] if down and right else []

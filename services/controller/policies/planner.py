@@ -154,7 +154,7 @@ class GeodesicPolicy:
         if not self.epistemic or self._information is not None:
             return
         self._information = ScanInformation.of(self.graph, scan, self.robot.max_speed)
-        self.graph.set_extra_cost_per_metre(self._information.ambiguity.ravel() / efe.NATS_PER_METRE)
+        self.graph.set_extra_cost_per_metre(self._information.ambiguity / efe.NATS_PER_METRE)
 
     def observe(self, scan: Scan | None, belief: Belief) -> None:
         """Stores the scan and its field of view; while tracking, also obstacles and the robot's part of the graph."""
@@ -280,12 +280,14 @@ class GeodesicPolicy:
         if self.field is not None and not self._field_outdated:
             return
         self._field_outdated = False
-        self.field, self.field_changed = self.graph.cost_field(self._goal, MAX_GOAL_SHIFT_M, position), True
+        self.field = self.graph.cost_field_around_obstacles(self._goal, MAX_GOAL_SHIFT_M, position)
+        self.field_changed = True
         self.ignores_obstacles = False
         if self.field is None or not self.field.reaches(position):
             # Obstacles leave no path. Drive by the map alone, up to the obstacle that blocks the path, and wait there.
             self.graph.set_obstacles(np.zeros((0, 2)))
-            self.field, self.ignores_obstacles = self.graph.cost_field(self._goal, MAX_GOAL_SHIFT_M), bool(len(points))
+            self.field = self.graph.cost_field_around_obstacles(self._goal, MAX_GOAL_SHIFT_M, position)
+            self.ignores_obstacles = bool(len(points))
 
     def _may_replan(self, field: CostField, position: Array, changed: npt.NDArray[Any], stamp_ns: int) -> bool:
         """Whether the plan is old enough to be replaced because obstacles in the cells ``changed`` came or went."""

@@ -16,11 +16,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
-from scipy.sparse import csr_matrix, vstack
-from scipy.sparse.csgraph import dijkstra
 
 from services.controller.policies import expected_free_energy as efe
 from services.controller.policies.free_space import Grid
+from services.controller.policies.grid_paths import cheapest_paths
 from services.controller.policies.motion_model import period_of
 
 if TYPE_CHECKING:
@@ -106,15 +105,12 @@ def _propagate_deviation(graph: FreeSpaceGraph, deviation: Array) -> Array:
     In the other cell, the scans leave the ``deviation`` (cells,) in m or rad; on the way it grows by
     `efe.DRIFT_PER_METRE`.
     """
+    # Each cell starts with the length of the drive over which drift alone causes the deviation that scans there leave.
     distance = deviation / efe.DRIFT_PER_METRE
-    # Dijkstra's algorithm starts at an additional node. The edge from it to a cell is as long as the drive over which
-    # drift alone causes the deviation that scans there leave. A sparse matrix stores no edge of length 0.
-    additional = csr_matrix(np.append(np.maximum(distance, 1e-9), 0.0))
-    lengths = graph.lengths
-    lengths.resize((len(distance), len(distance) + 1))
-    path_lengths = dijkstra(vstack([lengths, additional], format="csr"), indices=len(distance))
-    # Cells that are not free have no edges.
-    return np.asarray(efe.DRIFT_PER_METRE * np.minimum(distance, path_lengths[:-1]))
+    free = graph.free.clearance >= graph.min_clearance
+    cells = np.flatnonzero(free)
+    path_lengths, _ = cheapest_paths(np.where(free, graph.grid.resolution, np.inf), cells, distance[cells])
+    return np.asarray(efe.DRIFT_PER_METRE * np.minimum(distance, path_lengths))
 
 
 def _coarse_grid(grid: Grid) -> Grid:

@@ -81,7 +81,7 @@ def test_places_where_scans_tell_little():
     hypotheses = [BeliefHypothesis(pose=Pose.of(pose), weight=0.5) for pose in poses]
     ambiguous = belief(0, poses[0], "ambiguous").model_copy(update={"hypotheses": hypotheses})
     graph = FreeSpaceGraph(FreeSpace.of(room(10, 4)), ROBOT.radius)
-    graph.set_extra_cost_per_metre(np.full(graph.grid.shape, 100.0).ravel())
+    graph.set_extra_cost_per_metre(np.full(graph.grid.shape, 100.0))
     paths = ActiveLocaliser(ROBOT, graph, 0.33, Recovery()).prediction_request(ambiguous)
     assert paths is not None
     assert len(paths.displacements) > 5

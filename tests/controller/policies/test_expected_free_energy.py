@@ -25,6 +25,7 @@ from services.controller.policies.scan_information import (
     _ambiguity,
 )
 from tests.controller.driving import box, room, scan, shipped
+from tests.controller.policies.reference_paths import moves
 
 R = 25.0
 
@@ -239,7 +240,8 @@ def test_ambiguity_of_the_pose():
     scan_variances = np.column_stack([np.linalg.eigvalsh(left[:, :2, :2]), left[:, 2, 2]])
     expected = np.zeros(graph.grid.cell_count)
     centres = graph.grid.centres()
-    distances = dijkstra(graph.lengths)
+    free = graph.free.clearance >= graph.min_clearance
+    distances = dijkstra(moves(np.where(free, graph.grid.resolution, np.inf)))
     for variance, resolution in zip(scan_variances.T, np.diag(efe.RESOLUTION_COVARIANCE), strict=True):
         staying = np.zeros(count)
         for k in range(count):  # a metre of drift, then the scans of a metre, until it stays the same

@@ -127,11 +127,29 @@ def test_where_to_wait_for_an_occupied_goal(empty):
     """A robot waits on its side of an obstacle, but as near to the goal as a straight way leads; others, nearest."""
     goal = np.array([5.0, 3.0])
     empty.set_obstacles(np.stack([np.linspace(4.0, 6.0, 41), np.full(41, 3.1)], axis=-1))
-    places = [empty.cost_field(goal, 2.0, np.array([x, y])).goal for x, y in ((5.0, 5.0), (5.0, 1.5), (1.0, 5.5))]
+    starts = np.array([[5.0, 5.0], [5.0, 1.5], [1.0, 5.5]])
+    places = [empty.cost_field_around_obstacles(goal, 2.0, start).goal for start in starts]
     assert (places[0] - [5.0, 3.1])[1] > RADIUS
     assert (places[1] - [5.0, 3.1])[1] < -RADIUS
     for place, nearest in ((places[0], 0.5), (places[1], 0.3), (places[2], 0.3)):
         assert np.hypot(*(place - goal)) < nearest
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_costs_around_obstacles(name):
+    """Computed only where obstacles change them, the costs near the robot are those of all paths around them."""
+    world, graph, rng = shipped(name), FreeSpaceGraph(free_space(name), RADIUS), np.random.default_rng(4)
+    x0, y0, x1, y1 = world.bounds
+    for start, goal in world.sample_free(20, rng, RADIUS + WALL_GAP_M).reshape(-1, 2, 2):
+        graph.set_obstacles(rng.uniform((x0, y0), (x1, y1), (rng.integers(1, 12), 2)))
+        everywhere, found = graph.cost_field(goal, 0.3), graph.cost_field_around_obstacles(goal, 0.3, start)
+        if everywhere is None or graph.nearest_free(goal) != graph.nearest_free(goal, map_only=True):
+            continue
+        robot = everywhere.cost_from(start)
+        assert found.cost_from(start) == pytest.approx(robot)
+        np.testing.assert_allclose(found.path(start), everywhere.path(start))
+        near = everywhere.cost <= robot
+        np.testing.assert_allclose(found.cost[near], everywhere.cost[near], rtol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["corridor", "office"])
