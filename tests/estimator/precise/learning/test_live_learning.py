@@ -13,7 +13,7 @@ from lab.integrity.maps import grid_of
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.calibration import ReferenceDrive
-from services.estimator.precise.learning.drive_learning import range_errors
+from services.estimator.precise.learning.drive_learning import HELD_OUT_EVERY, range_errors
 from services.estimator.precise.learning.field_learning import Recipe, learn_field
 from services.estimator.precise.learning.live_learning import learn_version, mean_error, remove_moving_objects
 from services.estimator.precise.learning.map_alignment import align_to_map
@@ -107,6 +107,14 @@ def test_cupboard_moved_back(original, version):
     before, after = (error(each, BEFORE, *WEST) for each in (version.model, back.model))
     assert before > 0.01
     assert after < 0.3 * before
+
+
+def test_no_new_key_scan_is_held_out(original, version):
+    """Nothing shows whether a version is better if the model in use has learned all held-out key scans."""
+    model, places = original
+    keys = drive(AFTER, *WEST, 60)
+    assert learn_version(model, places, model, keys, RECIPE, learned_until=float(keys.stamps[57])) is None
+    assert version.test_scans == 80 // HELD_OUT_EVERY
 
 
 def test_poses_of_a_rough_map(original):
