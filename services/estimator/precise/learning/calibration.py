@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ConfigDict
 
+from common.errors import UserError
 from common.geometry import se2
 from services.estimator.precise.gauss_newton import View, polish
 from services.estimator.precise.likelihood import Likelihood
@@ -120,7 +121,7 @@ def _pose_precision(
 
     Compares poses (1, 3) found from one scan each, and the evidence there, with the reference poses (N, 3). The floors
     come from robust deviations. The inflation is the one with which the median of the squared errors is right, so that
-    a few poor reference poses do not decide.
+    a few poor reference poses do not decide. Raises UserError if the scans do not show the pose.
     """
     errors, covariances = [], []
     for reference, (found, evidence) in zip(references, fitted, strict=True):
@@ -129,6 +130,11 @@ def _pose_precision(
             inverse = np.linalg.inv(evidence.curvature[0] + np.eye(3))
             errors.append(error + inverse @ evidence.xi[0])
             covariances.append(inverse @ (evidence.xi_noise_covariance[0] + evidence.xi_model_covariance[0]) @ inverse)
+    if not errors:
+        raise UserError(
+            f"none of the {len(fitted)} held-out scans fits the model within {MAX_POSITION_ERROR_M:g} m of its "
+            "reference pose: check the reference poses and the mount of the laser, and drive where walls are in range"
+        )
     error, stated = np.array(errors), np.array(covariances)
 
     def excess_deviation(values: Array, variance: Array) -> float:
@@ -142,10 +148,16 @@ def _pose_precision(
         return np.asarray(np.einsum("ni,nij,nj->n", error, np.linalg.inv(inflation * stated + floor), error))
 
     low, high = 1.0, 1e4  # bisection for the inflation
-    for _ in range(40):
-        middle = float(np.sqrt(low * high))
-        low, high = (middle, high) if np.median(nees(middle)) > CHI2_MEDIAN else (low, middle)
-    return (position, heading), high, nees(high)
+    try:
+        for _ in range(40):
+            middle = float(np.sqrt(low * high))
+            low, high = (middle, high) if np.median(nees(middle)) > CHI2_MEDIAN else (low, middle)
+        return (position, heading), high, nees(high)
+    except np.linalg.LinAlgError:
+        raise UserError(
+            "some held-out scans show too few surfaces to find the pose: leave out the part of the drive where the "
+            "scanner sees no walls, or drive nearer to walls in different directions"
+        ) from None
 
 
 def _coverage(

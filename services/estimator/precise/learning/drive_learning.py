@@ -106,6 +106,7 @@ def _learn_model(
     drive: ReferenceDrive, recipe: Recipe, simulated: Beams | None, report: Callable[[float], None], *, replayed: bool
 ) -> FieldModel:
     measured = Beams.of(drive.poses, drive.mount, drive.angles, drive.ranges)
+    measured.check_any()
     beams = measured
     if simulated is not None and replayed:
         beams = measured.joined(remove_contradicted(measured, simulated, recipe.resolution))

@@ -18,7 +18,8 @@ from services.estimator.precise.learning.beam_cells import count_crossings
 BEAMS_AT_ONCE = 2_000_000  # processed together, which limits memory
 MAX_CELLS = 100_000_000  # 250 000 m² in cells of 5 cm, which need 6 GB
 WRONG_RANGES = (
-    "Are the ranges in m? From which range on there is no return is set with range_max in section log of --config"
+    "Check that ranges are in metres, and that `range_max` (section `log` of the --config file) is the range that the "
+    "driver reports for no return"
 )
 POOL_CELLS = 1  # cells to each side whose points are pooled to find a normal
 ELEMENT_RADIUS_CELLS = 2.0  # around a surface element, within which it shapes the field
@@ -42,6 +43,11 @@ class Beams:
         returned = np.isfinite(ranges) & (ranges > 0)
         row, column = np.nonzero(returned)
         return cls(lasers[row, :2], lasers[row, 2] + angles[column], ranges[returned])
+
+    def check_any(self) -> None:
+        """Raises UserError if there are no beams."""
+        if not len(self.ranges):
+            raise UserError(f"no surface to learn from: no two beams end near each other. {WRONG_RANGES}")
 
     def ends(self) -> Array:
         """End points (R, 2), m in map."""
@@ -93,8 +99,7 @@ class SurfaceCells:
     @classmethod
     def of(cls, beams: Beams, cell_m: float) -> SurfaceCells:
         """The cells of ``cell_m`` m in which beams end. Raises UserError if there are too many, or no beams."""
-        if not len(beams.ranges):
-            raise UserError(f"no surface to learn from: no two beams end near each other. {WRONG_RANGES}")
+        beams.check_any()
         low, high = beams.bounds()
         low = low - 4 * cell_m
         shape = np.ceil((high + 4 * cell_m - low) / cell_m).astype(int)[::-1] + 1
