@@ -217,10 +217,20 @@ def test_recovery():
     assert recovery.random_share < 0.12
 
 
-def test_settings():
-    for wrong in ({"sigma_hit": 0.0}, {"alpha1": -1.0}, {"max_beams": 0}, {"z_rand": 0.0}, {"min_particles": 9000}):
-        with pytest.raises(UserError, match="particle filter"):
-            dataclasses.replace(ParticleFilterSettings(), **wrong)
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"sigma_hit": 0.0}, "sigma_hit must be greater than 0"),
+        ({"max_beams": 0}, "max_beams must be greater than 0"),
+        ({"alpha1": -1.0, "sigma_hit": -0.1}, "alpha1, sigma_hit must not be negative"),
+        ({"walk_share": 1.5}, "walk_share must be 1 at most"),
+        ({"z_rand": 0.0}, "z_hit and z_rand must be greater than 0"),
+        ({"min_particles": 9000}, "max_particles 2000 < min_particles 9000"),
+    ],
+)
+def test_wrong_settings(wrong, message):
+    with pytest.raises(UserError, match=f"particle filter: {message}"):
+        dataclasses.replace(ParticleFilterSettings(), **wrong)
 
 
 def test_overlapping_obstacles():
