@@ -12,8 +12,10 @@ from common.geometry import se2
 from common.robot.motion_distortion import sweep_time
 from services.estimator.precise.gauss_newton import COARSE_SIGMA_M, GaussNewton, Optimiser, Prior, View
 from services.estimator.precise.hypotheses import (
+    OFF_MAP_PROBABILITY,
     SURROUNDINGS_PRIOR,
     SURROUNDINGS_TRANSITIONS,
+    UNKNOWN_PROBABILITY,
     TrackedHypothesis,
     UnknownPlace,
     clip_to_map,
@@ -81,6 +83,11 @@ SIGNIFICANT_MAP_ERROR = 0.25
 # A beam at a surface that the map lacks ends at one of the map's by chance with at most this probability. At nine of
 # ten wrong poses, the map explained less than 5 % of the scan (9 % in the worst of the buildings of development).
 EXPLAINED_BY_CHANCE = 0.1
+TRACKING_PROBABILITY = 0.999  # in state `tracking`: of the pose being within 0.2 m and 5 degrees of the truth
+# The state is `ambiguous` if the second hypothesis has more than this weight (a guess), or if the best one would be
+# `tracking` without the others.
+AMBIGUOUS_WEIGHT = 0.05
+ALL_CHANGED_PROBABILITY = 0.01  # that nothing around a given start is as the map shows it (a guess)
 UNKNOWN_SIGMA_M = 100.0  # published where the map is unknown
 # A motion, or a number of changes, that is less probable (a guess) may be due to a kidnapping. Such a motion causes a
 # search; such a number of changes does, too, if another place could fit much better.
@@ -413,11 +420,11 @@ class PreciseEstimator:
         the motion is unknown, this evidence is left out.
         """
         hypothesis, period = self.hypotheses[k], self._period(observation.stamp)
-        candidates, pose, evidence = match.motions[k], match.poses[k], match.evidence
+        candidates, pose = match.motions[k], match.poses[k]
         explained, unobserved = float(match.explained[k]), match.unobserved[k]
-        project_evidence(evidence, k, unobserved)
         # Where the map explains few beams, all of them may do so by chance, which is no information about the pose.
-        evidence.scale(k, _fraction_not_by_chance(explained))
+        not_by_chance = _fraction_not_by_chance(explained)
+        evidence = project_evidence(match.evidence.at(k), unobserved).scaled(not_by_chance)
         # A match with the local map gives the motion in the unobserved directions, too.
         unknown_motion = len(unobserved) > 0 and match.local_pose is None
         if unknown_motion and self._odometry_since_last_scan(observation) is None:
@@ -430,13 +437,13 @@ class PreciseEstimator:
             fuse(
                 limit_covariance(decouple(each, unobserved), self.seeds.spread),
                 pose,
-                evidence.xi[k],
-                evidence.curvature[k],
+                evidence.xi[0],
+                evidence.curvature[0],
             )
             for each in candidates
         ]
         best = min(fused, key=lambda each: each.negative_log_evidence)
-        updated = update_hypothesis(hypothesis, best, evidence, k, period, unobserved=unknown_motion)
+        updated = update_hypothesis(hypothesis, best, evidence, period, unobserved=unknown_motion)
         # Standing still is the first candidate, unless the local map gives a single one.
         is_standing = len(fused) > 1 and best is fused[0]
         if match.swept is not None and not is_standing:
@@ -469,10 +476,10 @@ class PreciseEstimator:
         """
         before = self.hypotheses[0]
         doubt = 1 - self._probability_of_being_near(before)
-        certain = doubt <= 1 - self.settings.tracking_probability
+        certain = doubt <= 1 - TRACKING_PROBABILITY
         if certain or 1 - self._probability_of_being_near(best) > 0.5 * doubt:
             return []
-        found = search_near([view], motion.mean, motion.covariance, self.seeds, self.settings, self._rng)
+        found = search_near([view], motion.mean, motion.covariance, self.seeds, self._rng)
         at_best = before.log_evidence + _prior_of([motion]).energy(best.pose[None])[0]
         return [
             replace(
@@ -498,32 +505,16 @@ class PreciseEstimator:
         if local is None:
             local = self._local_map.to_local(hypotheses[0].pose)
         poses = np.array([each.pose for each in hypotheses])
-        evidence = view.surface_evidence(poses)
-        mapped, small = evidence.weights[0] > 0.5, view.surfaces.small
-        seen, appeared = self._local_map.find_seen_and_appeared(local, view, mapped)
+        evidence, small = view.surface_evidence(poses), view.surfaces.small
+        seen, appeared = self._find_seen_and_appeared(view, local, evidence.weights[0] > 0.5)
         ignored = seen | appeared | small
-        unmapped = view.returned & ~mapped & ~small
-        self._moved, self._stayed = view.count_surfaces(unmapped & appeared), view.count_surfaces(unmapped & seen)
-
-        # Changes are equally probable at all hypotheses. If there are suddenly more of them, a search is due soon.
-        log_probability = 0.0  # of the number of changes
-        if self._last:
-            self._changes = count_changes(self._last, LocalScan(local, view))
-            log_probability = self._change_rate.log_probability(self._changes, period)
-        log_change = log_probability + _log_unmapped_surfaces(view, ~appeared | small)
-        if log_probability < np.log(SUDDEN_CHANGE_PROBABILITY):
-            self._search_interval = 1
-
+        log_change = self._log_probability_of_changes(view, local, appeared, period)
         before = np.array([each.surroundings for each in hypotheses])
         log_likelihood, surroundings = _log_at_poses(view, poses, ignored, before)
         losses = self._losses_by_motion(view, hypotheses, expected)
-        # Alternatives found for this scan come last in `hypotheses`, and have no counterpart in `self.hypotheses`. They
-        # differ by the motion, against which surfaces that were seen before may speak. They do not speak for it: among
-        # similar surfaces, the search may have missed the right match.
-        count = len(self.hypotheses)
-        if len(hypotheses) > count:
-            of_seen = _log_at_poses(view, poses, appeared | small, before)[0] - log_likelihood
-            losses[count:] += np.maximum(0.0, of_seen[0] - of_seen)[count:]
+        if len(hypotheses) > len(self.hypotheses):
+            with_seen, _ = _log_at_poses(view, poses, appeared | small, before)
+            losses += self._losses_of_alternatives(with_seen - log_likelihood)
         hypotheses = [
             replace(
                 hypothesis,
@@ -535,23 +526,65 @@ class PreciseEstimator:
             for k, hypothesis in enumerate(hypotheses)
         ]
         self._local_pose, self._ignored_beams, self._log_change = local, ignored, log_change
+        self._update_unknown_place(view, hypotheses)
+        self._set_hypotheses(hypotheses)
+        if not np.array_equal(self.hypotheses[0].pose, hypotheses[0].pose):  # another hypothesis is best now
+            self._local_map.place(local, self.hypotheses[0].pose)
 
+    def _find_seen_and_appeared(
+        self, view: View, local: Array, mapped: npt.NDArray[np.bool_]
+    ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+        """See `LocalMap.find_seen_and_appeared`. Also counts both among the surfaces that the map lacks."""
+        seen, appeared = self._local_map.find_seen_and_appeared(local, view, mapped)
+        unmapped = view.returned & ~mapped & ~view.surfaces.small
+        self._moved, self._stayed = view.count_surfaces(unmapped & appeared), view.count_surfaces(unmapped & seen)
+        return seen, appeared
+
+    def _log_probability_of_changes(
+        self, view: View, local: Array, appeared: npt.NDArray[np.bool_], period: float
+    ) -> float:
+        """Log probability in nats of the changes since the last scan, and of the surfaces that have ``appeared`` (B,).
+
+        They are equally probable at all hypotheses. If there are suddenly more changes, a search is due soon.
+        """
+        log_probability = 0.0  # of the number of changes
+        if self._last:
+            self._changes = count_changes(self._last, LocalScan(local, view))
+            log_probability = self._change_rate.log_probability(self._changes, period)
+        if log_probability < np.log(SUDDEN_CHANGE_PROBABILITY):
+            self._search_interval = 1
+        return log_probability + _log_unmapped_surfaces(view, ~appeared | view.surfaces.small)
+
+    def _losses_of_alternatives(self, log_of_seen: Array) -> Array:
+        """Evidence (N,) in nats, at least 0, that the alternatives lose: the hypotheses found for this scan only.
+
+        An alternative loses evidence if surfaces seen before fit it worse, but gains none if they fit it better,
+        because the search may have missed the right match among similar surfaces. ``log_of_seen`` (N,) are the log
+        likelihoods of these surfaces. The alternatives come last, and have no counterpart in `self.hypotheses`.
+        """
+        losses = np.maximum(0.0, log_of_seen[0] - log_of_seen)
+        losses[: len(self.hypotheses)] = 0.0
+        return np.asarray(losses)
+
+    def _update_unknown_place(self, view: View, hypotheses: list[TrackedHypothesis]) -> None:
+        """Updates the evidence for the unknown place, and that for a kidnapping, by the present scan.
+
+        ``hypotheses`` are those after the scan, with the evidence of their motions.
+        """
         log_kidnapping_prior = max(each.log_evidence for each in self.hypotheses)
-        log_kidnapping_prior += float(np.log(self.settings.unknown_probability))
+        log_kidnapping_prior += float(np.log(UNKNOWN_PROBABILITY))
         # If the robot was carried away just now, no motion had to be predicted, but all surfaces of the scan are new.
         # This counts only together with the whole scan: in a search at this scan, and for places off the map.
         self._log_kidnapped = log_kidnapping_prior + hypotheses[0].motion_complexity
         pairs = zip(self.hypotheses, hypotheses, strict=False)
         unknown_place = self._unknown_place
-        unknown_place.allow(max(self._log_mismatch(before, after) for before, after in pairs))
+        unknown_place.raise_evidence(max(self._log_mismatch(before, after) for before, after in pairs))
         # Either the surroundings have changed, or the robot was carried to another place and all surfaces are new.
-        log_new = _log_unmapped_surfaces(view, small)
-        unknown_place.scan_log_likelihood = max(_log_unmapped_surfaces(view, ignored) + log_change, log_new)
-        unknown_place.allow(log_kidnapping_prior)
-        unknown_place.add_kidnapping_off_map(self._log_kidnapped, self.settings.off_map_probability, log_new)
-        self._set_hypotheses(hypotheses)
-        if not np.array_equal(self.hypotheses[0].pose, hypotheses[0].pose):  # another hypothesis is best now
-            self._local_map.place(local, self.hypotheses[0].pose)
+        log_new = _log_unmapped_surfaces(view, view.surfaces.small)
+        log_changed = _log_unmapped_surfaces(view, self._ignored_beams) + self._log_change
+        unknown_place.scan_log_likelihood = max(log_changed, log_new)
+        unknown_place.raise_evidence(log_kidnapping_prior)
+        unknown_place.add_kidnapping_off_map(self._log_kidnapped, log_new)
 
     def _losses_by_motion(self, view: View, hypotheses: list[TrackedHypothesis], expected: list[Array]) -> Array:
         """By how much more the motion of each hypothesis costs than that of the best: (N,) nats, at least 0.
@@ -587,9 +620,9 @@ class PreciseEstimator:
     def _set_hypotheses(self, hypotheses: list[TrackedHypothesis]) -> None:
         """Sets the hypotheses and their weights."""
         unknown = self._unknown_place
-        min_log_unknown = max(each.log_weight for each in hypotheses) + float(np.log(self.settings.unknown_probability))
+        min_log_unknown = max(each.log_weight for each in hypotheses) + float(np.log(UNKNOWN_PROBABILITY))
         log_unknown = max(unknown.log_evidence + unknown.scan_log_likelihood, min_log_unknown)
-        self.hypotheses, unknown.weight = weigh(hypotheses, log_unknown, self.settings.max_hypotheses)
+        self.hypotheses, unknown.weight = weigh(hypotheses, log_unknown)
 
     def _add_key_scan(self, view: View) -> None:
         """Makes the present scan a key scan: keeps its evidence, and adds its surfaces to the local map."""
@@ -652,10 +685,10 @@ class PreciseEstimator:
         self._scans_since_search, self._search_interval = 0, min(2 * self._search_interval, MAX_SEARCH_INTERVAL_SCANS)
         if self._start is not None:
             start, self._start = self._start, None
-            found = search_near(views, *start, self.seeds, self.settings, self._rng)
+            found = search_near(views, *start, self.seeds, self._rng)
             view = _most_probable(views, found[0].pose)
-            unknown, all_changed = self.settings.unknown_probability, self.settings.all_changed_probability
-            self._start_with(view, found, unknown, unknown * self.settings.off_map_probability, all_changed)
+            off_map = UNKNOWN_PROBABILITY * OFF_MAP_PROBABILITY
+            self._start_with(view, found, UNKNOWN_PROBABILITY, off_map, ALL_CHANGED_PROBABILITY)
             if not self._may_be_elsewhere():
                 return view
         found = self._search_everywhere(views)
@@ -666,8 +699,7 @@ class PreciseEstimator:
             self._add_key_scan(view)
         else:
             # After a search of the whole map, a robot that is at none of these places is off the map.
-            off_map = self.settings.off_map_probability
-            self._start_with(view, found, unknown=off_map, off_map=off_map)
+            self._start_with(view, found, unknown=OFF_MAP_PROBABILITY, off_map=OFF_MAP_PROBABILITY)
         return view
 
     def _search_with_map_error(self, view: View, assumed: float, start: tuple[Array, Array] | None) -> View:
@@ -698,7 +730,7 @@ class PreciseEstimator:
         if self._precision.scans:  # the map's errors were learned in one room, but the robot may be in another
             elsewhere = self._precision.map_error_elsewhere
             views = [replace(view, map_error=max(view.map_error, elsewhere)) for view in views]
-        found, view = search_everywhere(views, self.seeds, self.settings), views[0]
+        found, view = search_everywhere(views, self.seeds), views[0]
         small = view.surfaces.small
         log_at_unknown_place = view.surfaces.log_density[~small].sum()
         return [each for each in found if each.scan_log_likelihood > log_at_unknown_place + MIN_GAIN_NATS] or found[:1]
@@ -706,9 +738,9 @@ class PreciseEstimator:
     def _start_with(
         self, view: View, found: list[TrackedHypothesis], unknown: float, off_map: float, all_changed: float = 0.0
     ) -> None:
-        """Starts with the hypotheses ``found``, and the probability ``unknown`` that the robot is at none.
+        """Starts with the hypotheses ``found``, and the probability ``unknown`` that the robot is at none of them.
 
-        ``off_map`` is the probability that it is at a place that is not on the map. With the probability
+        It contains the probability ``off_map`` of a place that is not on the map. With the probability
         ``all_changed``, no surface is as the map shows it.
         """
         self._restart_local_map(view)
@@ -756,8 +788,8 @@ class PreciseEstimator:
             self._search_interval = 1
             if if_kidnapped[best] > if_stayed[best]:
                 self._restart_local_map(view)
-                unknown, off_map = self._unknown_place, self.settings.off_map_probability
-                unknown.add_kidnapping_off_map(log_kidnapped, off_map, unknown.scan_log_likelihood)
+                unknown = self._unknown_place
+                unknown.add_kidnapping_off_map(log_kidnapped, unknown.scan_log_likelihood)
         self._unknown_place.exclude_mapped_places()
         self._set_hypotheses([*self.hypotheses, *added])
 
@@ -859,17 +891,15 @@ class PreciseEstimator:
 
     def _is_tracked(self) -> bool:
         """Whether the best hypothesis is so probable that the state is `tracking`."""
-        return self._probability() >= self.settings.tracking_probability
+        return self._probability() >= TRACKING_PROBABILITY
 
     def _state(self) -> State:
         if self._is_tracked():
             return "tracking"
         known = 1 - self._unknown_place.weight
         if len(self.hypotheses) > 1:
-            tracked_alone = (
-                known * self._probability_of_being_near(self.hypotheses[0]) >= self.settings.tracking_probability
-            )
-            if tracked_alone or self.hypotheses[1].weight * known > self.settings.ambiguous_weight:
+            tracked_alone = known * self._probability_of_being_near(self.hypotheses[0]) >= TRACKING_PROBABILITY
+            if tracked_alone or self.hypotheses[1].weight * known > AMBIGUOUS_WEIGHT:
                 return "ambiguous"
         return "lost" if self._has_tracked else "localising"
 

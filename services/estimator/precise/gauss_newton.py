@@ -286,6 +286,10 @@ class Prior:
         information = np.linalg.inv(covariance)
         return cls(np.tile(mean, (count, 1)), np.tile(information, (count, 1, 1)))
 
+    def at(self, row: int) -> Prior:
+        """Returns the prior of one hypothesis."""
+        return Prior(self.mean[row : row + 1], self.information[row : row + 1])
+
     def energy(self, poses: Array) -> Array:
         """Negative log density (N,) of poses (N, 3) in nats, without its constant."""
         offset = se2.difference(poses, self.mean)

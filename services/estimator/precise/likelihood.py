@@ -52,10 +52,14 @@ class Evidence:
         """Returns the evidence at some of the poses."""
         return Evidence(*(values[rows] for values in vars(self).values()))
 
-    def scale(self, row: int, factor: float) -> None:
-        """Multiplies the derivatives at one pose, and the covariances of xi, by ``factor``, in place."""
-        for values in (self.xi, self.curvature, self.xi_noise_covariance, self.xi_model_covariance):
-            values[row] *= factor
+    def at(self, row: int) -> Evidence:
+        """Returns the evidence at one of the poses."""
+        return Evidence(*(values[row : row + 1] for values in vars(self).values()))
+
+    def scaled(self, factor: float) -> Evidence:
+        """Returns the evidence with its derivatives, and the covariances of xi, multiplied by ``factor``."""
+        derivatives = (self.xi, self.curvature, self.xi_noise_covariance, self.xi_model_covariance)
+        return Evidence(self.accuracy, *(factor * each for each in derivatives))
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from services.estimator.precise.gauss_newton import (
     View,
 )
 from services.estimator.precise.hypotheses import (
+    MAX_HYPOTHESES,
     TrackedHypothesis,
     hypothesis_from_search,
     project_evidence,
@@ -26,12 +27,15 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from services.estimator.precise.global_seeds import Seeds
     from services.estimator.precise.likelihood import Evidence
-    from services.estimator.precise.settings import PreciseSettings
 
-
+RANKED_SEEDS = 300  # seeds at which the evidence by surfaces is computed
+SEARCH_STARTS = 48  # the best of them, from which a search of the whole map descends
+SEARCH_BEAMS = 100  # or more, used by these descents
+SEARCH_RESULTS = 12  # of a search's first descents: the best, from which it descends with all beams
+NEAR_STARTS = 48  # poses from which a search near a given pose descends
 SEED_EVIDENCE_BEAMS = 75  # or more, for the evidence at the ranked poses
-# Typical error of a range there, added in quadrature to every beam's deviation. Of 0.05 to 0.15 m, this keeps most true
-# poses among moved furniture.
+# Typical error of a range there, added in quadrature to every beam's deviation. Of the values tried, 0.05 to 0.15 m,
+# this keeps most true poses among moved furniture.
 SEED_SIGMA_M = 0.1
 # Added in the same way, at each step of a descent: from a seed, where larger deviations would match moved furniture to
 # the map's, and from a pose that may be half a metre off
@@ -39,7 +43,7 @@ SEED_SCHEDULE_M = (MEDIUM_SIGMA_M, MEDIUM_SIGMA_M, 0.05, 0.05)
 NEAR_SCHEDULE_M = (COARSE_SIGMA_M, COARSE_SIGMA_M, MEDIUM_SIGMA_M, MEDIUM_SIGMA_M)
 
 
-def search_everywhere(views: list[View], seeds: Seeds, settings: PreciseSettings) -> list[TrackedHypothesis]:
+def search_everywhere(views: list[View], seeds: Seeds) -> list[TrackedHypothesis]:
     """Returns the hypotheses that fit best in the whole map, best first.
 
     ``views`` are the same scan with different errors of the map. Ranks the seeds by their panoramas, and the best by
@@ -47,14 +51,14 @@ def search_everywhere(views: list[View], seeds: Seeds, settings: PreciseSettings
     beams, once per view.
     """
     view = views[0]
-    starts = seeds.rank(view, settings.ranked_seeds)
+    starts = seeds.rank(view, RANKED_SEEDS)
     fit = view.thinned(SEED_EVIDENCE_BEAMS).surface_evidence(starts, SEED_SIGMA_M).log_likelihood
-    starts = starts[np.argsort(-fit, kind="stable")[: settings.search_starts]]
-    few = view.thinned(settings.search_beams)
+    starts = starts[np.argsort(-fit, kind="stable")[:SEARCH_STARTS]]
+    few = view.thinned(SEARCH_BEAMS)
     poses, _ = few.descend(starts, None, SEED_SCHEDULE_M)
     fit = few.surface_evidence(poses, SEED_SCHEDULE_M[-1]).log_likelihood
-    starts = poses[select_best(poses, fit, settings.search_results)]
-    return _best_first([_best_hypotheses(each, *each.descend(starts), None, seeds, settings) for each in views])
+    starts = poses[select_best(poses, fit, SEARCH_RESULTS)]
+    return _best_first([_best_hypotheses(each, *each.descend(starts), None, seeds) for each in views])
 
 
 def search_near(
@@ -62,24 +66,23 @@ def search_near(
     pose: Array,
     covariance: Array,
     seeds: Seeds,
-    settings: PreciseSettings,
     rng: np.random.Generator,
 ) -> list[TrackedHypothesis]:
     """Returns the hypotheses that fit best near ``pose`` (3,), which is known within ``covariance`` (3, 3).
 
     ``views`` are the same scan with different errors of the map.
     """
-    starts = rng.multivariate_normal(pose, covariance, settings.near_starts)
+    starts = rng.multivariate_normal(pose, covariance, NEAR_STARTS)
     starts[0] = pose
     prior = Prior.repeated(len(starts), pose, covariance)
-    # More than the starts are off would lead all of them to the same minimum, which may be a wrong one.
+    # A sigma larger than the spread of the starts would merge all minima into one, perhaps a wrong one.
     largest = max(MEDIUM_SIGMA_M, _range_deviation(views[0], covariance))
     schedule = tuple(min(each, largest) for each in NEAR_SCHEDULE_M)
     poses, _ = views[0].descend(starts, prior, schedule)
     fit = views[0].surface_evidence(poses, schedule[-1]).log_likelihood - prior.energy(poses)
-    starts = poses[select_best(poses, fit, settings.search_results)]
+    starts = poses[select_best(poses, fit, SEARCH_RESULTS)]
     prior = Prior.repeated(len(starts), pose, covariance)
-    return _best_first([_best_hypotheses(each, *each.descend(starts, prior), prior, seeds, settings) for each in views])
+    return _best_first([_best_hypotheses(each, *each.descend(starts, prior), prior, seeds) for each in views])
 
 
 def _range_deviation(view: View, covariance: Array) -> float:
@@ -108,16 +111,16 @@ def search_around(view: View, starts: Array, prior: Prior, extra_starts: Array) 
 
 
 def _best_hypotheses(
-    view: View, poses: Array, evidence: Evidence, prior: Prior | None, seeds: Seeds, settings: PreciseSettings
+    view: View, poses: Array, evidence: Evidence, prior: Prior | None, seeds: Seeds
 ) -> list[TrackedHypothesis]:
     """The hypotheses with most evidence by surfaces among ``poses`` (N, 3), best first."""
     surface_evidence = view.surface_evidence(poses)
     log_likelihood = surface_evidence.without(view.surfaces.small)
     log_pose_prior = -prior.energy(poses) if prior else np.zeros(len(poses))
-    hypotheses, kept = [], select_best(poses, log_likelihood + log_pose_prior, settings.max_hypotheses)
+    hypotheses, kept = [], select_best(poses, log_likelihood + log_pose_prior, MAX_HYPOTHESES)
     for k, unobserved in zip(kept, unobserved_directions(view, poses[kept], evidence.curvature[kept]), strict=True):
-        project_evidence(evidence, k, unobserved)
-        hypothesis = hypothesis_from_search(poses[k], evidence, k, prior, seeds.volume, seeds.spread)
+        observed, prior_at = project_evidence(evidence.at(k), unobserved), prior.at(k) if prior else None
+        hypothesis = hypothesis_from_search(poses[k], observed, prior_at, seeds.volume, seeds.spread)
         hypotheses.append(
             replace(
                 hypothesis,

@@ -320,12 +320,12 @@ def test_hypothesis_weights():
         make_hypothesis(0.01, -3.0),
         make_hypothesis(9.0, -5000.0),
     ]
-    found, unknown = weigh(hypotheses, -2.0, 8)
+    found, unknown = weigh(hypotheses, -2.0)
     assert [m.pose[0] for m in found] == [0.0, 5.0]
     assert found[0].weight / found[1].weight == pytest.approx(np.e)
     assert sum(m.weight for m in found) == pytest.approx(1)
     assert unknown / (1 - unknown) == pytest.approx(np.exp(-2) / (1 + np.exp(-1)))
-    (best,), unknown = weigh(hypotheses, 5000.0, 1)
+    (best,), unknown = weigh(hypotheses[1:2], 5000.0)
     assert best.weight == unknown == 1
 
 
