@@ -323,7 +323,7 @@ class PreciseEstimator:
             odom,
             command,
             hypothesis.velocity,
-            hypothesis.slip_covariance,
+            hypothesis.pose_slip_cross_covariance,
         )
 
     def _predict_local_motion(self, period: float, odom: Array | None, command: Array | None) -> list[MotionCandidate]:
@@ -332,7 +332,7 @@ class PreciseEstimator:
             self.hypotheses[0],
             pose=self._local_pose,
             noise_covariance=np.zeros((3, 3)),
-            slip_covariance=np.zeros((3, 3)),
+            pose_slip_cross_covariance=np.zeros((3, 3)),
         )
         return self._predict_motion(last, period, odom, command)
 

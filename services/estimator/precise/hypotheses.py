@@ -60,7 +60,7 @@ class TrackedHypothesis:
     motion_complexity: float = 0.0  # nats, see `motion_model.motion_complexity`
     velocity: Array | None = None  # (3,) in base_link; None while unknown
     # (3, 3) covariance of the pose with the scale errors of odometry, as in `MotionCandidate`
-    slip_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    pose_slip_cross_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
     weight: float = 1.0
     displacement: Displacement | None = None  # of a swept scan; None if it stands, or was not corrected
     # number of consecutive scans at which neither the map nor the local map showed the motion along some direction
@@ -243,7 +243,7 @@ def update_hypothesis(
         log_evidence=hypothesis.log_evidence,
         surroundings=hypothesis.surroundings,
         velocity=velocity,
-        slip_covariance=inverse @ prior_information @ fused.candidate.slip_covariance,
+        pose_slip_cross_covariance=inverse @ prior_information @ fused.candidate.pose_slip_cross_covariance,
         unobserved_scans=hypothesis.unobserved_scans + 1 if unobserved else 0,
     )
 

@@ -282,8 +282,10 @@ def test_drift():
     def drifted(steps):
         pose, P, drift = TRUTH, np.zeros((3, 3)), None
         for step in steps:
-            moved = expected_motion(predict_motion(noise, pose, P, 0.1, odom=np.array(step), slip_covariance=drift))
-            pose, P, drift = moved.mean, moved.covariance, moved.slip_covariance
+            moved = expected_motion(
+                predict_motion(noise, pose, P, 0.1, odom=np.array(step), pose_slip_cross_covariance=drift)
+            )
+            pose, P, drift = moved.mean, moved.covariance, moved.pose_slip_cross_covariance
         return se2.rotation(-TRUTH[2]) @ P @ se2.rotation(-TRUTH[2]).T
 
     assert drifted([[0.2, 0, 0]] * 50) == pytest.approx(np.diag([1.0, 0, 0]), abs=1e-9)

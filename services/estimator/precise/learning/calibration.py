@@ -91,7 +91,7 @@ def calibrate(model: GenerativeModel, held_out: ReferenceDrive, motion: MotionNo
     """Calibrates on scans from which ``model`` has not learned; ``sigma`` m is the scanner's noise."""
     lasers = se2.compose(held_out.poses, held_out.mount)
     expected = model.expect(lasers, held_out.angles)
-    likelihood = learn_shares(held_out.ranges, expected, held_out.range_max, Likelihood(sigma))
+    likelihood = learn_outlier_fractions(held_out.ranges, expected, held_out.range_max, Likelihood(sigma))
     views = [
         View(model, likelihood, held_out.mount, held_out.angles, scan, held_out.range_max) for scan in held_out.ranges
     ]
@@ -169,7 +169,7 @@ def _coverage(
     return tuple((p, float((below <= p).mean())) for p in PROBABILITIES)
 
 
-def learn_shares(measured: Array, expected: Expected, range_max: float, start: Likelihood) -> Likelihood:
+def learn_outlier_fractions(measured: Array, expected: Expected, range_max: float, start: Likelihood) -> Likelihood:
     """Fits the shares of the density to scans (N, B) by expectation maximisation; sigma remains that of ``start``."""
     surface = (expected.ranges < range_max) & np.isfinite(expected.scale) & (measured > -np.inf)  # excludes NaN
     hit = surface & np.isfinite(measured)

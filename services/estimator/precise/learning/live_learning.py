@@ -13,11 +13,10 @@ from services.estimator.precise.field import FieldModel
 from services.estimator.precise.gauss_newton import Prior, View
 from services.estimator.precise.global_seeds import Seeds
 from services.estimator.precise.learning.drive_learning import (
-    errors_of_beams,
+    absolute_range_errors,
     free_places,
     hold_out,
     learn_model,
-    range_errors,
     remove_contradicted,
     replay_model,
 )
@@ -94,7 +93,7 @@ def learn_version(
     others, held_out = hold_out(aligned)
     trial = _learn(others, overlapping, recipe, EPOCHS)
     errors, present_errors = (
-        errors_of_beams(model, _match_key_scans(model, test_scans, test_scans.poses, sigma))[
+        absolute_range_errors(model, _match_key_scans(model, test_scans, test_scans.poses, sigma))[
             np.isfinite(test_scans.ranges)
         ]
         for model in (trial, present)
@@ -146,8 +145,8 @@ def mean_error(errors: Array) -> float:
 
 def _estimate_map_error(model: GenerativeModel, keys: ReferenceDrive, sigma: float) -> float:
     """Estimates the standard deviation in m of the model's own errors, without the scanner's noise ``sigma`` m."""
-    errors = range_errors(model, keys)
-    errors = errors[errors < MAX_ERROR_M]
+    errors = absolute_range_errors(model, keys)
+    errors = errors[errors < MAX_ERROR_M]  # not NaN either
     variance = robust_excess(errors, np.array(sigma**2)) if len(errors) else 0.0
     return float(np.sqrt(max(variance, PRECISE_M**2)))
 

@@ -12,7 +12,7 @@ from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.global_seeds import Seeds
 from services.estimator.precise.learning import calibration
-from services.estimator.precise.learning.calibration import learn_motion, learn_shares
+from services.estimator.precise.learning.calibration import learn_motion, learn_outlier_fractions
 from services.estimator.precise.learning.drive_learning import learn_drive
 from services.estimator.precise.learning.field_learning import Recipe, learn_field, seen_cells
 from services.estimator.precise.learning.surfaces import Beams
@@ -61,7 +61,7 @@ def test_outlier_shares():
     surface = rng.uniform(2, 8, (200, 121))
     expected = Expected(surface, np.full(surface.shape, 1e-3), np.zeros((*surface.shape, 3)))
     measured = disturbed(surface + SIGMA * rng.standard_normal(surface.shape), rng)
-    found = learn_shares(measured, expected, RANGE_MAX, Likelihood(SIGMA))
+    found = learn_outlier_fractions(measured, expected, RANGE_MAX, Likelihood(SIGMA))
     assert found.short == pytest.approx(SHORT / (1 - NONE), abs=0.005)
     assert found.random == pytest.approx(LONG / (1 - NONE), abs=0.004)
     assert found.unseen == pytest.approx(NONE, abs=0.002)
