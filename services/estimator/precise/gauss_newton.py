@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from services.estimator.shared.generative_models import Expected, GenerativeModel
 
 MAX_STEP = np.array([0.5, 0.5, 0.3])  # m, m, rad: beyond this distance the linearisation is not valid
-SETTLED_STEP = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: after a smaller step, a descent ends
+SETTLED_STEP = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: a descent ends if its next step is smaller
 # Added in quadrature to every beam's standard deviation during a descent, so that the minimum is wide at first.
 COARSE_SIGMA_M, MEDIUM_SIGMA_M = 0.3, 0.1
 TRACKING_SCHEDULE_M = (0.05, 0.0, 0.0, 0.0, 0.0)  # at each step of a descent that starts near the minimum
@@ -109,7 +109,7 @@ class View:
     map_cell: float = 0.0  # m, edge of the cells if the map is a grid
     map_offset: float = 0.0  # m, mean distance of the real surfaces behind those that the model predicts
     log_map_error_prior: float = 0.0  # nats, log probability that the map's error is this large
-    # (B,) s after the middle of the sweep; (1,) if all beams were measured at once, or are not corrected
+    # (B,) s after the middle of the sweep, 0 if all beams were measured at once; (1,) if they are not corrected
     times: Array = field(default_factory=lambda: np.zeros(1))
     _last: deque[_PredictedScans] = field(default_factory=lambda: deque(maxlen=2), init=False, repr=False)
 

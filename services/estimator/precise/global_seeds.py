@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 SEED_SPACING_M = 0.3  # between the places at which a search begins
 RANKED_HEADINGS = 120  # at each place, 3 degrees apart
-# Of the laser (9, 2) m, in its own frame, by a third of the spacing; the first is zero. A scan changes much over half
-# of the spacing, and comparing it as if the laser were displaced takes less memory than more panoramas.
+# Displacements (9, 2) m of the laser, in its frame, with which each panorama is compared: a third of the spacing; the
+# first is zero. A scan changes much over half of the spacing, and displacements take less memory than more panoramas.
 DISPLACEMENTS_M = 0.1 * np.stack(np.meshgrid([0, 1, -1], [0, 1, -1]), axis=-1).reshape(-1, 2)
 # A large map is ranked in stages, so that most places are compared with few beams only:
 PRESELECTION_BEAMS = 24  # or more, in the first two stages

@@ -30,7 +30,8 @@ KEY_DISTANCE_M, KEY_TURN_RAD = 0.25, 0.35  # a key scan is taken after a motion 
 SEEN_RADIUS_M, SEEN_ACROSS_M = 0.15, 0.05
 MAX_SQUARED_MAHALANOBIS = 4.0  # of the result of a match from the prior
 CHANGE_MEMORY_S = 30.0  # time constant with which changes of the surroundings are forgotten (a guess)
-PRIOR_MOVED, PRIOR_STAYED = 1.0, 4.0  # surfaces that the map lacks, as if seen before the first scan (a guess)
+PRIOR_MOVED, PRIOR_STAYED = 1.0, 4.0  # pseudo-counts of surfaces that the map lacks (a guess)
+COUNT_PERIOD_S = 1.0  # between two scans, in which a surface that moved or stayed counts once
 # A beam that ends farther than this behind a surface has passed through it. Three standard deviations of the noise are
 # added in quadrature.
 PASSED_M = 0.1
@@ -101,11 +102,12 @@ class ChangeRate:
 class MovedFraction:
     """Fraction of moving surfaces, such as people, among those that are not in the map; learned while driving.
 
-    It has a beta distribution, and returns to the prior with time. A surface is seen again and again, so it counts in
-    proportion to the time between two scans, but not more than once.
+    It has a beta distribution, whose parameters are counts of surfaces that return to the pseudo-counts of the prior
+    with time. A surface is seen again and again, so it counts in proportion to the time between two scans: once in
+    `COUNT_PERIOD_S`, and never more.
     """
 
-    moved: float = PRIOR_MOVED  # surfaces, forgotten exponentially
+    moved: float = PRIOR_MOVED
     stayed: float = PRIOR_STAYED
 
     @property
@@ -116,7 +118,7 @@ class MovedFraction:
     def learn(self, moved: int, stayed: int, period: float) -> None:
         """Learns from the surfaces of a scan, ``period`` s after the last one, and forgets earlier ones."""
         kept = math.exp(-period / CHANGE_MEMORY_S)
-        weight = min(1.0, period)
+        weight = min(1.0, period / COUNT_PERIOD_S)
         self.moved = kept * self.moved + (1 - kept) * PRIOR_MOVED + moved * weight
         self.stayed = kept * self.stayed + (1 - kept) * PRIOR_STAYED + stayed * weight
 

@@ -34,8 +34,9 @@ MIN_CHANGED_FRACTION, MAX_CHANGED_FRACTION = 0.02, 0.5  # guesses
 # walls, from which noise could be measured.
 MAX_NOISE_FACTOR = 4.0
 # The covariance of the errors on one segment of a surface is taken for the variance of the map's errors, so a segment
-# must be short enough that these are nearly equal along it. `CORRELATION_LENGTH_M` is longer: it says how far along a
-# surface errors still add up instead of averaging out.
+# must be short enough that these are nearly equal along it. Its length is measured across the beams: the sum of their
+# ranges times their spacing, so a segment of a surface that they graze is longer. `CORRELATION_LENGTH_M` is longer: it
+# says how far along a surface errors still add up instead of averaging out.
 SEGMENT_LENGTH_M = 0.5
 # Larger errors, with three standard deviations of the noise added in quadrature, are not the map's, but changes of the
 # surroundings.
@@ -148,7 +149,7 @@ class Precision:
         robust = robust_covariance(errors, segments) - float(np.median(model_variance))
         if robust > view.map_error**2:  # with too small an assumed error, all surfaces would look changed
             view = replace(view, map_error=float(np.sqrt(robust)))
-        # Weighted by length of surface instead of by beam, because near surfaces have more beams.
+        # Weighted by the length that each covers across the beams, because near surfaces have more beams.
         lengths = view.surface_evidence(pose[None]).weights[0, used] * spacing
         if sum_over_pairs(segments, lengths) <= 0:
             return
@@ -166,8 +167,8 @@ class Precision:
         weight = _update_weight(self.scans)
         self.model_variance += weight * (float(np.average(model_variance, weights=lengths)) - self.model_variance)
         if self.cell:
-            # Both in m³: a variance times the length of surface over which errors are alike, which for independent ones
-            # is the length that one beam covers. The former is as measured, without the prior, by which the offset of a
+            # Both in m³: a variance times the length over which errors are alike, which for independent ones is the
+            # length that one beam covers. The former is as measured, without the prior, by which the offset of a
             # grid drawn exactly along its cells would remain uncertain for long.
             correlated_part = (
                 max(0.0, self.covariance_sum) / max(self.expected_sum, MIN_EXPECTED_SUM) * CORRELATION_LENGTH_M

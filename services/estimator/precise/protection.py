@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from services.estimator.precise.likelihood import Evidence
 
 EXCEEDANCE_PROBABILITY = 1e-4  # that the error exceeds the protection level, by design
-MISTAKEN_FRACTION = 0.01  # of a scan's surfaces, taken for a surface of the map but another one (a guess)
+MISTAKEN_FRACTION = 0.01  # of a scan's surfaces, matched to a wrong surface of the map (a guess)
 BISECTIONS = 20  # of an interval of some metres, to micrometres
 
 

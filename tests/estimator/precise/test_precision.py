@@ -64,7 +64,8 @@ def test_noise_is_no_error_of_the_map(noise, seed):
 
 @pytest.mark.parametrize("value", [np.inf, -np.inf])
 def test_scans_without_returns_show_no_noise(value):
-    precision, exact = Precision(), Likelihood(sigma=0.01)  # a tenth of it is less than the least noise that is learned
+    # So that the estimate from no range at all, MIN_SIGMA_M, would be near enough to be learned
+    precision, exact = Precision(), Likelihood(sigma=0.01)
     assert precision.update_noise(exact, np.full(622, value), ANGLES) == exact
     assert not precision.noise_scans
 

@@ -30,7 +30,8 @@ EM_STEPS = 30  # of expectation maximisation
 PRIOR_BEAMS = 10.0  # pseudo-count of each kind of beam
 CHI2_MEDIAN = 2.366  # median of chi squared with three degrees of freedom
 MAX_POSITION_ERROR_M = 0.3  # larger errors mean that another place was found; the covariance does not describe them
-MIN_EXPLAINED_RATIO = 0.77  # minimum share of explained beams, relative to the usual one: the default if 97 % are usual
+# Minimum fraction of explained beams, relative to the usual one; if 97 % are usual, this is the default.
+MIN_EXPLAINED_RATIO = 0.77
 # Probabilities at which the calibration curve is evaluated.
 PROBABILITIES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 
@@ -44,17 +45,19 @@ class Calibration:
     likelihood: Likelihood
     motion: MotionNoise
     scans: int  # held out
-    usual: float  # share of a scan's beams that end at surfaces of the map: median over the scans
+    usual: float  # fraction of a scan's beams that end at surfaces of the map: median over the scans
     inflation: float  # factor on the covariance
     floor_position: float  # m, remaining deviation in x and in y: error of the reference poses and of the map
     floor_heading: float  # rad
     log_likelihood: float  # nats per beam
     nees_median: float  # of poses found from one scan, with the covariance as published; ideal: 2.37
     nees_mean: float  # ideal: 3
-    coverage: tuple[tuple[float, float], ...]  # pairs of a range's cumulative probability and the share of beams below
+    coverage: tuple[
+        tuple[float, float], ...
+    ]  # pairs of a range's cumulative probability and the fraction of beams below
 
     def settings(self) -> PreciseSettings:
-        """Parameters of the estimator; the threshold of explained beams is relative to the usual share here."""
+        """Parameters of the estimator; the threshold of explained beams is relative to the usual fraction."""
         return PreciseSettings(
             min_explained_fraction=MIN_EXPLAINED_RATIO * self.usual,
             inflation=self.inflation,
@@ -163,14 +166,14 @@ def _pose_precision(
 def _coverage(
     likelihood: Likelihood, measured: Array, expected: Expected, range_max: float
 ) -> tuple[tuple[float, float], ...]:
-    """Share of ranges below each quantile of the density, where a surface is expected; ideally the quantile itself."""
+    """Fraction of ranges below each quantile of the density, where a surface is expected; ideally the probability."""
     use = np.isfinite(measured) & np.isfinite(expected.scale) & (expected.ranges < range_max)
     below = likelihood.cumulative(measured[use], expected.ranges[use], expected.scale[use], range_max)
     return tuple((p, float((below <= p).mean())) for p in PROBABILITIES)
 
 
 def learn_outlier_fractions(measured: Array, expected: Expected, range_max: float, start: Likelihood) -> Likelihood:
-    """Fits the shares of the density to scans (N, B) by expectation maximisation; sigma remains that of ``start``."""
+    """Fits the fractions of the density to scans (N, B) by expectation maximisation; sigma stays that of ``start``."""
     surface = (expected.ranges < range_max) & np.isfinite(expected.scale) & (measured > -np.inf)  # excludes NaN
     hit = surface & np.isfinite(measured)
     o, g, m = measured[hit], np.maximum(expected.ranges[hit], 1e-3), expected.scale[hit]

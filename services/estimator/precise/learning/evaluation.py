@@ -42,7 +42,7 @@ def evaluate_model(
 ) -> ModelErrors:
     """Compares the model with noiseless scans ``ranges`` (N, B) m at base_link poses (N, 3).
 
-    ``sigma`` m is the scanner's noise, and ``relative`` the part of it that grows with the range, as a share of that.
+    ``sigma`` m is the scanner's noise, and ``relative`` the part that grows with the range, as a fraction of the range.
     """
     likelihood = Likelihood(sigma, relative=relative)
     expected = model.expect(se2.compose(poses, mount), angles)

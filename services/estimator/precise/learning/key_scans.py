@@ -29,8 +29,8 @@ PLACE_M, HEADINGS = 0.5, 4  # one key scan is kept for each square of this size 
 MAX_KEY_SCANS = 4000  # with 622 beams, 10 MB; if there are more, the squares become twice as large
 MAX_PROTECTION = np.array([0.2, 0.2, np.deg2rad(5)])  # m, m, rad: protection level of a trusted pose
 VERIFIED_AFTER_M = 5.0  # of driving: about a room
-# A version is learned from at least this many key scans, of which this many and this share are new.
-MIN_KEY_SCANS, MIN_NEW, MIN_NEW_SHARE = 50, 20, 0.1
+# A version is learned from at least this many key scans, of which this many and this fraction are new.
+MIN_KEY_SCANS, MIN_NEW, MIN_NEW_FRACTION = 50, 20, 0.1
 MAX_GAP_S = 1.0  # longest time without `tracking` after which the robot is still assumed to be where it was tracked
 # A pose jumps if it moves by more than this between two scans, beyond this multiple of the robot's full speed.
 JUMP_M, JUMP_RAD = 0.2, 0.2
@@ -127,7 +127,7 @@ class KeyScanCollector:
         """Returns the verified key scans in order of time if enough of them are new since the last time, else None."""
         keys = self._in_order()
         new = sum(key.stamp > self._taken_until for key in keys)
-        if len(keys) < MIN_KEY_SCANS or new < max(MIN_NEW, MIN_NEW_SHARE * len(keys)):
+        if len(keys) < MIN_KEY_SCANS or new < max(MIN_NEW, MIN_NEW_FRACTION * len(keys)):
             return None
         self._taken_until = keys[-1].stamp
         return ReferenceDrive(
