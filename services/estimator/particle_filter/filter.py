@@ -93,10 +93,11 @@ class ParticleFilter:
 
     def update(self, observation: Observation) -> Posterior:
         """Returns the posterior after one more scan."""
-        period, odom = self._period(observation), self._odometry_since_last_scan(observation)
+        last_stamp, last_odom = (None, None) if self._last is None else (self._last.stamp, self._last.odom)
+        period, odom = observation.period_since(last_stamp, NOMINAL_PERIOD_S), observation.odometry_since(last_odom)
         self._predict(observation, min(period, MAX_PERIOD_S), odom)
         self._anneal()
-        if self._last is not None and observation.is_earlier_than(self._last.stamp):
+        if observation.is_earlier_than(last_stamp):
             self._velocity = self._tracked = None
         elif self._velocity is None and odom is not None:
             self._velocity = odom / period
@@ -117,18 +118,6 @@ class ParticleFilter:
             self._resample()
         self._last = observation
         return posterior
-
-    def _period(self, now: Observation) -> float:
-        """Time in s since the last scan."""
-        last = self._last
-        if last is None or now.stamp is None or last.stamp is None or now.stamp <= last.stamp:
-            return NOMINAL_PERIOD_S
-        return now.stamp - last.stamp
-
-    def _odometry_since_last_scan(self, now: Observation) -> Array | None:
-        if self._last is None or now.odom is None or self._last.odom is None:
-            return None
-        return se2.between(self._last.odom, now.odom)
 
     def _update_velocity(self, posterior: Posterior, period: float) -> None:
         """Averages the velocity over the last poses, while they are tracked."""

@@ -199,7 +199,7 @@ class PreciseEstimator:
             self._scan = view, observation
             return None
         # Motion prior
-        period, odom = self._period(observation.stamp), self._odometry_since_last_scan(observation)
+        period, odom = self._period(observation), observation.odometry_since(self._odom)
         motions = [self._predict_motion(each, period, odom, observation.command) for each in self.hypotheses]
         # Optimisation
         match = self._match_map(view, motions, period, with_odometry=odom is not None)
@@ -296,20 +296,14 @@ class PreciseEstimator:
         """Velocity (3,) in base_link from the last poses or else from odometry, or None if it is unknown."""
         if observation.is_earlier_than(self._stamp):
             return None
-        odom = self._odometry_since_last_scan(observation)
+        odom = observation.odometry_since(self._odom)
         if hypothesis.velocity is not None or odom is None:
             return hypothesis.velocity
-        return odom / self._period(observation.stamp)
+        return odom / self._period(observation)
 
-    def _odometry_since_last_scan(self, observation: Observation) -> Array | None:
-        if observation.odom is None or self._odom is None:
-            return None
-        return se2.between(self._odom, observation.odom)
-
-    def _period(self, stamp: float | None) -> float:
-        if stamp is None or self._stamp is None or stamp <= self._stamp:
-            return self.settings.motion.period
-        return stamp - self._stamp
+    def _period(self, observation: Observation) -> float:
+        """Time in s since the last scan."""
+        return observation.period_since(self._stamp, self.settings.motion.period)
 
     def _predict_motion(
         self, hypothesis: TrackedHypothesis, period: float, odom: Array | None, command: Array | None
@@ -419,7 +413,7 @@ class PreciseEstimator:
         An improbable motion, given those that were ``predicted``, is evidence for a kidnapping. Where the duration of
         the motion is unknown, this evidence is left out.
         """
-        hypothesis, period = self.hypotheses[k], self._period(observation.stamp)
+        hypothesis, period = self.hypotheses[k], self._period(observation)
         candidates, pose = match.motions[k], match.poses[k]
         explained, unobserved = float(match.explained[k]), match.unobserved[k]
         # Where the map explains few beams, all of them may do so by chance, which is no information about the pose.
@@ -427,7 +421,7 @@ class PreciseEstimator:
         evidence = project_evidence(match.evidence.at(k), unobserved).scaled(not_by_chance)
         # A match with the local map gives the motion in the unobserved directions, too.
         unknown_motion = len(unobserved) > 0 and match.local_pose is None
-        if unknown_motion and self._odometry_since_last_scan(observation) is None:
+        if unknown_motion and observation.odometry_since(self._odom) is None:
             candidates = [
                 widen_unobserved(self.settings.motion, each, unobserved, hypothesis.unobserved_scans, period)
                 for each in candidates
@@ -816,7 +810,7 @@ class PreciseEstimator:
     def _finish_scan(self, view: View, observation: Observation) -> Posterior:
         """Stores what the next scan needs, and returns the posterior."""
         self.hypotheses = clip_to_map(self.hypotheses, self.bounds)
-        period = self._period(observation.stamp)
+        period = self._period(observation)
         poses = [
             pose_at_stamp(each.pose, self._velocity(each, observation), period, observation)
             if each.displacement is None

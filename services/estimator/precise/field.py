@@ -18,6 +18,7 @@ from scipy import ndimage
 
 from services.estimator.precise.field_tracing import mark_crossed, trace, trace_behind
 from services.estimator.shared.generative_models import Expected
+from services.estimator.shared.grid_values import values_at
 from services.estimator.shared.seen_cells import SEEN_CELL_M
 
 if TYPE_CHECKING:
@@ -67,10 +68,11 @@ class DistanceField:
     def value_at(self, places: Array) -> Array:
         """Phi (N,) in m at the node nearest to each place (N, 2) m in map; NaN beyond the grid."""
         column, row = np.round((places - self.origin) / self.resolution).astype(int).T
-        inside = (column >= 0) & (row >= 0) & (column < self.phi.shape[1]) & (row < self.phi.shape[0])
-        phi = np.full(len(places), np.nan)
-        phi[inside] = self.phi[row[inside], column[inside]]
-        return phi
+        return values_at(self.phi, row, column, np.nan)
+
+    def as_stored(self) -> DistanceField:
+        """The field rounded to half precision, as it is stored, so that it can be evaluated with the same precision."""
+        return dataclasses.replace(self, phi=self.phi.astype(np.float16).astype(np.float32))
 
     def with_solids(self, places: Array) -> DistanceField:
         """The field, negative wherever no beam from ``places`` (S, 2) m passes.

@@ -10,6 +10,7 @@ import numba
 import numpy as np
 
 from common.geometry.occupancy_grid import UNKNOWN
+from services.estimator.shared.grid_values import values_at
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -49,10 +50,7 @@ class SeenCells:
     def contains(self, points: Array) -> npt.NDArray[np.bool_]:
         """Mask (N,) of the points (N, 2) m in map that lie in seen cells."""
         j, i = np.floor((points - self.origin) / SEEN_CELL_M).astype(int).T
-        inside = (i >= 0) & (j >= 0) & (i < self.cells.shape[0]) & (j < self.cells.shape[1])
-        found = np.zeros(len(points), np.bool_)
-        found[inside] = self.cells[i[inside], j[inside]]
-        return found
+        return values_at(self.cells, i, j, beyond=False)
 
     def limit(self, lasers: Array, angles: Array, ranges: Array, jacobian: Array, scale: Array) -> None:
         """Ends beams (N, B) in place, with an infinite scale, once they have passed `SEEN_CELL_M` of unseen cells.

@@ -113,9 +113,7 @@ def _learn_model(
 def learn_model(beams: Beams, recipe: Recipe, report: Callable[[float], None] = lambda _done: None) -> FieldModel:
     """Learns a model that predicts the beams; its scales, the deviations of its errors, are left at their defaults."""
     field = learn_field(beams, recipe, lambda _, done: report(done))
-    # Rounded to half precision, as the field will be stored and read.
-    field = replace(field, phi=field.phi.astype(np.float16).astype(np.float32))
-    return FieldModel(field, seen=seen_cells(beams))
+    return FieldModel(field.as_stored(), seen=seen_cells(beams))
 
 
 def free_places(model: FieldModel, places: Array) -> Array:

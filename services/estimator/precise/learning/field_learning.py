@@ -79,9 +79,9 @@ def learn_field(
 
 def seen_cells(beams: Beams) -> SeenCells:
     """The cells in which the beams passed or ended."""
-    ends = beams.ends()
-    low = np.minimum(ends.min(0), beams.starts.min(0)) - SEEN_CELL_M
-    shape = np.ceil((np.maximum(ends.max(0), beams.starts.max(0)) - low) / SEEN_CELL_M).astype(int)[::-1] + 1
+    low, high = beams.bounds()
+    low = low - SEEN_CELL_M
+    shape = np.ceil((high - low) / SEEN_CELL_M).astype(int)[::-1] + 1
     cells = np.zeros(shape, np.bool_)
     mark_seen_cells(beams.starts - low, beams.unit(), beams.ranges, SEEN_CELL_M, cells)
     return SeenCells(cells, (float(low[0]), float(low[1])))
