@@ -16,8 +16,8 @@ from services.estimator.precise.motion_model import smooth_velocity
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
-    from services.estimator.precise.gauss_newton import View
     from services.estimator.precise.motion_model import FusedMotion
+    from services.estimator.precise.scan_likelihood import ScanLikelihood
     from services.estimator.precise.swept_scan import Displacement
 
 NEAR_POSITION_M, NEAR_HEADING_RAD = 0.2, math.radians(5)  # a pose with a larger error is wrong
@@ -130,7 +130,7 @@ class UnknownPlace:
         self.log_evidence = self.log_off_map
 
 
-def unobserved_directions(view: View, poses: Array, curvatures: Array) -> list[Array]:
+def unobserved_directions(scan: ScanLikelihood, poses: Array, curvatures: Array) -> list[Array]:
     """The unit vectors (K, 3) of x, y, yaw that a scan does not observe at each of the ``poses`` (N, 3).
 
     ``curvatures`` (N, 3, 3) are those of its accuracy. There are usually none, and one along a corridor: that in which
@@ -141,21 +141,21 @@ def unobserved_directions(view: View, poses: Array, curvatures: Array) -> list[A
     axes = np.array([np.linalg.eigh(position_information(curvature))[1].T for curvature in curvatures])
     weakest, strongest = axes[:, 0], axes[:, 1]
     unobserved = [np.zeros((0, 3))] * len(poses)
-    rows = np.flatnonzero(~_are_observed(view, poses, curvatures, weakest))
+    rows = np.flatnonzero(~_are_observed(scan, poses, curvatures, weakest))
     if len(rows):
-        across = _are_observed(view, poses[rows], curvatures[rows], strongest[rows])
+        across = _are_observed(scan, poses[rows], curvatures[rows], strongest[rows])
         for k, observed in zip(rows, across, strict=True):
             unobserved[k] = np.array([[*weakest[k], 0.0]]) if observed else np.eye(3)
     return unobserved
 
 
-def _are_observed(view: View, poses: Array, curvatures: Array, directions: Array) -> npt.NDArray[np.bool_]:
+def _are_observed(scan: ScanLikelihood, poses: Array, curvatures: Array, directions: Array) -> npt.NDArray[np.bool_]:
     """Mask (N,) of the poses whose position along ``directions`` (N, 2) a scan shows, with the best heading there."""
     turns = -np.einsum("ni,ni->n", curvatures[:, 2, :2], directions) / np.maximum(curvatures[:, 2, 2], 1e-12)
-    distance = PROBE_DISTANCE_M + PROBE_MAP_DEVIATIONS * view.map_error
+    distance = PROBE_DISTANCE_M + PROBE_MAP_DEVIATIONS * scan.map_error
     steps = distance * np.column_stack([directions, turns])
-    here = view.surface_evidence(poses).log_likelihood
-    away = view.surface_evidence(np.concatenate([poses + steps, poses - steps])).log_likelihood
+    here = scan.surface_evidence(poses).log_likelihood
+    away = scan.surface_evidence(np.concatenate([poses + steps, poses - steps])).log_likelihood
     return np.asarray(here - away.reshape(2, -1).max(axis=0) > MIN_LOG_LIKELIHOOD_DROP)
 
 

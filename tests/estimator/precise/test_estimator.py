@@ -382,7 +382,7 @@ def test_alternatives_along_a_corridor():
     feed(made, scene, here, 1)
     before = replace(made.hypotheses[0], noise_covariance=np.diag([4.0, 1e-6, 1e-6]))
     made.hypotheses = [before]
-    view = made._view(scene.observe(scene.clean((here + turn)[None])[0], 1 / 15))
+    view = made._scan_likelihood(scene.observe(scene.clean((here + turn)[None])[0], 1 / 15))
     motions = made._predict_motion(before, 1 / 15, None, None)  # standing still is expected
     match = made._match_map(view, [motions], 1 / 15, with_odometry=False)
     evidence = deepcopy(match.evidence)

@@ -15,10 +15,11 @@ from pydantic import ConfigDict
 
 from common.errors import UserError
 from common.geometry import se2
-from services.estimator.precise.gauss_newton import View, polish
+from services.estimator.precise.gauss_newton import polish
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.motion_model import MotionNoise
 from services.estimator.precise.noise import robust_excess
+from services.estimator.precise.scan_likelihood import ScanLikelihood
 from services.estimator.precise.settings import PreciseSettings
 
 if TYPE_CHECKING:
@@ -95,12 +96,15 @@ def calibrate(model: GenerativeModel, held_out: ReferenceDrive, motion: MotionNo
     lasers = se2.compose(held_out.poses, held_out.mount)
     expected = model.expect(lasers, held_out.angles)
     likelihood = learn_outlier_fractions(held_out.ranges, expected, held_out.range_max, Likelihood(sigma))
-    views = [
-        View(model, likelihood, held_out.mount, held_out.angles, scan, held_out.range_max) for scan in held_out.ranges
+    likelihoods = [
+        ScanLikelihood(model, likelihood, held_out.mount, held_out.angles, ranges, held_out.range_max)
+        for ranges in held_out.ranges
     ]
-    fitted = [polish(view, pose[None]) for view, pose in zip(views, held_out.poses, strict=True)]
-    explained = [float(view.surface_evidence(pose).explained[0]) for view, (pose, _) in zip(views, fitted, strict=True)]
-    energy = sum(view.evidence(pose[None]).accuracy[0] for view, pose in zip(views, held_out.poses, strict=True))
+    fitted = [polish(scan, pose[None]) for scan, pose in zip(likelihoods, held_out.poses, strict=True)]
+    explained = [
+        float(scan.surface_evidence(pose).explained[0]) for scan, (pose, _) in zip(likelihoods, fitted, strict=True)
+    ]
+    energy = sum(scan.evidence(pose[None]).accuracy[0] for scan, pose in zip(likelihoods, held_out.poses, strict=True))
     floor, inflation, nees = _pose_precision(fitted, held_out.poses)
     return Calibration(
         likelihood=likelihood,

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from common.geometry import se2
 from services.estimator.precise.field import FieldModel
-from services.estimator.precise.gauss_newton import Prior, View
+from services.estimator.precise.gauss_newton import Prior
 from services.estimator.precise.global_seeds import Seeds
 from services.estimator.precise.learning.drive_learning import (
     absolute_range_errors,
@@ -31,6 +31,7 @@ from services.estimator.precise.learning.map_alignment import align_to_map, with
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.noise import estimate_noise, robust_excess
+from services.estimator.precise.scan_likelihood import ScanLikelihood
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -176,6 +177,6 @@ def _match_key_scans(model: GenerativeModel, keys: ReferenceDrive, priors: Array
     information, likelihood = np.diag(ALIGNMENT_DEVIATION**-2.0)[None], Likelihood(sigma)
     poses = []
     for pose, prior, ranges in zip(keys.poses, priors, keys.ranges, strict=True):
-        view = View(model, likelihood, keys.mount, keys.angles, ranges.astype(float), keys.range_max)
-        poses.append(view.descend(pose[None], Prior(prior[None], information), ALIGNMENT_SCHEDULE_M)[0][0])
+        scan = ScanLikelihood(model, likelihood, keys.mount, keys.angles, ranges.astype(float), keys.range_max)
+        poses.append(scan.descend(pose[None], Prior(prior[None], information), ALIGNMENT_SCHEDULE_M)[0][0])
     return replace(keys, poses=np.array(poses).reshape(-1, 3))
