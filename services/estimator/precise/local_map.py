@@ -31,7 +31,7 @@ SEEN_RADIUS_M, SEEN_ACROSS_M = 0.15, 0.05
 MAX_SQUARED_MAHALANOBIS = 4.0  # of the result of a match from the prior
 CHANGE_MEMORY_S = 30.0  # time constant with which changes of the surroundings are forgotten (a guess)
 PRIOR_MOVED, PRIOR_STAYED = 1.0, 4.0  # pseudo-counts of surfaces that the map lacks (a guess)
-COUNT_PERIOD_S = 1.0  # between two scans, in which a surface that moved or stayed counts once
+COUNT_PERIOD_S = 1.0  # a surface that moved or stayed counts once in this time between two scans, else in proportion
 # A beam that ends farther than this behind a surface has passed through it. Three standard deviations of the noise are
 # added in quadrature.
 PASSED_M = 0.1
@@ -103,8 +103,8 @@ class MovedFraction:
     """Fraction of moving surfaces, such as people, among those that are not in the map; learned while driving.
 
     It has a beta distribution, whose parameters are counts of surfaces that return to the pseudo-counts of the prior
-    with time. A surface is seen again and again, so it counts in proportion to the time between two scans: once in
-    `COUNT_PERIOD_S`, and never more.
+    with time. A surface is seen again and again, so it counts in proportion to the time between two scans: once if
+    that is `COUNT_PERIOD_S` or more.
     """
 
     moved: float = PRIOR_MOVED

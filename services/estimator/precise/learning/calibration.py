@@ -53,9 +53,8 @@ class Calibration:
     log_likelihood: float  # nats per beam
     nees_median: float  # of poses found from one scan, with the covariance as published; ideal: 2.37
     nees_mean: float  # ideal: 3
-    coverage: tuple[
-        tuple[float, float], ...
-    ]  # pairs of a range's cumulative probability and the fraction of beams below
+    # pairs of a range's cumulative probability and the fraction of beams below
+    coverage: tuple[tuple[float, float], ...]
 
     def settings(self) -> PreciseSettings:
         """Parameters of the estimator; the threshold of explained beams is relative to the usual fraction."""
