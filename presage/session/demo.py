@@ -118,8 +118,11 @@ def _choose_goal(demo: DemoOptions, world: World) -> tuple[float, float]:
         aligned = free[np.abs(free[:, 1] - start[1]) < 0.1 * (y1 - y0)]  # preset paper drives in a straight line
         farthest = aligned[np.argmax(np.abs(aligned[:, 0] - start[0]))] if len(aligned) else free[0]
         return (15.5, float(start[1])) if world.name == "corridor" else (float(farthest[0]), float(farthest[1]))
-    if (error := world.placement_error(np.array(demo.goal), robot.radius)) is not None:
-        raise UserError(f"goal {error} (--goal)")
+    if not world.has_room(np.array(demo.goal), robot.radius):
+        # Imported here because it is slow to import.
+        from services.controller.policies.planner import GeodesicPolicy
+
+        raise UserError(f"goal {GeodesicPolicy(robot, world).refusal(np.array(demo.goal))} (--goal)")
     return demo.goal
 
 
