@@ -65,12 +65,15 @@ def test_states():
 
 def test_services_of_a_known_session(board):
     """Its own commands start the missing ones; those that it was started without are no rows."""
-    commands = {"estimator": "python -m services.estimator --world=office", "recorder": "python -m services.recorder"}
+    world = "/a/folder/with/a/long/name/that/fits/into/no/column/of/the/table/office.yaml"
+    command = f"python -m services.estimator --world={world}"
+    commands = {"estimator": command, "recorder": "python -m services.recorder"}
     with session_file(DEFAULT_ENDPOINT, ["robot"], None, commands):
         names = [row.service.name for row in board.rows(0.0)]
-        note = row(board, "estimator").note
+        note, shown = row(board, "estimator").note, text(board)
     assert names == ["simulator", "estimator", "controller", "recorder"]
-    assert note == "start it: python -m services.estimator --world=office"
+    assert note == f"start it: {command}"
+    assert world in "".join(shown.replace("│", " ").split())
 
 
 def test_rates_and_counts(board):
