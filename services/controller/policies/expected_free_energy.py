@@ -48,15 +48,17 @@ class ExpectedFreeEnergy:
         """G (N,) in nats."""
         return self.risk + self.ambiguity - self.pose_information - self.place_information
 
-    def of(self, motion: int) -> dict[str, float]:
-        """The terms of one motion by name, and its probability among all N."""
+    def of(self, motion: int, compared: Array) -> dict[str, float]:
+        """The terms of one motion by name, and its `motion_probability` among those with energies ``compared``."""
         terms = {name: float(values[motion]) for name, values in vars(self).items()}
-        return terms | {"probability": motion_probability(float(self.total[motion]), self.total)}
+        return terms | {"probability": motion_probability(float(self.total[motion]), compared)}
 
 
 def motion_probability(energy: float, compared: Array) -> float:
     """Probability of a motion with this ``energy`` among N with energies ``compared`` (N,), nats, +inf if excluded."""
-    return float(1 / np.exp(-PROBABILITY_PRECISION * (compared - energy)).sum())
+    least = compared.min()
+    weights = np.exp(-PROBABILITY_PRECISION * (compared - least))
+    return float(np.exp(-PROBABILITY_PRECISION * (energy - least)) / weights.sum())
 
 
 def expected_distance(distance: Array, variance: float) -> Array:

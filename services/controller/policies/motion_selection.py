@@ -175,10 +175,8 @@ def select_motion(
     chosen = sampled if sampled.least <= refined.least else refined
     hindered = float(sampled.energy.total.min()) < chosen.least - HINDERED_M * NATS_PER_METRE
     best = chosen.best
-    terms = chosen.energy.of(best)
+    terms = chosen.energy.of(best, np.concatenate([sampled.allowed_energy, refined.allowed_energy]))
     terms["risk"] += 2 * NATS_PER_METRE * cost_beyond  # in the mean distance during the motion and in that at its end
-    compared = np.concatenate([sampled.allowed_energy, refined.allowed_energy])
-    terms["probability"] = float(efe.motion_probability(chosen.least, compared))
     return SelectedMotion(chosen.motions[best, :3], chosen.poses[best], terms, hindered=hindered)
 
 

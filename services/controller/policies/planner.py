@@ -21,6 +21,7 @@ from services.controller.policies.free_space import NO_MAP, FreeSpace
 from services.controller.policies.geodesic_field import OBSTACLE_GAP_M, WALL_COST_RANGE_M, CostField, FreeSpaceGraph
 from services.controller.policies.motion_model import (
     STANDING_SPEED,
+    braking_speed,
     is_moving,
     period_of,
     stopping_distance,
@@ -61,7 +62,8 @@ class GeodesicPolicy:
         """
         # In a growing map this is off, because the information of a scan cannot be computed where the map is unknown.
         self.epistemic = epistemic and world is not None
-        self.robot, self.world, self.keep_heading = robot, world, keep_heading
+        self._robot, self.world, self.keep_heading = robot, world, keep_heading
+        self.robot = robot  # its maximum speed is less if the scanner's range is too short for it
         self.free = NO_MAP if world is None else FreeSpace.of(world)
         self.graph = FreeSpaceGraph(self.free, robot.radius)
         self.obstacles = TemporaryObstacles(self.free)
@@ -159,6 +161,7 @@ class GeodesicPolicy:
         if scan is not None:
             self._field_of_view = Sweep.of(scan).sector(scan.mount.yaw)
             self._scan = scan
+            self.robot = self._robot.model_copy(update={"max_speed": self._max_speed(scan)})
         if belief.state != "tracking":
             return  # the pose is not reliable; obstacles found so far are kept
         self.localiser.reset()
@@ -167,6 +170,11 @@ class GeodesicPolicy:
             self.obstacles.update(scan, pose)
         if (cell := self.graph.nearest_free(pose[:2], self.graph.min_clearance, map_only=True)) is not None:
             self._component = int(self.graph.component[cell])
+
+    def _max_speed(self, scan: Scan) -> float:
+        """Speed in m/s from which the robot can stop within the range in which the scanner shows obstacles."""
+        sight = min(scan.range_max, MAX_RANGE_M) - self._robot.radius - OBSTACLE_GAP_M
+        return braking_speed(sight, self._robot)
 
     def decide(self, belief: Belief, velocity: Array, motion_until_effect: Array) -> Decision:
         """Chooses the velocity of least expected free energy; arguments as for `Policy.decide`."""

@@ -160,6 +160,16 @@ def test_side_of_a_box_that_was_never_seen():
     assert drive(changed, Robot(drive="holonomic"), start, goal(7.5, 2.5), 120, known=HALL)[2] == 0
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_faster_than_the_scanner_sees(kind):
+    """A robot that needs 4 m to stop drives slowly enough to stop before a box that it sees from 3 m."""
+    robot = Robot(drive=kind, max_speed=1.5, acceleration=0.3)
+    scanner = SCANNER.model_copy(update={"range_max": 3.0})
+    world = room(20, 4, box(12, 2, 0.4, 3.2))
+    more = {"known": room(20, 4), "scanner": scanner, "stop": False}
+    assert drive(world, robot, (1.5, 2.0, 0.0), goal(18.5, 2.0), 350, **more)[2] == 0
+
+
 def test_published_energy():
     """The risk includes the path beyond the lookahead point; the probability is that among all motions compared."""
     policy, risks = GeodesicPolicy(Robot(), room(30, 5)), []
