@@ -192,6 +192,7 @@ def _navigate(bus: Bus, messages: LatestMessages, stack: Stack, place: tuple[flo
                 target = f"({place[0]:g}, {place[1]:g})"
                 line.update(f"navigating to {target}: {status.distance:.2f} m to go {status.reason}")
             if status.state == "reached":
+                console.print(f"reached: {status.reason}")
                 break
             passed = (status.stamp_ns - stamp) * 1e-9
             no_belief = status.state == "lost" and status.distance is None
