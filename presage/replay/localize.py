@@ -107,7 +107,7 @@ def build_estimator_options(
     sigma: float | None,
     seed: int,
     initial_pose: str,
-    descent: Descent = Descent(),  # noqa: B008 - frozen
+    descent: Descent = Descent(),
 ) -> EstimatorOptions:
     """The estimator chosen on the command line; the world defaults to that of the recording.
 
@@ -185,8 +185,8 @@ def heading_warning(estimator: Estimator, scans: Scans) -> str:
     if not others:
         return ""
     return (
-        f"warning: preset paper assumes a heading of {np.rad2deg(heading):.0f} deg, but according to {source} the robot "
-        f"has another in {others} of {len(headings)} scans: their poses will be wrong"
+        f"warning: preset paper assumes a heading of {np.rad2deg(heading):.0f} deg, but according to {source} the "
+        f"robot has another in {others} of {len(headings)} scans: their poses will be wrong"
     )
 
 

@@ -112,10 +112,9 @@ def test_interrupted_run_leaves_no_file(session, monkeypatch):
 
 def test_missing_weights_name_no_temporary_file(session):
     """The command that trains them is also right when the run has ended."""
+    why = r"presage train --world hall\.yaml .*run\.mcap contains as attachment world"
     for preset in ("paper", "precise"):
-        with pytest.raises(
-            UserError, match=r"presage train --world hall\.yaml .*run\.mcap contains as attachment world"
-        ) as error:
+        with pytest.raises(UserError, match=why) as error:
             rerun_command(RerunOptions(session, {"estimator": preset}, session.with_name("never.mcap")), None, quiet())
         assert "presage-" not in str(error.value)
 
