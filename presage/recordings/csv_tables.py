@@ -191,8 +191,8 @@ def _readme(
         "Written by `presage export --format csv`. Units are SI; poses are of base_link in map unless noted otherwise.",
         "An empty cell means unknown. Ranges: inf is no return, -inf too close (REP-117), 0 not measured.",
         "`stamp_ns` is simulation or sensor time; `log_time_ns` and `publish_time_ns` are wall time.",
-        "Lists have their own files (TOPIC.FIELD.csv), whose rows belong to the message with the same `log_time_ns` and",
-        "`seq`. So have arrays (TOPIC.FIELD-N.csv, with N columns), "
+        "Lists have their own files (TOPIC.FIELD.csv), whose rows belong to the message with the same `log_time_ns`",
+        "and `seq`. So have arrays (TOPIC.FIELD-N.csv, with N columns), "
         + ("which are all here." if arrays else "which `presage export --format csv --arrays` writes."),
     ]
     for layout in layouts.values():
