@@ -36,6 +36,7 @@ class SessionSummary:
     localised_error_m: float | None  # at that scan
     goal_reached: bool | None  # according to the controller
     goal_refusal: str | None  # why the controller refused the goal
+    goal_tolerance_m: float | None
     goal_distance_m: float | None  # from the true pose, at the end
     goal_distance_believed_m: float | None
     position_error_m: float | None  # at the end
@@ -82,7 +83,10 @@ class SessionSummary:
         """What became of the last goal."""
         if self.goal_refusal is not None:
             return self.goal_refusal.removeprefix("goal ")
-        return "reached" if self.goal_reached else "not reached"
+        if not self.goal_reached:
+            return "not reached"
+        distance, tolerance = self.goal_distance_m, self.goal_tolerance_m
+        return "believed reached" if distance and tolerance and distance > tolerance else "reached"
 
     def _skipped(self) -> str:
         """How many messages services did not use because newer ones had come, by topic."""
@@ -137,6 +141,7 @@ def summary_of(session: RecordedSession) -> SessionSummary:
         localised_error_m=None if first is None else _last(errors[: first + 1]),
         goal_reached=None if goal is None else reached is not None,
         goal_refusal=session.refusal(),
+        goal_tolerance_m=None if goal is None else goal.tolerance,
         goal_distance_m=_distance(path[-1:], goal),
         goal_distance_believed_m=_distance(session.belief.poses[-1:], goal),
         position_error_m=_last(errors),

@@ -223,5 +223,5 @@ def demo_command(demo: DemoOptions, json_file: Path | None) -> int:
         draw_session(recording, figure)
     print_summary(summary, recording, figure, console)
     write_json(json_file, {**summary.as_dict(), "seed": demo.seed, "commit": commit(), "arguments": sys.argv[1:]})
-    console.print("[bold green]goal reached[/]" if reached else "[bold red]goal not reached[/]")
+    console.print(f"[bold green]goal {summary.goal_result()}[/]" if reached else "[bold red]goal not reached[/]")
     return 0 if reached else 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -134,6 +135,13 @@ def test_cancelled_goal(tmp_path):
     )
     assert summarise(path).goal_reached is None
     assert summarise(path).goal_distance_m is None
+
+
+def test_goal_reached_only_in_the_belief(recording):
+    summary = summarise(recording)
+    assert summary.goal_result() == "reached"
+    assert replace(summary, goal_distance_m=0.2).goal_result() == "believed reached"
+    assert replace(summary, goal_distance_m=None).goal_result() == "reached"
 
 
 def test_refused_goal(tmp_path):
