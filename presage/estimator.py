@@ -59,7 +59,7 @@ class Estimator:
                 of SCANNERS state (0.2, 0, 0).
             model: for preset "precise": "learned", "exact" (rays cast in the world), a file of weights, or any object
                 with the methods of GenerativeModel.
-            models: folder of weights; defaults to the shipped ones.
+            models: folder of weights; defaults to your trained ones for the world, else the shipped ones.
             likelihood: for preset "precise": density of a range; defaults to the calibrated one of the model.
             optimiser: for preset "precise": finds poses of least free energy; defaults to GaussNewton().
             sigma: for preset "precise": noise of the scanner in m; defaults to what the scans state, else 0.02.

@@ -27,7 +27,7 @@ def localisation(world: str, beams: int, trials: int, scans: int, seed: int, con
     The scans are exact rays with fresh noise; the estimator starts at the map's centre.
     """
     use_one_core()
-    model, card = weights.load(weights.find(SHIPPED, world, "paper", beams))
+    model, card = weights.load(weights.find(SHIPPED, world, beams))
     rng, scanner = np.random.default_rng(seed), card.scanner
     places = card.world.sample_free(trials, rng, Robot().radius)
     errors, is_tracking = [], []

@@ -107,7 +107,7 @@ def in_front(field: ExperimentWorld, scene: Scene) -> Array:
 def _expected(name: str, field: ExperimentWorld, scene: Scene, poses: Array) -> tuple[Array, Array]:
     """Ranges (N, B), m, predicted with the shipped weights, and the predicted deviations of the measurements, m."""
     if name == "paper":
-        path = paper_weights.find(SHIPPED, scene.world.name, "paper", scene.scanner.beams)
+        path = paper_weights.find(SHIPPED, scene.world.name, scene.scanner.beams)
         ranges = paper_weights.load(path)[0].ranges(poses)
         return ranges, np.full(ranges.shape, PAPER_SIGMA)
     model = precise_weights.load(precise_weights.find(SHIPPED, scene.world, field.world))[0]

@@ -103,7 +103,7 @@ def trial(job: StepSizeJob) -> dict[str, Any]:
 @functools.lru_cache(maxsize=2)
 def _model(field: ExperimentWorld) -> tuple[PaperModel, weights.ModelCard]:
     use_one_core()
-    return weights.load(weights.find(SHIPPED, field.world, "paper", field.beams))
+    return weights.load(weights.find(SHIPPED, field.world, field.beams))
 
 
 def _run_displacement(job: StepSizeJob, world: World, ends: StartAndGoal) -> dict[str, Any]:

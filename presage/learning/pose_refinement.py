@@ -13,12 +13,12 @@ import numpy as np
 
 from common.geometry.se2 import Array
 from services.estimator.precise.field import FieldModel
-from services.estimator.precise.gauss_newton import View
 from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.precise.learning.field_learning import Recipe, learn_field, seen_cells
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.noise import estimate_noise
+from services.estimator.precise.scan_likelihood import ScanLikelihood
 from services.mapper.slam.trajectory import distribute_corrections
 
 ROUNDS = 4  # of learning the field and matching the scans to it
@@ -39,14 +39,14 @@ def refine_poses(drive: ReferenceDrive, report: Callable[[float], None]) -> Arra
         beams = Beams.of(part.poses, part.mount, part.angles, part.ranges)
         model = FieldModel(learn_field(beams, RECIPE), seen=seen_cells(beams))
         poses = [
-            _take_step(View(model, likelihood, part.mount, part.angles, ranges, part.range_max), pose)
+            _take_step(ScanLikelihood(model, likelihood, part.mount, part.angles, ranges, part.range_max), pose)
             for pose, ranges in zip(part.poses, part.ranges, strict=True)
         ]
         part = replace(part, poses=np.array(poses))
     return distribute_corrections(drive.poses, numbers, part.poses, np.zeros(len(numbers), int))
 
 
-def _take_step(view: View, pose: Array) -> Array:
+def _take_step(scan: ScanLikelihood, pose: Array) -> Array:
     """The pose (3,) after a step towards where the model explains the scan best."""
-    evidence = view.evidence(pose[None])
+    evidence = scan.evidence(pose[None])
     return np.asarray(pose + np.linalg.solve(evidence.curvature[0] + np.diag(PRIOR**-2.0), evidence.xi[0]))

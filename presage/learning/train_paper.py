@@ -45,7 +45,7 @@ def train(options: TrainPaperOptions, link: Link, console: Console) -> Path:
     An interrupted training with the same options is resumed. Raises UserError if the scanner cannot be sampled.
     """
     world, scanner = load_world(options.world), options.scanner
-    path = weights.path_of(options.out, world.name, options.preset, scanner.beams)
+    path = weights.path_of(options.out, world.name, scanner.beams)
     described = {
         "world": world.model_dump(mode="json"),
         "scanner": scanner.model_dump(mode="json"),

@@ -121,9 +121,7 @@ def _train(
     # The beams are not kept here: in large buildings, they are most of the memory.
     learned = learn_field(
         Beams.of(poses["train"], mount, angles, scans["train"]), recipe, report, threads=os.cpu_count() or 1
-    )
-    # The weights are stored in half precision, so that the model is evaluated with the same precision.
-    learned = replace(learned, phi=learned.phi.astype(np.float16).astype(np.float32))
+    ).as_stored()
     report("standard deviations", 1.0)
     count = CALIBRATION_SAMPLES
     scales = learn_scales(learned, poses["held out"][:count], mount, angles, scans["held out"][:count], 0.0)

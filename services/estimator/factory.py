@@ -45,7 +45,7 @@ class EstimatorOptions:
     world: str | World = "corridor"  # name of a shipped world, path of a file, or the world itself
     estimator: EstimatorPreset = "precise"
     model: str = "learned"  # for precise: learned, exact, or a file of weights
-    models: Path | None = None  # folder of weights; defaults to the shipped ones
+    models: Path | None = None  # folder of weights; defaults to the user's for this world, else the shipped ones
     sigma: float | None = None  # m, the scanner's noise; defaults to what the scans state, else DEFAULT_SIGMA_M
     seed: int = 0
     initial_pose: Array | None = None  # (3,), or (2,) without heading; None if unknown (paper starts at the centre)
@@ -76,7 +76,7 @@ class ScannerGeometry:
     mount: Array  # (3,) laser in base_link
     range_max: float  # m
     sigma: float = 0.0  # m, the scanner's noise
-    sigma_relative: float = 0.0  # the part that grows with the range, as a share of it; both 0 if not stated
+    sigma_relative: float = 0.0  # noise that grows with the range, as a fraction of the range; both 0 if not stated
     mount_assumed: bool = False  # whether the mount is a guess, because neither the scans nor the user state it
 
     @classmethod
@@ -159,15 +159,13 @@ def prepare_factory(options: EstimatorOptions) -> EstimatorFactory:
 
 def _prepare_particle_filter(options: EstimatorOptions, world: World) -> EstimatorFactory:
     tuned = options.estimator == "particle-filter"
+    settings = ParticleFilterSettings.tuned() if tuned else ParticleFilterSettings()
     world.ray_distances(np.zeros((1, 3)), np.zeros(1))  # compile now, so that no request has to wait
-    sensor = functools.cache(functools.partial(Sensor, world))  # all filters share one field
+    sensor = functools.cache(lambda: Sensor(world, settings))  # all filters share one field
 
     def make(geometry: ScannerGeometry) -> PoseEstimator:
-        settings = ParticleFilterSettings.tuned() if tuned else ParticleFilterSettings()
-        if tuned:
-            settings = replace(settings, robot_model_type="omni")  # this model also covers a differential base
         x, y, yaw = map(float, geometry.mount)
-        estimator = ParticleFilter(world, settings, (x, y, yaw), options.seed, sensor=sensor(settings))
+        estimator = ParticleFilter(world, settings, (x, y, yaw), options.seed, sensor=sensor())
         estimator.name = options.estimator
         if options.initial_pose is not None:
             estimator.restart(options.initial_pose)
@@ -293,7 +291,6 @@ def _prepare_paper(options: EstimatorOptions, world: World) -> EstimatorFactory:
 
     use_one_core()
     folder, files, remedy = _paper_weights(options, world)
-    train_command = remedy.rpartition(" --scanner")[0]
     for path in files.values():  # find damaged files now, and warm up torch for the first scan
         model, card = paper_weights.load(path)
         if not weights.same_walls(card.world, world):
@@ -307,7 +304,8 @@ def _prepare_paper(options: EstimatorOptions, world: World) -> EstimatorFactory:
     def make(geometry: ScannerGeometry) -> PoseEstimator:
         model, card = load(paper_weights.nearest(folder, world.name, len(geometry.angles)))
         check_mount(geometry, card.scanner)
-        converted = fit(card.scanner, geometry.angles, geometry.mount, f"{train_command} {_train_options(geometry)}")
+        train_command = paper_weights.train_command(options.world_argument, _train_options(geometry))
+        converted = fit(card.scanner, geometry.angles, geometry.mount, train_command)
         return PaperEstimator(model, card, options.descent, options.initial_pose, converted)
 
     return make
@@ -322,8 +320,8 @@ def _paper_weights(options: EstimatorOptions, world: World) -> tuple[Path, dict[
     from services.estimator.paper import weights as paper_weights  # torch, as above
 
     folder = options.models or find_folder(world.name, "paper")
-    files = paper_weights.available(folder, world.name, "paper")
-    remedy = paper_weights.train_command(options.world_argument, "paper")
+    files = paper_weights.available(folder, world.name)
+    remedy = paper_weights.train_command(options.world_argument)
     if not files:
         raise UserError(
             f"no weights of preset paper for world {world.name!r} in {folder}; train them with: {remedy}; "

@@ -36,6 +36,13 @@ class EncodedVersion:
     data: bytes
 
 
+@dataclass(frozen=True)
+class LearningOutcome:
+    """The result of learning a version of the model."""
+
+    version: EncodedVersion | None  # None if it predicts held-out key scans no better than the model in use
+
+
 class Learner:
     """Collects key scans, and learns a version of the model whenever enough of them are new."""
 
@@ -48,7 +55,7 @@ class Learner:
         self._closed = False
         self._running: Future[EncodedVersion | None] | None = None
         self._stamps = np.zeros(0)  # (N,) of the key scans from which a version is being learned
-        self.rejected_total = 0  # versions that predicted held-out key scans no better than the model in use
+        self.rejected_total = 0  # versions that were no better than the model in use
 
     def add(self, posterior: Posterior, observation: Observation, present: GenerativeModel) -> None:
         """Adds a scan, and starts learning if enough key scans are new; ``present`` is the model in use."""
@@ -57,8 +64,8 @@ class Learner:
             self._stamps = drive.stamps
             self._running = self._pool.submit(self._learn, present, drive, self.keys.learned_until)
 
-    def take(self) -> EncodedVersion | None:
-        """Returns the version that was learned since the last call, or None; raises RuntimeError if learning failed.
+    def take(self) -> LearningOutcome | None:
+        """Returns the outcome if learning has ended since the last call, or None; raises RuntimeError if it failed.
 
         The next version starts with the poses at which the key scans agree best in this one.
         """
@@ -69,7 +76,7 @@ class Learner:
             self.rejected_total += 1
         else:
             self.keys.set_learned(self._stamps, learned.version.key_poses)
-        return learned
+        return LearningOutcome(learned)
 
     def close(self) -> None:
         """Terminates the learning process."""

@@ -15,7 +15,6 @@ from common.messages.requests import FILE_NAME, ModelReply
 from common.versions import commit, versions
 from services.estimator.factory import EstimatorOptions, ScannerGeometry, field_path
 from services.estimator.precise.learning import weights as precise_weights
-from services.estimator.precise.learning.drive_learning import HELD_OUT_EVERY
 from services.estimator.precise.learning.live_learning import RECIPE, ModelVersion
 from services.estimator.shared.digest import sha256
 from services.estimator.shared.model_folder import find_folder
@@ -95,7 +94,7 @@ def save_learned(
         origin=field.origin,
         sweeps=RECIPE.sweeps,
         inflation=1.0 if card_before is None else card_before.inflation,
-        test_samples=len(version.key_poses) // HELD_OUT_EVERY,
+        test_samples=version.test_scans,
         test_range_error_median_m=float(np.median(errors)),
         test_range_error_mean_m=float(errors.mean()),
         test_share_above_5_cm=float((errors > 0.05).mean()),

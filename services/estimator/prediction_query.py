@@ -28,10 +28,11 @@ def answer_prediction(
     chosen = angles[np.round(np.linspace(0, len(angles) - 1, beams)).astype(np.intp)]
     count = len(request.poses)
     if count > MAX_POSES:
-        raise UserError(f"{count} poses are too many to predict at once: ask for {MAX_POSES} at most")
+        raise UserError(f"{count} poses are too many to predict at once: request at most {MAX_POSES}")
     if count * len(chosen) > MAX_RANGES:
         raise UserError(
-            f"{count} poses of {len(chosen)} beams are too many ranges: ask for {MAX_RANGES} at most, of fewer beams"
+            f"{count} poses with {len(chosen)} beams each are too many to predict at once: request fewer poses or "
+            f"beams: at most {MAX_RANGES} ranges"
         )
     if not count:
         return PredictReply(angles=chosen.astype(np.float32))

@@ -238,15 +238,16 @@ class EstimatorService(Service):
 
     def _use_learned_version(self, learner: Learner, estimator: PreciseEstimator, stamp_ns: int) -> None:
         """Switches to a newly learned version of the model, if there is one, and publishes it."""
-        learned = learner.take()
-        if learner.rejected_total > self.counters["versions_rejected"]:
-            self.counters["versions_rejected"] = learner.rejected_total
+        outcome = learner.take()
+        if outcome is None:
+            return
+        if (learned := outcome.version) is None:
+            self.counters["versions_rejected"] += 1
             self.log.info(
                 "a new version predicts new scans no better, so the model stays",
                 version=self.field_version,
                 key_scans=len(learner.keys),
             )
-        if learned is None:
             return
         estimator.use_model(learned.version.model, learned.version.seeds)
         self._learned, self.field_version = learned, self.field_version + 1

@@ -62,7 +62,10 @@ class EstimatorSettings(MotionLimitSettings):
         ),
     ] = "precise"
     model: Annotated[str, Field(description="model of precise: learned, exact, or a file of weights")] = "learned"
-    models: Annotated[Path | None, Field(description="folder of weights; defaults to the shipped ones")] = None
+    models: Annotated[
+        Path | None,
+        Field(description="folder of weights; defaults to your trained ones for the world, else the shipped ones"),
+    ] = None
     learn: Annotated[
         Literal["none", "refine", "follow"],
         Field(

@@ -7,7 +7,7 @@ import pytest
 
 from common.errors import UserError
 from common.geometry import se2
-from common.geometry.world import World, load_world, save_world
+from common.geometry.world import World, save_world
 from common.messages.definitions import Belief, Goal, Pose, Scan
 from common.messages.requests import LocaliseRequest
 from common.messages.topics import GOAL, LOCALISE, SCAN
@@ -113,5 +113,4 @@ def test_goal_on_a_floor(service):
 
 def test_world_without_floors():
     service = StoringService(EstimatorSettings(), SharedModels(EstimatorSettings()))
-    service.models.world = load_world("corridor")
     assert service.scan("", [5.0, 1.5, 2.0]).map_id == ""

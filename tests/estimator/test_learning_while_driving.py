@@ -22,6 +22,7 @@ from common.robot.scan_geometry import Sweep
 from lab.accuracy.scenes import Scene
 from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.field_exchange import FieldAssembler, split_into_messages
+from services.estimator.learner import LearningOutcome
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.key_scans import KeyScanCollector
 from services.estimator.service import EstimatorService
@@ -193,16 +194,19 @@ def test_rejected_versions_are_reported():
     service.open()
     with pytest.raises(UserError, match="nothing was learned: start with `presage up --learn`"):
         service.on_request(SAVE_MODEL, SaveModelRequest(name="monday"))
-    learner = SimpleNamespace(keys=range(12), rejected_total=0, take=lambda: None)
+    outcomes = []
+    learner = SimpleNamespace(keys=range(12), rejected_total=0, take=lambda: outcomes.pop() if outcomes else None)
     service._learner = learner
     with pytest.raises(UserError, match="12 key scans, and a version needs 50"):
         service.on_request(SAVE_MODEL, SaveModelRequest(name="monday"))
+    service.counters["versions_rejected"] = 5  # with another scanner, whose learner was another one
     learner.rejected_total = 2
+    outcomes.append(LearningOutcome(None))
     with capture_logs() as lines:
         for stamp_ns in (1, 2):
             service._use_learned_version(learner, None, stamp_ns)
     assert [line["event"] for line in lines] == ["a new version predicts new scans no better, so the model stays"]
-    assert service.counters["versions_rejected"] == 2
+    assert service.counters["versions_rejected"] == 6
     with pytest.raises(UserError, match="2 new versions predicted new scans no better"):
         service.on_request(SAVE_MODEL, SaveModelRequest(name="monday"))
 

@@ -10,7 +10,7 @@ import pytest
 from common.geometry import se2
 from common.geometry.world import World
 from services.estimator.particle_filter import ParticleFilter, ParticleFilterSettings
-from services.estimator.particle_filter.recovery import Recovery
+from services.estimator.particle_filter.fit_averages import FitAverages
 from services.estimator.shared.interface import Observation, Posterior
 from tests.estimator.models import ROOM, SCANNER
 
@@ -184,7 +184,7 @@ def test_scans_without_returns():
     spread = [np.trace(found.update(empty).covariance) for _ in range(5)]
     assert np.all(np.isfinite(spread))
     assert spread[-1] > spread[0]
-    assert found._health == Recovery(0.01, 0.5)  # how well scans fit is not learned from them
+    assert found._fit_for_state == FitAverages(0.01, 0.5)  # how well scans fit is not learned from them
 
 
 def test_restart():

@@ -16,8 +16,8 @@ from common.geometry.world import World
 from services.estimator.particle_filter import ParticleFilterSettings, motion, resampling
 from services.estimator.particle_filter.beam_model import BeamModel, RangeTable
 from services.estimator.particle_filter.clusters import cluster_hypotheses, labels, moments
+from services.estimator.particle_filter.fit_averages import FitAverages
 from services.estimator.particle_filter.likelihood_field import LikelihoodField, SurfaceDistances
-from services.estimator.particle_filter.recovery import Recovery
 from tests.estimator.models import ROOM
 
 HALL = World(name="hall", boundary=[(0, 0), (10, 0), (10, 10), (0, 10)])
@@ -205,22 +205,32 @@ def test_moments():
     assert covariance[0, 0] == pytest.approx(1.0)
 
 
-def test_recovery():
-    recovery = Recovery(0.01, 0.3)
+def test_fit_averages():
+    averages = FitAverages(0.01, 0.3)
     for _ in range(20):
-        recovery.add(0.9)
-    assert recovery.random_share == 0.0
-    recovery.add(0.1)
-    assert recovery.random_share == pytest.approx(1 - (0.9 - 0.24) / (0.9 - 0.008), abs=1e-6)
-    recovery.add(0.95)
-    recovery.add(0.95)
-    assert recovery.random_share < 0.12
+        averages.add(0.9)
+    assert averages.random_share == 0.0
+    averages.add(0.1)
+    assert averages.random_share == pytest.approx(1 - (0.9 - 0.24) / (0.9 - 0.008), abs=1e-6)
+    averages.add(0.95)
+    averages.add(0.95)
+    assert averages.random_share < 0.12
 
 
-def test_settings():
-    for wrong in ({"sigma_hit": 0.0}, {"alpha1": -1.0}, {"max_beams": 0}, {"z_rand": 0.0}, {"min_particles": 9000}):
-        with pytest.raises(UserError, match="particle filter"):
-            dataclasses.replace(ParticleFilterSettings(), **wrong)
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"sigma_hit": 0.0}, "sigma_hit must be greater than 0"),
+        ({"max_beams": 0}, "max_beams must be greater than 0"),
+        ({"alpha1": -1.0, "sigma_hit": -0.1}, "alpha1, sigma_hit must not be negative"),
+        ({"walk_share": 1.5}, "walk_share must be 1 at most"),
+        ({"z_rand": 0.0}, "z_hit and z_rand must be greater than 0"),
+        ({"min_particles": 9000}, "max_particles 2000 < min_particles 9000"),
+    ],
+)
+def test_wrong_settings(wrong, message):
+    with pytest.raises(UserError, match=f"particle filter: {message}"):
+        dataclasses.replace(ParticleFilterSettings(), **wrong)
 
 
 def test_overlapping_obstacles():

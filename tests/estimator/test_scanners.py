@@ -15,8 +15,9 @@ from lab.accuracy.scenes import Scene
 from services.estimator.factory import DEFAULT_SIGMA_M, EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.field import FieldModel
-from services.estimator.precise.gauss_newton import View, polish
+from services.estimator.precise.gauss_newton import polish
 from services.estimator.precise.global_seeds import SEED_SPACING_M, Seeds, thin_places
+from services.estimator.precise.scan_likelihood import ScanLikelihood
 from tests.estimator.models import ROOM
 
 OFF_CENTRE = {"mount": (-0.12, 0.1, 2.0)}
@@ -52,7 +53,7 @@ def biases(made: PreciseEstimator, scene: Scene, poses: np.ndarray) -> np.ndarra
     """Squared position error (N,) in m² caused by the model alone: scans without noise, descent from the true pose."""
     scanner, found = scene.scanner, []
     for pose, clean in zip(poses, scanner.limit(scene.clean(poses)), strict=True):
-        view = View(made.model, made.likelihood, made.mount, scanner.angles(), clean, scanner.range_max)
+        view = ScanLikelihood(made.model, made.likelihood, made.mount, scanner.angles(), clean, scanner.range_max)
         off = polish(view, pose[None])[0][0] - pose
         found.append(float(np.square(off[:2]).sum()))
     return np.array(found)

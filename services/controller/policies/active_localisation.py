@@ -59,6 +59,8 @@ INITIAL_WAIT_NS = 1_000_000_000  # time for the estimator to localise before the
 CORRELATION_LENGTH_M = 1.0  # scans from places this far apart are nearly independent
 MAX_VISITED = 100  # positions kept, VISITED_SPACING_M apart
 VISITED_SPACING_M = 0.25
+UNSEEN_RANGE_M = 1.5  # obstacles this close are remembered when they leave the field of view
+FORGET_NS = 5_000_000_000  # for this time; dead reckoning is exact enough for it
 STALLED_NS = 3_000_000_000  # after this time without progress, the robot gives up the viewpoint
 REACHED_M = 0.1  # a viewpoint nearer than this was reached
 PROGRESS_M, PROGRESS_RAD = 0.25, 0.5  # a motion or turn by this is progress; turning to and fro by less is not
@@ -109,6 +111,33 @@ class VisitedPlaces:
         """Share (M,) of the information of a scan that is new at places (M, 2) m in base_link."""
         distance = np.hypot(*np.moveaxis(places[:, None] - self.positions, -1, 0)).min(axis=1)
         return np.asarray(-np.expm1(-(distance**2) / (2 * CORRELATION_LENGTH_M**2)))
+
+
+class UnseenPoints:
+    """Obstacles close to the robot that have left its field of view, in the present base_link, by dead reckoning."""
+
+    def __init__(self) -> None:
+        self._points, self._stamps = np.zeros((0, 2)), np.zeros(0, np.int64)  # (K, 2) m, and when they were seen, ns
+
+    def update(self, stamp_ns: int, motion: Array, points: Array, scan: Scan) -> Array:
+        """Adds the ``points`` (N, 2) m of the present scan; returns them and those that are out of view.
+
+        ``motion`` (3,) is that since the last update.
+        """
+        field_of_view = Sweep.of(scan).sector(scan.mount.yaw)
+        kept = se2.rotate(-motion[2], self._points - motion[:2])
+        from_laser = kept - scan.mount.array()[:2]
+        off_centre = np.abs(se2.wrap(np.arctan2(from_laser[:, 1], from_laser[:, 0]) - field_of_view.centre))
+        age = stamp_ns - self._stamps
+        remembered = (np.hypot(*kept.T) < UNSEEN_RANGE_M) & (age >= 0) & (age < FORGET_NS)
+        unseen = remembered & (off_centre > field_of_view.half)
+        near = points[np.hypot(*points.T) < UNSEEN_RANGE_M]
+        self._points = np.concatenate([kept[unseen], near])
+        self._stamps = np.concatenate([self._stamps[unseen], np.full(len(near), stamp_ns)])
+        # One point per 5 cm, and of several the latest
+        _, first = np.unique(np.round(self._points[::-1] / 0.05), axis=0, return_index=True)
+        self._points, self._stamps = self._points[::-1][first], self._stamps[::-1][first]
+        return np.concatenate([points, kept[unseen]])
 
 
 class StallTimer:
@@ -173,6 +202,7 @@ class ActiveLocaliser:
     def reset(self) -> None:
         """Forgets everything. Call it when the pose is known, or the goal has changed."""
         self._visited, self._stall_timer = VisitedPlaces(), StallTimer(self.robot.max_speed)
+        self._unseen_points = UnseenPoints()
         self._requested_ns: int | None = None  # stamp of the last search for candidates
         self._paths: ViewpointPaths | None = None  # result of that search; None if the map has no path
         self._prediction_failure = ""  # why the last request was not answered
@@ -235,6 +265,7 @@ class ActiveLocaliser:
         self._period = period_of(scan)
         motion = self._visited.integrate(belief.stamp_ns, velocity)
         self._stall_timer.add_motion(belief.stamp_ns, motion)
+        points = self._unseen_points.update(belief.stamp_ns, motion, points, scan)
         if self._viewpoint is not None:
             self._viewpoint = (se2.between(motion, self._viewpoint[0]), self._viewpoint[1])
             # A further scan from where it has arrived gives no information. If it kept the viewpoint, the robot would

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from services.controller.policies.free_space import FreeSpace
 
 WALL_GAP_M = 0.03  # minimum distance between footprint and wall; the obstacle stop needs 0.02 m, and noise 0.01 m
+# Minimum gap between footprint and unmapped obstacles: more than the scanner's noise, 0.02 m, and half a cell of
+# `obstacles`, 0.025 m, together.
+OBSTACLE_GAP_M = 0.06
 WALL_COST_RANGE_M = 0.35  # range of clearances beyond the minimum within which a metre costs more
 MAX_WALL_COST = 1.0  # additional cost of a metre at the minimum clearance
 UNKNOWN_COST = 30.0  # additional cost of a metre where nothing is known: a path through it is the last resort
@@ -50,7 +53,8 @@ class FreeSpaceGraph:
         self.free, self.grid, self.radius = free, free.grid, radius
         self.min_clearance = radius + WALL_GAP_M
         self._extra_cost_per_metre = UNKNOWN_COST * free.unknown  # the part that does not depend on clearance
-        self.clearance = free.clearance.copy()  # (rows, columns) m, to walls and temporary obstacles
+        # (rows, columns) m, to walls; to temporary obstacles it is less than the distance, because their gap is wider
+        self.clearance = free.clearance.copy()
         self.cost_per_metre = self._extra_cost_per_metre + cost_near_walls(free.clearance, self.min_clearance)
         # (cells,) number of the part of the free space, without temporary obstacles
         self.component = label(free.clearance >= self.min_clearance)[0].ravel()
@@ -64,7 +68,8 @@ class FreeSpaceGraph:
         self._near_obstacles = np.zeros(0, np.intp)
         if not len(points):
             return
-        range_m = self.min_clearance + WALL_COST_RANGE_M
+        additional_gap = OBSTACLE_GAP_M - WALL_GAP_M
+        range_m = self.min_clearance + WALL_COST_RANGE_M + additional_gap
         cells = np.unique(self.grid.cell_of(points))
         rows, columns = np.divmod(cells, self.grid.shape[1])
         margin = int(range_m / self.grid.resolution) + 1
@@ -75,9 +80,10 @@ class FreeSpaceGraph:
         rows, columns = np.nonzero(_dilate(window, margin))
         near = (rows + top) * self.grid.shape[1] + columns + left
         distance, _ = cKDTree(points).query(self._centres[near], distance_upper_bound=range_m)
-        reduced = distance < self.clearance.ravel()[near]
+        clearance = distance - additional_gap
+        reduced = clearance < self.clearance.ravel()[near]
         self._near_obstacles = near[reduced]
-        self._set_clearance(self._near_obstacles, distance[reduced])
+        self._set_clearance(self._near_obstacles, clearance[reduced])
 
     def _set_clearance(self, cells: npt.NDArray[np.intp], clearance: Array) -> None:
         self.clearance.ravel()[cells] = clearance

@@ -30,9 +30,6 @@ FIELD_OF_VIEW_MARGIN_RAD, FIELD_OF_VIEW_DIVISOR = np.pi / 3, 3
 # Cost in m of a change of velocity by 1 m/s, so that the choice does not alternate between motions of equal merit.
 CHANGE_COST_S = 0.02
 WALKING_SPEED = 1.0  # m/s at which moving obstacles are assumed to approach
-# Fractions of the line to the lookahead point at which the ambiguity is looked up. With fewer, the errors of its
-# integral would exceed the differences between motions.
-LINE_SAMPLES = (np.arange(12) + 0.5) / 12
 HINDERED_M = 0.05  # a status text is shown if walls and obstacles make the way longer by this much
 GAP_TOLERANCE_M = 1e-3  # for rounding errors
 
@@ -126,14 +123,17 @@ class PoseBelief:
         if self.scans is None:
             return np.zeros(len(motions)), np.zeros(len(motions))
         ends, before, after = motions[:, -1, :2], motions[:, :-1, :2], motions[:, 1:, :2]
-        line = ends[:, None] + LINE_SAMPLES[:, None] * (lookahead - ends)[:, None]
-        points = se2.transform(self.pose, np.concatenate([(before + after) / 2, line], axis=1))
         line_length = np.hypot(*(lookahead - ends).T)[:, None]
+        # One sample per cell of the ambiguity: with fewer, errors of its integral exceed differences between motions.
+        samples = max(1, int(np.ceil(line_length.max() / self.scans.ambiguity_grid.resolution)))
+        fraction = (np.arange(samples)[:, None] + 0.5) / samples
+        line = ends[:, None] + fraction * (lookahead - ends)[:, None]
+        points = se2.transform(self.pose, np.concatenate([(before + after) / 2, line], axis=1))
         # Length of the part of the way that each point represents
         metres = np.concatenate(
             [
                 np.linalg.norm(after - before, axis=-1),
-                np.repeat(line_length / len(LINE_SAMPLES), len(LINE_SAMPLES), axis=1),
+                np.repeat(line_length / samples, samples, axis=1),
             ],
             axis=1,
         )

@@ -25,6 +25,9 @@ SAME_OBSTACLE_M = 0.3  # a new cell this close to furniture is another side of i
 FORGET_STATIC_NS = 20_000_000_000  # a cell that was hit for 3 * STATIC_AFTER_NS is kept this long out of sight
 FORGET_RECENT_NS = 2_000_000_000  # and any other cell this long
 FREE_MARGIN_M = 0.15  # a beam must end this far behind a cell to show that the cell is free
+# Evidence that a cell is occupied, as in an occupancy grid: a hit adds, a beam that passes subtracts. A cell without
+# evidence is removed. So noise does not remove the edge of an obstacle, or a leg that only every other scan hits.
+HIT_EVIDENCE, PASS_EVIDENCE, MAX_EVIDENCE = 2, 1, 4
 
 
 class TemporaryObstacles:
@@ -36,6 +39,7 @@ class TemporaryObstacles:
         self._cells = np.zeros(0, np.int64)  # flat indices, sorted
         self._first_seen = np.zeros(0, np.int64)  # ns
         self._last_seen = np.zeros(0, np.int64)  # ns
+        self._evidence = np.zeros(0, np.int64)
 
     def _use(self, free: FreeSpace) -> None:
         self._free, self._origin = free, np.array(free.grid.origin)
@@ -43,12 +47,13 @@ class TemporaryObstacles:
 
     def change_map(self, free: FreeSpace) -> None:
         """Uses another map of the same place. Obstacles that are walls in it are no longer obstacles."""
-        points, first, last = self.points(), self._first_seen, self._last_seen
+        points, first, last, evidence = self.points(), self._first_seen, self._last_seen, self._evidence
         self._use(free)
         keep = self._unmapped(points)
-        # Where cells of the old grid share one of the new, the first one's times are kept.
+        # Where cells of the old grid share one of the new, the first one's times and evidence are kept.
         self._cells, kept = np.unique(self._cell_of(points[keep]), return_index=True)
         self._first_seen, self._last_seen = first[keep][kept], last[keep][kept]
+        self._evidence = evidence[keep][kept]
 
     def _unmapped(self, points: Array) -> npt.NDArray[np.bool_]:
         """Whether points (K, 2) m lie on the map and far from its walls; (K,) bool."""
@@ -94,15 +99,17 @@ class TemporaryObstacles:
         known = position < len(self._cells)
         known[known] = self._cells[position[known]] == cells[known]
         self._last_seen[position[known]] = stamp_ns
+        self._evidence[position[known]] = np.minimum(self._evidence[position[known]] + HIT_EVIDENCE, MAX_EVIDENCE)
         new = cells[~known]
         order = np.argsort(merged := np.concatenate([self._cells, new]), kind="stable")
         stamps = np.full(len(new), stamp_ns, np.int64)
         self._cells = merged[order]
         self._first_seen = np.concatenate([self._first_seen, stamps])[order]
         self._last_seen = np.concatenate([self._last_seen, stamps])[order]
+        self._evidence = np.concatenate([self._evidence, np.full(len(new), HIT_EVIDENCE)])[order]
 
     def _remove_cleared(self, scan: Scan, laser: Array, stamp_ns: int) -> None:
-        """Removes cells through which a beam passed, cells not seen for long, and cells from before a reset."""
+        """Removes cells through which enough beams passed, cells not seen for long, and cells from before a reset."""
         if not len(self._cells):
             return
         offset = self.points() - laser[:2]
@@ -112,8 +119,10 @@ class TemporaryObstacles:
         measured = scan.ranges.astype(np.float64)[beam]
         # A beam without return does not prove free space: dark or slanting surfaces give no return either.
         passed = (beam >= 0) & np.isfinite(measured) & (measured > distance + FREE_MARGIN_M)
+        self._evidence = self._evidence - PASS_EVIDENCE * passed
         recent = self._last_seen - self._first_seen < 3 * STATIC_AFTER_NS
         memory = np.where(recent, FORGET_RECENT_NS, FORGET_STATIC_NS)
-        keep = ~passed & (stamp_ns - self._last_seen < memory) & (stamp_ns >= self._last_seen)
+        keep = (self._evidence > 0) & (stamp_ns - self._last_seen < memory) & (stamp_ns >= self._last_seen)
         self._cells = self._cells[keep]
         self._first_seen, self._last_seen = self._first_seen[keep], self._last_seen[keep]
+        self._evidence = self._evidence[keep]

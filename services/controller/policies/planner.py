@@ -18,8 +18,9 @@ from services.controller.policies import expected_free_energy as efe
 from services.controller.policies.active_localisation import ActiveLocaliser, ViewpointPaths
 from services.controller.policies.decision import Decision, DecisionState
 from services.controller.policies.free_space import NO_MAP, FreeSpace
-from services.controller.policies.geodesic_field import WALL_COST_RANGE_M, CostField, FreeSpaceGraph
+from services.controller.policies.geodesic_field import OBSTACLE_GAP_M, WALL_COST_RANGE_M, CostField, FreeSpaceGraph
 from services.controller.policies.motion_model import (
+    STANDING_SPEED,
     is_moving,
     period_of,
     stopping_distance,
@@ -38,9 +39,6 @@ if TYPE_CHECKING:
     from common.messages.requests import PredictReply
     from common.robot.robot import Robot
 
-# Minimum gap between footprint and unmapped obstacles: more than the scanner's noise, 0.02 m, and half a cell of
-# `obstacles`, 0.025 m, together.
-OBSTACLE_GAP_M = 0.06
 REPLAN_PERIOD_NS = 400_000_000  # minimum time between two plans when obstacles near the path change
 REPLAN_PERIOD_FAR_NS = 1_500_000_000  # the same when obstacles change elsewhere
 BLIND_AHEAD = "the scanner does not see ahead, where a differential base drives: mount it facing ahead"
@@ -189,7 +187,9 @@ class GeodesicPolicy:
             motion = se2.transform(pose, selected.poses[:, :2])
             return Decision(selected.action, BACKING_OFF, "blocked", path, motion, recovering=True)
         assert self.field is not None  # noqa: S101 - there is a path
-        if (stop := self._stop_beside_goal(stamp_ns, pose, self.field.goal, surroundings, path)) is not None:
+        turning = abs(float(velocity[2])) > STANDING_SPEED
+        stop = self._stop_beside_goal(stamp_ns, pose, self.field.goal, surroundings, path, turning=turning)
+        if stop is not None:
             return stop
         lookahead = self.field.lookahead_point(pose[:2], path, stopping_distance(self.robot))
         lookahead = se2.rotate(-pose[2], lookahead - pose[:2])
@@ -321,12 +321,12 @@ class GeodesicPolicy:
         )
 
     def _stop_beside_goal(
-        self, stamp_ns: int, pose: Array, place: Array, surroundings: Surroundings, path: Array
+        self, stamp_ns: int, pose: Array, place: Array, surroundings: Surroundings, path: Array, *, turning: bool
     ) -> Decision | None:
         """The decision to stop beside a goal that cannot be reached exactly; None while the robot can drive on.
 
         Beside an obstacle the robot waits; otherwise the goal is refused. ``place`` (2,) m is the end of the ``path``:
-        the goal, or the free place nearest to it.
+        the goal, or the free place beside it. A robot that is ``turning`` may first have to turn around.
         """
         assert self._goal is not None  # noqa: S101 - there is a path
         to_goal = self._goal - pose[:2]
@@ -338,7 +338,9 @@ class GeodesicPolicy:
             self._last_progress = (pose[:2], stamp_ns)
         # Other free places may be as near to the goal as this one, so the robot need not stand exactly here.
         arrived = shift > 0 and distance < shift + self.free.grid.resolution
-        stuck = self._last_progress is not None and stamp_ns - self._last_progress[1] > STUCK_AFTER_NS
+        half_turn_ns = 1e9 * np.pi / self.robot.max_turn
+        patience_ns = STUCK_AFTER_NS + (half_turn_ns if turning else 0.0)
+        stuck = self._last_progress is not None and stamp_ns - self._last_progress[1] > patience_ns
         of_robot, of_goal = (
             np.hypot(*(surroundings.points - centre).T).min(initial=np.inf)
             for centre in (np.zeros(2), se2.rotate(-pose[2], to_goal))

@@ -77,9 +77,9 @@ def fit(scanner: Scanner, angles: Array, mount: Array, remedy: str) -> BeamFit:
     off = np.abs(mount[:2] - np.array(scanner.mount[:2])).max()
     if off > TOLERANCE:
         here, there = (f"({x:g}, {y:g}) m" for x, y in (mount[:2], scanner.mount[:2]))
-        raise refuse(f"its laser is mounted at {here}, theirs at {there}")
+        raise refuse(f"the laser is mounted at {here}, but the weights are for {there}")
     if (round_deg := float(np.rad2deg(np.ptp(angles)))) > MAX_FIELD_OF_VIEW_DEG:
-        raise refuse(f"its beams go round more than once, {round_deg:.0f} deg from the first to the last")
+        raise refuse(f"the scan's beams cover {round_deg:.0f} deg, more than a full turn")
     turned = float(mount[2]) - scanner.mount[2]
     centre = scanner.angle_min + scanner.angle_increment * (scanner.beams - 1) / 2
     model_angles = scanner.angles() - centre
@@ -100,10 +100,11 @@ def fit(scanner: Scanner, angles: Array, mount: Array, remedy: str) -> BeamFit:
     if (gap > max_gap).any() and not same:
         spacing = float(np.median(np.diff(np.sort(scan_angles))))
         if spacing > max_gap:
-            model_spacing = np.rad2deg(max_gap / MAX_SPACING_RATIO)
-            apart = f"its beams are {np.rad2deg(spacing):.2f} deg apart, theirs {model_spacing:.2f}"
-            raise refuse(f"{apart}, and {MAX_SPACING_RATIO:g} times as far is the most")
+            raise refuse(
+                f"the scan's beams are {np.rad2deg(spacing):.2f} deg apart; these weights accept at most "
+                f"{np.rad2deg(max_gap):.2f} deg"
+            )
         blind = np.rad2deg(float(wrap(ascending[np.argmax(gap)] + centre + scanner.mount[2])))
-        raise refuse(f"it does not look towards {blind:.0f} deg of base_link, as they do")
+        raise refuse(f"the scan has no beams towards {blind:.0f} deg in base_link, which these weights need")
     share = np.where(exact, 1.0, (ascending - around[before]) / np.maximum(gap, 1e-12))
     return BeamFit(ascending, order, index[before], index[after], share, centre - turned, same)

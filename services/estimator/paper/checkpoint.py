@@ -25,7 +25,10 @@ class Checkpoint:
     """A folder with the state of an unfinished training, which a training with the same ``recipe`` can resume."""
 
     def __init__(self, folder: Path, recipe: dict[str, Any]) -> None:
-        """Opens the folder. It is emptied if it is that of another recipe; ``discarded`` is true if that had begun."""
+        """Opens the folder, and empties it if it is that of another recipe.
+
+        ``discarded`` is then true if that training had stored samples or weights.
+        """
         self.folder, self.recipe = folder, json.loads(json.dumps(recipe))
         self.discarded = False
         if folder.exists() and self._read("recipe.json") != self.recipe:

@@ -76,7 +76,7 @@ class PaperEstimator:
             state=estimate.state,
             hypotheses=(Hypothesis(estimate.pose, None, 1.0),),
             accuracy=free_energy.accuracy,
-            complexity=free_energy.attraction,
+            complexity=free_energy.attraction,  # to the goal; the paper has no complexity term
             xi=free_energy.xi,
             curvature=free_energy.curvature,
             predicted=predicted,

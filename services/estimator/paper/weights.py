@@ -17,6 +17,8 @@ from services.estimator.paper.decoder import Decoder, DecoderShape, Normalisatio
 from services.estimator.shared.digest import check_digest, sha256
 from services.estimator.shared.model_folder import write_weights_and_card
 
+PRESET = "paper"
+
 
 class ModelCard(BaseModel):
     """Model card of a decoder: how it was made, and its errors on test scans."""
@@ -57,26 +59,24 @@ class ModelCard(BaseModel):
         return Normalisation(self.center, self.half_size, self.range_scale)
 
 
-def path_of(folder: Path, world: str, preset: str, beams: int) -> Path:
-    """The weights file for a world, preset and number of beams in ``folder``."""
-    return folder / f"{world}-{preset}-{beams}.safetensors"
+def path_of(folder: Path, world: str, beams: int) -> Path:
+    """The weights file for a world and number of beams in ``folder``."""
+    return folder / f"{world}-{PRESET}-{beams}.safetensors"
 
 
-def available(folder: Path, world: str, preset: str) -> dict[int, Path]:
+def available(folder: Path, world: str) -> dict[int, Path]:
     """The weights files in ``folder``, by number of beams."""
     found = {}
-    for path in folder.glob(f"{world}-{preset}-*.safetensors"):
+    for path in folder.glob(f"{world}-{PRESET}-*.safetensors"):
         beams = path.stem.rsplit("-", 1)[-1]
         if beams.isdigit():
             found[int(beams)] = path
     return dict(sorted(found.items()))
 
 
-def train_command(world: str, preset: str, scanner: str = "tim571", beams: int | None = None) -> str:
+def train_command(world: str, scanner_options: str = "--scanner tim571") -> str:
     """The command that trains missing weights."""
-    return f"presage train --world {shlex.quote(world)} --preset {preset} --scanner {scanner}" + (
-        f" --beams {beams}" if beams else ""
-    )
+    return f"presage train --world {shlex.quote(world)} --preset {PRESET} {scanner_options}"
 
 
 def save(path: Path, decoder: Decoder, card: ModelCard) -> None:
@@ -107,21 +107,21 @@ def load(path: Path) -> tuple[PaperModel, ModelCard]:
     return PaperModel(decoder, card.normalisation()), card
 
 
-def find(folder: Path, world: str, preset: str, beams: int) -> Path:
+def find(folder: Path, world: str, beams: int) -> Path:
     """The weights file for scans of ``beams`` beams. Raises UserError, with the command that trains it, if missing."""
-    known = available(folder, world, preset)
+    known = available(folder, world)
     if beams not in known:
         found = f"there are weights for {', '.join(map(str, known))} beams" if known else f"there are none in {folder}"
         raise UserError(
-            f"no weights of preset {preset} for world {world!r} and {beams} beams ({found}); "
-            f"train them with: {train_command(world, preset, beams=beams)}"
+            f"no weights of preset {PRESET} for world {world!r} and {beams} beams ({found}); "
+            f"train them with: {train_command(world, f'--scanner tim571 --beams {beams}')}"
         )
     return known[beams]
 
 
 def nearest(folder: Path, world: str, beams: int) -> Path:
-    """The weights file of preset paper whose number of beams is nearest to ``beams``; raises UserError without any."""
-    known = available(folder, world, "paper")
+    """The weights file whose number of beams is nearest to ``beams``. Raises UserError if there are none."""
+    known = available(folder, world)
     if not known:
-        return find(folder, world, "paper", beams)
+        return find(folder, world, beams)
     return known[min(known, key=lambda count: (abs(count - beams), -count))]

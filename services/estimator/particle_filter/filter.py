@@ -10,7 +10,7 @@ import numpy as np
 from common.geometry import se2
 from services.estimator.particle_filter import motion, resampling
 from services.estimator.particle_filter.clusters import cluster_hypotheses
-from services.estimator.particle_filter.recovery import Recovery
+from services.estimator.particle_filter.fit_averages import FitAverages
 from services.estimator.particle_filter.sensor import Sensor
 from services.estimator.particle_filter.settings import ParticleFilterSettings
 from services.estimator.shared.interface import Observation, Posterior, Predicted, State, start_belief
@@ -77,8 +77,8 @@ class ParticleFilter:
             self.particles = self._rng.multivariate_normal(mean, spread, count, method="eigh")
         self._freeze_heading()
         self.weights = np.full(len(self.particles), 1 / len(self.particles))
-        self._recovery = Recovery(s.recovery_alpha_slow, s.recovery_alpha_fast)
-        self._health = Recovery(0.01, 0.5)  # averages over about 100 and 2 scans
+        self._fit_for_recovery = FitAverages(s.recovery_alpha_slow, s.recovery_alpha_fast)
+        self._fit_for_state = FitAverages(0.01, 0.5)  # averages over about 100 and 2 scans
         self._state: State = "localising"
         self._was_found, self._searches = False, 0
         self._scans = 0
@@ -93,10 +93,11 @@ class ParticleFilter:
 
     def update(self, observation: Observation) -> Posterior:
         """Returns the posterior after one more scan."""
-        period, odom = self._period(observation), self._odometry_since_last_scan(observation)
+        last_stamp, last_odom = (None, None) if self._last is None else (self._last.stamp, self._last.odom)
+        period, odom = observation.period_since(last_stamp, NOMINAL_PERIOD_S), observation.odometry_since(last_odom)
         self._predict(observation, min(period, MAX_PERIOD_S), odom)
         self._anneal()
-        if self._last is not None and observation.is_earlier_than(self._last.stamp):
+        if observation.is_earlier_than(last_stamp):
             self._velocity = self._tracked = None
         elif self._velocity is None and odom is not None:
             self._velocity = odom / period
@@ -117,18 +118,6 @@ class ParticleFilter:
             self._resample()
         self._last = observation
         return posterior
-
-    def _period(self, now: Observation) -> float:
-        """Time in s since the last scan."""
-        last = self._last
-        if last is None or now.stamp is None or last.stamp is None or now.stamp <= last.stamp:
-            return NOMINAL_PERIOD_S
-        return now.stamp - last.stamp
-
-    def _odometry_since_last_scan(self, now: Observation) -> Array | None:
-        if self._last is None or now.odom is None or self._last.odom is None:
-            return None
-        return se2.between(self._last.odom, now.odom)
 
     def _update_velocity(self, posterior: Posterior, period: float) -> None:
         """Averages the velocity over the last poses, while they are tracked."""
@@ -197,7 +186,12 @@ class ParticleFilter:
 
     def _anneal(self) -> None:
         """Adapts sigma of a hit to the spread of the particles; starts a new search if the filter is lost."""
-        if self._recovers and self._state == "lost" and not self._searching and self._health.ratio < LOST_FIT_RATIO:
+        if (
+            self._recovers
+            and self._state == "lost"
+            and not self._searching
+            and self._fit_for_state.ratio < LOST_FIT_RATIO
+        ):
             self._searching, self._sigma = True, self.sensor.max_sigma
             self._searches += 1
             return
@@ -214,17 +208,19 @@ class ParticleFilter:
         ]
         sharp = not self._searching or self._sigma < 1.5 * self.settings.sigma_hit
         settled = found[0].weight > TRACKING_WEIGHT and tight[0] and sharp
-        if self._was_found and self._health.ratio < (FOUND_FIT_RATIO if self._state == "lost" else LOST_FIT_RATIO):
+        if self._was_found and self._fit_for_state.ratio < (
+            FOUND_FIT_RATIO if self._state == "lost" else LOST_FIT_RATIO
+        ):
             if self._searches <= MAX_SEARCHES or not settled or not self._recovers:
                 return "lost"
-            self._health.accept()
-            self._recovery.accept()
+            self._fit_for_state.accept()
+            self._fit_for_recovery.accept()
         self._searches = 0
         if settled:
             if self._state != "tracking":
                 self._was_found = True
-                self._health.converged()
-                self._recovery.converged()
+                self._fit_for_state.converged()
+                self._fit_for_recovery.converged()
             return "tracking"
         if (
             found[0].weight <= TRACKING_WEIGHT
@@ -237,8 +233,8 @@ class ParticleFilter:
         pose = found[0].pose
         scan_fit = self.sensor.explain(pose, self.mount, observation)
         if not np.isnan(scan_fit.fit):
-            self._recovery.add(scan_fit.fit)
-            self._health.add(scan_fit.fit)
+            self._fit_for_recovery.add(scan_fit.fit)
+            self._fit_for_state.add(scan_fit.fit)
         self._state = self._next_state(found)
         return Posterior(
             state=self._state,
@@ -253,7 +249,7 @@ class ParticleFilter:
     def _resample(self) -> None:
         """Draws as many particles as the belief needs; a share at random places if scans no longer fit."""
         s, rng = self.settings, self._rng
-        share = self._recovery.random_share if self._recovers else 0.0
+        share = self._fit_for_recovery.random_share if self._recovers else 0.0
         bins = resampling.bins(self.particles)
         trial = self._upper_bound(len(np.unique(bins)), share)
         drawn = bins[rng.permutation(resampling.low_variance(self.weights, trial, rng))]

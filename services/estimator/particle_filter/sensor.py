@@ -27,9 +27,11 @@ class ScanFit(NamedTuple):
     """How well a pose explains a scan."""
 
     accuracy: float  # nats, -ln p(o | pose)
-    xi: Array  # (3,) minus the gradient of accuracy
-    curvature: Array  # (3, 3) Gauss-Newton Hessian
-    fit: float  # mean likelihood of a beam relative to an exact one, about the share of beams explained; or NaN
+    xi: Array  # (3,) minus the gradient of accuracy by the pose in map: 1/m, 1/m, 1/rad
+    curvature: Array  # (3, 3) Gauss-Newton Hessian, in map
+    # Mean likelihood of a beam, relative to that of an exact one: about the fraction of beams explained. NaN if no beam
+    # returned.
+    fit: float
 
 
 class Sensor:

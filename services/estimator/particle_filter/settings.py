@@ -9,6 +9,8 @@ from common.errors import UserError
 
 LaserModel = Literal["likelihood_field", "likelihood_field_prob", "beam"]
 MotionModel = Literal["omni", "differential"]
+POSITIVE = ("sigma_hit", "lambda_short", "pf_err", "resolution", "min_particles", "resample_interval", "max_beams")
+SHARES = ("recovery_alpha_slow", "recovery_alpha_fast", "search_share", "odometry_share", "walk_share")
 
 
 @dataclass(frozen=True)
@@ -58,13 +60,12 @@ class ParticleFilterSettings:
     def __post_init__(self) -> None:
         """Raises UserError for values with which the filter cannot work."""
         numbers = [f.name for f in fields(self) if f.type in ("float", "int", "int | None")]
-        negative = [name for name in numbers if (value := getattr(self, name)) is not None and not value >= 0]
-        positive = ("sigma_hit", "lambda_short", "pf_err", "resolution", "min_particles", "resample_interval")
-        if negative or any(getattr(self, name) == 0 for name in positive) or self.max_beams == 0:
-            named = negative or [name for name in (*positive, "max_beams") if getattr(self, name) == 0]
-            raise UserError(
-                f"particle filter: {', '.join(named)} must be greater than 0 (noise and weights may also be 0)"
-            )
+        if negative := [name for name in numbers if (value := getattr(self, name)) is not None and not value >= 0]:
+            raise UserError(f"particle filter: {', '.join(negative)} must not be negative")
+        if zero := [name for name in POSITIVE if getattr(self, name) == 0]:
+            raise UserError(f"particle filter: {', '.join(zero)} must be greater than 0")
+        if large := [name for name in SHARES if getattr(self, name) > 1]:
+            raise UserError(f"particle filter: {', '.join(large)} must be 1 at most")
         if self.max_particles < self.min_particles:
             raise UserError(f"particle filter: max_particles {self.max_particles} < min_particles {self.min_particles}")
         if self.z_hit == 0 or self.z_rand == 0:

@@ -18,6 +18,7 @@ from scipy import ndimage
 
 from services.estimator.precise.field_tracing import mark_crossed, trace, trace_behind
 from services.estimator.shared.generative_models import Expected
+from services.estimator.shared.grid_values import values_at
 from services.estimator.shared.seen_cells import SEEN_CELL_M
 
 if TYPE_CHECKING:
@@ -28,12 +29,12 @@ Floats = npt.NDArray[np.float32]
 
 # Beams are divided into classes of about equal prediction error, by these edges: how close the beam passed another
 # surface (m), how deep the surface is behind the beam's end, relative to a plane, and the cosine of incidence.
-DIP_EDGES = np.array([0.001, 0.002, 0.005, 0.01, 0.02, 0.03, 0.05, 0.1])
-DEPTH_EDGES = np.array([0.0, 0.25, 0.5, 0.75])
-FACING_EDGES = np.array([0.05, 0.1, 0.2, 0.5])
+CLEARANCE_EDGES = np.array([0.001, 0.002, 0.005, 0.01, 0.02, 0.03, 0.05, 0.1])
+DEPTH_RATIO_EDGES = np.array([0.0, 0.25, 0.5, 0.75])
+COS_INCIDENCE_EDGES = np.array([0.05, 0.1, 0.2, 0.5])
 SOLID_DIRECTIONS = 360  # of beams that find out what is solid
 SOLID_MARGIN_CELLS = 2  # a node this near to such a beam is free: the beams leave gaps
-CLASSES = (len(DIP_EDGES) + 1, len(DEPTH_EDGES) + 1, len(FACING_EDGES) + 1)
+CLASSES = (len(CLEARANCE_EDGES) + 1, len(DEPTH_RATIO_EDGES) + 1, len(COS_INCIDENCE_EDGES) + 1)
 
 
 @dataclass(frozen=True)
@@ -42,16 +43,16 @@ class TracedBeams:
 
     ranges: Array  # m; +inf if nothing is met within the grid
     jacobian: Array  # (N, B, 3) derivative of the ranges by x, y (m/m) and yaw (m/rad) of the laser
-    dip: Array  # m, smallest distance at which the beam passed another surface; +inf if it passed none
-    edge: Array  # depth behind the end, relative to a plane: 1 on a wall, near 0 at an edge
-    facing: Array  # cosine of incidence
+    clearance: Array  # m, smallest distance at which the beam passed another surface; +inf if it passed none
+    depth_ratio: Array  # depth behind the end, relative to a plane: 1 on a wall, near 0 at an edge
+    cos_incidence: Array  # cosine of incidence
 
     def classes(self) -> npt.NDArray[np.intp]:
         """Index (N, B) of each beam's class in the table of scales."""
         parts = (
-            np.digitize(self.dip, DIP_EDGES),
-            np.digitize(self.edge, DEPTH_EDGES),
-            np.digitize(self.facing, FACING_EDGES),
+            np.digitize(self.clearance, CLEARANCE_EDGES),
+            np.digitize(self.depth_ratio, DEPTH_RATIO_EDGES),
+            np.digitize(self.cos_incidence, COS_INCIDENCE_EDGES),
         )
         return np.ravel_multi_index(parts, CLASSES)
 
@@ -64,13 +65,14 @@ class DistanceField:
     origin: tuple[float, float]  # m in map, of node (0, 0)
     resolution: float  # m
 
-    def near(self, places: Array) -> Array:
+    def value_at(self, places: Array) -> Array:
         """Phi (N,) in m at the node nearest to each place (N, 2) m in map; NaN beyond the grid."""
         column, row = np.round((places - self.origin) / self.resolution).astype(int).T
-        inside = (column >= 0) & (row >= 0) & (column < self.phi.shape[1]) & (row < self.phi.shape[0])
-        phi = np.full(len(places), np.nan)
-        phi[inside] = self.phi[row[inside], column[inside]]
-        return phi
+        return values_at(self.phi, row, column, np.nan)
+
+    def as_stored(self) -> DistanceField:
+        """The field rounded to half precision, as it is stored, so that it can be evaluated with the same precision."""
+        return dataclasses.replace(self, phi=self.phi.astype(np.float16).astype(np.float32))
 
     def with_solids(self, places: Array) -> DistanceField:
         """The field, negative wherever no beam from ``places`` (S, 2) m passes.
@@ -88,10 +90,21 @@ class DistanceField:
         """Traces beams from laser poses (N, 3) in map along angles (B,) rad in the laser frame."""
         lasers, angles = np.asarray(lasers, float).reshape(-1, 3), np.asarray(angles, float)
         shape = (len(lasers), len(angles))
-        ranges, dip, edge, facing = (np.empty(shape) for _ in range(4))
+        ranges, clearance, depth_ratio, cos_incidence = (np.empty(shape) for _ in range(4))
         jacobian = np.empty((*shape, 3))
-        trace(self.phi, *self.origin, self.resolution, lasers, angles, ranges, jacobian, dip, edge, facing)
-        return TracedBeams(ranges, jacobian, dip, edge, facing)
+        trace(
+            self.phi,
+            *self.origin,
+            self.resolution,
+            lasers,
+            angles,
+            ranges,
+            jacobian,
+            clearance,
+            depth_ratio,
+            cos_incidence,
+        )
+        return TracedBeams(ranges, jacobian, clearance, depth_ratio, cos_incidence)
 
     def trace_behind(self, lasers: Array, angles: Array, ranges: Array) -> Array:
         """Ranges (N, B) in m to the next surface behind the one at ``ranges`` (N, B) m; +inf if there is none."""

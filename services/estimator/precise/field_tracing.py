@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 MIN_STEP_CELLS = 0.25  # shorter steps would take long along walls, longer ones would jump over corners
 MAX_STEPS = 2000
 BEAMS_AT_ONCE = 256  # traced in turns
-GRAZING = 0.05  # no derivative is computed if |n . u| is less (below three degrees of incidence, or at an edge)
+GRAZING = 0.05  # no derivative is computed if |n . u| is less: at an incidence above 87 degrees, or at an edge
 
 jit = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -46,13 +46,15 @@ def lookup(phi: Floats, x: float, y: float) -> tuple[float, float, float, bool]:
 
 
 @jit
-def trace_beams(phi: Floats, h: float, x: Array, y: Array, ux: Array, uy: Array, lengths: Array, dips: Array) -> None:
+def trace_beams(
+    phi: Floats, h: float, x: Array, y: Array, ux: Array, uy: Array, lengths: Array, clearances: Array
+) -> None:
     """Traces beams (B,) by sphere tracing, from starts and along directions in grid coordinates.
 
     Fills the length of each beam and the smallest distance at which it passed another surface, in m; +inf if there is
     none. The beams take turns step by step, because a processor overlaps steps that do not depend on each other.
     """
-    lengths[:], dips[:] = np.inf, np.inf
+    lengths[:], clearances[:] = np.inf, np.inf
     t, step, previous = np.zeros(len(x)), np.zeros(len(x)), np.zeros(len(x))
     falling, solid = np.zeros(len(x), np.bool_), np.ones(len(x), np.bool_)
     running, count = np.arange(len(x)), len(x)  # the first `count` of these beams have not ended
@@ -66,7 +68,7 @@ def trace_beams(phi: Floats, h: float, x: Array, y: Array, ux: Array, uy: Array,
             value /= h
             if value > 0.0:
                 if falling[b] and value > previous[b]:
-                    dips[b] = min(dips[b], previous[b] * h)
+                    clearances[b] = min(clearances[b], previous[b] * h)
                 solid[b], falling[b], previous[b] = False, value < previous[b], value
                 step[b] = max(0.98 * value, MIN_STEP_CELLS)  # not all of phi, because it is not exactly a distance
                 t[b] += step[b]
@@ -115,26 +117,27 @@ def trace(
     angles: Array,
     ranges: Array,
     jacobian: Array,
-    dip: Array,
-    edge: Array,
-    facing: Array,
+    clearance: Array,
+    depth_ratio: Array,
+    cos_incidence: Array,
 ) -> None:
     """Traces beams at ``angles`` (B,) from lasers (N, 3), and fills the fields of `field.TracedBeams`.
 
-    These are ranges (N, B), jacobian (N, B, 3), and dip, edge and facing (N, B). The derivative of a range is
-    dr = -(n . dp + r n . u' dyaw) / (n . u). Edge is the depth one cell behind the surface, relative to a plane.
+    These are ranges (N, B), jacobian (N, B, 3), and clearance, depth_ratio and cos_incidence (N, B). The derivative of
+    a range is dr = -(n . dp + r n . u' dyaw) / (n . u). The depth ratio is the depth one cell behind the surface,
+    relative to a plane.
     """
-    flat_ranges, flat_dip, flat_jacobian = ranges.reshape(-1), dip.reshape(-1), jacobian.reshape(-1, 3)
-    flat_edge, flat_facing = edge.reshape(-1), facing.reshape(-1)
+    flat_ranges, flat_clearance, flat_jacobian = ranges.reshape(-1), clearance.reshape(-1), jacobian.reshape(-1, 3)
+    flat_depth_ratio, flat_cos_incidence = depth_ratio.reshape(-1), cos_incidence.reshape(-1)
     for first in range(0, len(flat_ranges), BEAMS_AT_ONCE):
         part = slice(first, min(first + BEAMS_AT_ONCE, len(flat_ranges)))
         x, y, ux, uy = aim(ox, oy, h, lasers, angles, first, np.zeros(part.stop - first))
-        trace_beams(phi, h, x, y, ux, uy, flat_ranges[part], flat_dip[part])
+        trace_beams(phi, h, x, y, ux, uy, flat_ranges[part], flat_clearance[part])
         for n in range(len(x)):
             beam = first + n
             r = flat_ranges[beam]
             flat_jacobian[beam, :] = 0.0
-            flat_edge[beam], flat_facing[beam] = 0.0, 0.0
+            flat_depth_ratio[beam], flat_cos_incidence[beam] = 0.0, 0.0
             if r == np.inf:
                 continue
             hx, hy = x[n] + r / h * ux[n], y[n] + r / h * uy[n]
@@ -146,7 +149,7 @@ def trace(
                 flat_jacobian[beam, 0], flat_jacobian[beam, 1] = nx / cosine, ny / cosine
                 flat_jacobian[beam, 2] = r * (ny * ux[n] - nx * uy[n]) / cosine
             behind, _, _, _ = lookup(phi, hx + ux[n], hy + uy[n])
-            flat_edge[beam], flat_facing[beam] = -behind / (h * cosine), cosine
+            flat_depth_ratio[beam], flat_cos_incidence[beam] = -behind / (h * cosine), cosine
 
 
 @jit

@@ -14,13 +14,13 @@ from services.estimator.precise import beam_sums
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
-    from services.estimator.precise.gauss_newton import View
+    from services.estimator.precise.scan_likelihood import ScanLikelihood
     from services.estimator.shared.generative_models import GenerativeModel
 
 SEED_SPACING_M = 0.3  # between the places at which a search begins
 RANKED_HEADINGS = 120  # at each place, 3 degrees apart
-# Of the laser (9, 2) m, in its own frame, by a third of the spacing; the first is zero. A scan changes much over half
-# of the spacing, and comparing it as if the laser were displaced takes less memory than more panoramas.
+# Displacements (9, 2) m of the laser, in its frame, with which each panorama is compared: a third of the spacing; the
+# first is zero. A scan changes much over half of the spacing, and displacements take less memory than more panoramas.
 DISPLACEMENTS_M = 0.1 * np.stack(np.meshgrid([0, 1, -1], [0, 1, -1]), axis=-1).reshape(-1, 2)
 # A large map is ranked in stages, so that most places are compared with few beams only:
 PRESELECTION_BEAMS = 24  # or more, in the first two stages
@@ -66,48 +66,52 @@ class Seeds:
         extent = np.ptp(self.places, axis=0)
         return np.diag([*np.maximum(extent, SEED_SPACING_M) ** 2 / 12, np.pi**2 / 3])
 
-    def rank(self, view: View, count: int) -> Array:
+    def rank(self, scan: ScanLikelihood, count: int) -> Array:
         """The ``count`` base_link poses (count, 3) that fit the scan best, best first; at most two per place."""
-        places, panoramas, thinned = self.places, self.panoramas, view.thinned(PRESELECTION_BEAMS)
+        places, panoramas, thinned = self.places, self.panoramas, scan.thinned(PRESELECTION_BEAMS)
         stages = ((COARSELY_SELECTED_PLACES, DISPLACEMENTS_M[:1]), (FINELY_SELECTED_PLACES, DISPLACEMENTS_M))
         for max_places, displacements in stages:
             if len(places) > max_places:
                 misfits = _least_misfits(panoramas, thinned, displacements)
                 selected = np.sort(np.argsort(misfits, kind="stable")[:max_places])
                 places, panoramas = places[selected], panoramas[selected]
-        misfits, best_displacement = _misfits(panoramas, view.thinned(RANKED_BEAMS))
+        misfits, best_displacement = _misfits(panoramas, scan.thinned(RANKED_BEAMS))
         place, heading = _select(misfits, count)
         lasers = np.column_stack([places[place], se2.wrap(heading * (2 * np.pi / RANKED_HEADINGS))])
         displacements = DISPLACEMENTS_M[best_displacement[place, heading]]
         lasers = se2.compose(lasers, np.column_stack([displacements, np.zeros(len(lasers))]))
-        return se2.compose(lasers, se2.inverse(view.mount))
+        return se2.compose(lasers, se2.inverse(scan.mount))
 
 
-def _least_misfits(panoramas: npt.NDArray[np.uint8], view: View, displacements: Array) -> npt.NDArray[np.uint16]:
+def _least_misfits(
+    panoramas: npt.NDArray[np.uint8], scan: ScanLikelihood, displacements: Array
+) -> npt.NDArray[np.uint16]:
     """Misfit (S,) of a scan with each panorama, at the best heading and the best of the displacements (K, 2)."""
     no_headings = np.empty((0, RANKED_HEADINGS), np.uint16)
-    misfits = [_compare(panoramas, view, each, no_headings) for each in displacements]
+    misfits = [_compare(panoramas, scan, each, no_headings) for each in displacements]
     return np.asarray(np.min(misfits, axis=0))
 
 
-def _misfits(panoramas: npt.NDArray[np.uint8], view: View) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.intp]]:
+def _misfits(
+    panoramas: npt.NDArray[np.uint8], scan: ScanLikelihood
+) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.intp]]:
     """Misfit (S, H) of a scan with each panorama at each heading, and the index (S, H) of the best displacement."""
     misfits = np.empty((len(DISPLACEMENTS_M), len(panoramas), RANKED_HEADINGS), np.uint16)
     for displacement, each in zip(DISPLACEMENTS_M, misfits, strict=True):
-        _compare(panoramas, view, displacement, each)
+        _compare(panoramas, scan, displacement, each)
     best = misfits.argmin(axis=0)
     return np.take_along_axis(misfits, best[None], axis=0)[0], best
 
 
 def _compare(
-    panoramas: npt.NDArray[np.uint8], view: View, displacement: Array, misfits: npt.NDArray[np.uint16]
+    panoramas: npt.NDArray[np.uint8], scan: ScanLikelihood, displacement: Array, misfits: npt.NDArray[np.uint16]
 ) -> npt.NDArray[np.uint16]:
     """Returns the least misfit (S,) of a scan with each panorama if the laser is displaced by ``displacement`` (2,) m.
 
     Fills ``misfits`` (S, H) with those of all headings, unless it is empty.
     """
-    used = ~(np.isnan(view.ranges) | np.isneginf(view.ranges))
-    angles, ranges = view.angles[used], view.ranges[used]
+    used = ~(np.isnan(scan.ranges) | np.isneginf(scan.ranges))
+    angles, ranges = scan.angles[used], scan.ranges[used]
     returned = np.isfinite(ranges)
     directions = np.stack([np.cos(angles[returned]), np.sin(angles[returned])], axis=-1)
     end_points = ranges[returned, None] * directions + displacement
@@ -116,7 +120,7 @@ def _compare(
     words = panoramas.view(np.uint64)
     words.flags.writeable = False  # as arrays from a file are: numba would compile once more for others
     least = np.empty(len(panoramas), np.uint16)
-    beam_sums.rank_places(words, bins, _in_steps(ranges), int(_in_steps(np.array(view.range_max))), least, misfits)
+    beam_sums.rank_places(words, bins, _in_steps(ranges), int(_in_steps(np.array(scan.range_max))), least, misfits)
     return least
 
 

@@ -11,13 +11,13 @@ import numpy.typing as npt
 
 from common.geometry import se2
 from services.estimator.precise.gauss_newton import MAX_STEP, Prior, limit_steps, position_information
+from services.estimator.precise.likelihood import Evidence
 from services.estimator.precise.motion_model import smooth_velocity
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
-    from services.estimator.precise.gauss_newton import View
-    from services.estimator.precise.likelihood import Evidence
     from services.estimator.precise.motion_model import FusedMotion
+    from services.estimator.precise.scan_likelihood import ScanLikelihood
     from services.estimator.precise.swept_scan import Displacement
 
 NEAR_POSITION_M, NEAR_HEADING_RAD = 0.2, math.radians(5)  # a pose with a larger error is wrong
@@ -27,6 +27,10 @@ SAME_POSITION_M, SAME_HEADING_RAD = 0.1, 0.1  # of hypotheses nearer to one anot
 # deviations of it are added to the step (guesses).
 MIN_LOG_LIKELIHOOD_DROP, PROBE_DISTANCE_M, PROBE_MAP_DEVIATIONS = math.log(100), 0.1, 2.0
 WEAK_PRIOR = np.eye(3)  # 1/m², 1/rad²: keeps the covariance finite along unobserved directions
+# Probabilities (guesses): the least that the robot is at none of the hypotheses; and if it is at none, that it is at a
+# place that no search of the map finds
+UNKNOWN_PROBABILITY, OFF_MAP_PROBABILITY = 1e-5, 0.01
+MAX_HYPOTHESES = 8
 MIN_WEIGHT = 1e-9  # hypotheses with less weight are dropped
 # A hidden Markov model: the surfaces that a key scan shows for the first time are as the map predicts (0), clutter (1),
 # or in a room that the map lacks (2). The transitions are from one key scan (row) to the next (column). All of these
@@ -56,7 +60,7 @@ class TrackedHypothesis:
     motion_complexity: float = 0.0  # nats, see `motion_model.motion_complexity`
     velocity: Array | None = None  # (3,) in base_link; None while unknown
     # (3, 3) covariance of the pose with the scale errors of odometry, as in `MotionCandidate`
-    slip_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    pose_slip_cross_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
     weight: float = 1.0
     displacement: Displacement | None = None  # of a swept scan; None if it stands, or was not corrected
     # number of consecutive scans at which neither the map nor the local map showed the motion along some direction
@@ -82,21 +86,24 @@ class UnknownPlace:
     scan_log_likelihood: float = 0.0  # of the present scan
     weight: float = 1.0  # probability
 
-    def restart(self, probability: float, off_map: float) -> None:
-        """Starts with the ``probability`` that the robot is at no hypothesis, ``off_map`` that it is off the map."""
-        self.log_evidence, self.log_off_map = float(np.log(probability)), float(np.log(off_map))
+    def restart(self, probability: float, off_map_probability: float) -> None:
+        """Starts with the ``probability`` that the robot is at no hypothesis.
 
-    def allow(self, log_evidence: float) -> None:
+        It contains ``off_map_probability``, that the robot is off the map.
+        """
+        self.log_evidence, self.log_off_map = float(np.log(probability)), float(np.log(off_map_probability))
+
+    def raise_evidence(self, log_evidence: float) -> None:
         """Raises the evidence to at least this value, after a kidnapping or a match at a wrong place."""
         self.log_evidence = max(self.log_evidence, log_evidence)
 
-    def add_kidnapping_off_map(self, log_carried: float, off_map: float, log_new: float) -> None:
+    def add_kidnapping_off_map(self, log_kidnapped: float, log_new: float) -> None:
         """Adds the possibility that the robot was carried off the map just before the present scan.
 
-        ``log_carried`` is the evidence that it was carried at all, and ``off_map`` the probability that this ended off
-        the map. There, all surfaces of the scan are new, with the log likelihood ``log_new`` of the scan.
+        ``log_kidnapped`` is the evidence that it was carried anywhere. ``log_new`` is the scan's log likelihood off the
+        map, where all of its surfaces are new.
         """
-        log_off_map = log_carried + float(np.log(off_map)) + log_new - self.scan_log_likelihood
+        log_off_map = log_kidnapped + float(np.log(OFF_MAP_PROBABILITY)) + log_new - self.scan_log_likelihood
         self.log_off_map = max(self.log_off_map, log_off_map)
 
     @property
@@ -123,7 +130,7 @@ class UnknownPlace:
         self.log_evidence = self.log_off_map
 
 
-def unobserved_directions(view: View, poses: Array, curvatures: Array) -> list[Array]:
+def unobserved_directions(scan: ScanLikelihood, poses: Array, curvatures: Array) -> list[Array]:
     """The unit vectors (K, 3) of x, y, yaw that a scan does not observe at each of the ``poses`` (N, 3).
 
     ``curvatures`` (N, 3, 3) are those of its accuracy. There are usually none, and one along a corridor: that in which
@@ -134,63 +141,65 @@ def unobserved_directions(view: View, poses: Array, curvatures: Array) -> list[A
     axes = np.array([np.linalg.eigh(position_information(curvature))[1].T for curvature in curvatures])
     weakest, strongest = axes[:, 0], axes[:, 1]
     unobserved = [np.zeros((0, 3))] * len(poses)
-    rows = np.flatnonzero(~_are_observed(view, poses, curvatures, weakest))
+    rows = np.flatnonzero(~_are_observed(scan, poses, curvatures, weakest))
     if len(rows):
-        across = _are_observed(view, poses[rows], curvatures[rows], strongest[rows])
+        across = _are_observed(scan, poses[rows], curvatures[rows], strongest[rows])
         for k, observed in zip(rows, across, strict=True):
             unobserved[k] = np.array([[*weakest[k], 0.0]]) if observed else np.eye(3)
     return unobserved
 
 
-def _are_observed(view: View, poses: Array, curvatures: Array, directions: Array) -> npt.NDArray[np.bool_]:
+def _are_observed(scan: ScanLikelihood, poses: Array, curvatures: Array, directions: Array) -> npt.NDArray[np.bool_]:
     """Mask (N,) of the poses whose position along ``directions`` (N, 2) a scan shows, with the best heading there."""
     turns = -np.einsum("ni,ni->n", curvatures[:, 2, :2], directions) / np.maximum(curvatures[:, 2, 2], 1e-12)
-    distance = PROBE_DISTANCE_M + PROBE_MAP_DEVIATIONS * view.map_error
+    distance = PROBE_DISTANCE_M + PROBE_MAP_DEVIATIONS * scan.map_error
     steps = distance * np.column_stack([directions, turns])
-    here = view.surface_evidence(poses).log_likelihood
-    away = view.surface_evidence(np.concatenate([poses + steps, poses - steps])).log_likelihood
+    here = scan.surface_evidence(poses).log_likelihood
+    away = scan.surface_evidence(np.concatenate([poses + steps, poses - steps])).log_likelihood
     return np.asarray(here - away.reshape(2, -1).max(axis=0) > MIN_LOG_LIKELIHOOD_DROP)
 
 
-def project_evidence(evidence: Evidence, k: int, unobserved: Array) -> None:
-    """Sets the k-th evidence to 0, in place, along the unobserved directions: unit vectors (K, 3) of x, y, yaw."""
+def project_evidence(evidence: Evidence, unobserved: Array) -> Evidence:
+    """The evidence at one pose, set to 0 along the unobserved directions: unit vectors (K, 3) of x, y, yaw."""
     if not len(unobserved):
-        return
+        return evidence
     projection = np.eye(3) - unobserved.T @ unobserved
-    evidence.xi[k] = projection @ evidence.xi[k]
-    for matrix in (evidence.curvature, evidence.xi_noise_covariance, evidence.xi_model_covariance):
-        matrix[k] = projection @ matrix[k] @ projection
+    curvature, noise, model = (
+        (projection @ matrix[0] @ projection)[None]
+        for matrix in (evidence.curvature, evidence.xi_noise_covariance, evidence.xi_model_covariance)
+    )
+    return Evidence(evidence.accuracy, (projection @ evidence.xi[0])[None], curvature, noise, model)
 
 
 def hypothesis_from_search(
-    pose: Array, evidence: Evidence, k: int, prior: Prior | None, volume: float, spread: Array
+    pose: Array, evidence: Evidence, prior: Prior | None, volume: float, spread: Array
 ) -> TrackedHypothesis:
-    """A hypothesis found by a search: one more step from ``pose`` (3,), where the scan has the k-th evidence.
+    """A hypothesis found by a search: one more step from ``pose`` (3,), where the scan has this ``evidence``.
 
-    Without a prior, all poses in ``volume`` m² rad were equally likely, and ``spread`` (3, 3), the covariance of an
-    unknown pose, remains along the directions in which the evidence is zero.
+    The ``prior`` is that of this hypothesis alone. Without one, all poses in ``volume`` m² rad were equally likely, and
+    ``spread`` (3, 3), the covariance of an unknown pose, remains along the directions in which the evidence is zero.
     """
-    information = prior.information[k] if prior else np.linalg.inv(spread)
-    inverse = np.linalg.inv(evidence.curvature[k] + information)
-    slope = evidence.xi[k] + (prior.information[k] @ se2.difference(prior.mean[k], pose) if prior else 0)
+    information = prior.information[0] if prior else np.linalg.inv(spread)
+    inverse = np.linalg.inv(evidence.curvature[0] + information)
+    slope = evidence.xi[0] + (information @ se2.difference(prior.mean[0], pose) if prior else 0)
     pose = pose + limit_steps(inverse @ slope, MAX_STEP)
     pose[2] = se2.wrap(pose[2])
-    logdet = float(np.linalg.slogdet(evidence.curvature[k] + information)[1])
+    logdet = float(np.linalg.slogdet(evidence.curvature[0] + information)[1])
     if prior:
-        off = se2.difference(pose, prior.mean[k])
+        off = se2.difference(pose, prior.mean[0])
         complexity = 0.5 * float(np.trace(information @ inverse) - 3 + off @ information @ off + logdet)
         complexity -= 0.5 * float(np.linalg.slogdet(information)[1])
     else:
         complexity = float(np.log(volume)) + 0.5 * (logdet - 3 * np.log(2 * np.pi * np.e))
     return TrackedHypothesis(
         pose=pose,
-        noise_covariance=inverse @ (evidence.xi_noise_covariance[k] + information) @ inverse,
-        model_covariance=inverse @ evidence.xi_model_covariance[k] @ inverse,
-        accuracy=float(evidence.accuracy[k]),
+        noise_covariance=inverse @ (evidence.xi_noise_covariance[0] + information) @ inverse,
+        model_covariance=inverse @ evidence.xi_model_covariance[0] @ inverse,
+        accuracy=float(evidence.accuracy[0]),
         complexity=complexity,
-        xi=evidence.xi[k],
-        curvature=evidence.curvature[k],
-        log_evidence=0.0 if prior else float(_log_volume_of_place(evidence.curvature[k]) - np.log(volume)),
+        xi=evidence.xi[0],
+        curvature=evidence.curvature[0],
+        log_evidence=0.0 if prior else float(_log_volume_of_place(evidence.curvature[0]) - np.log(volume)),
     )
 
 
@@ -204,9 +213,9 @@ def _log_volume_of_place(curvature: Array) -> float:
 
 
 def update_hypothesis(
-    hypothesis: TrackedHypothesis, fused: FusedMotion, evidence: Evidence, k: int, period: float, *, unobserved: bool
+    hypothesis: TrackedHypothesis, fused: FusedMotion, evidence: Evidence, period: float, *, unobserved: bool
 ) -> TrackedHypothesis:
-    """The hypothesis after a scan, from its motion fused with the scan, and from the k-th evidence.
+    """The hypothesis after a scan, from its motion fused with the scan, and from the evidence at its pose.
 
     The scan's information reduces the noise covariance. The model's errors are alike from scan to scan, so their
     standard deviations are averaged instead of their variances, weighted by each scan's information. ``unobserved`` is
@@ -214,27 +223,27 @@ def update_hypothesis(
     not estimated, but their covariance with the pose shrinks.
     """
     inverse = np.linalg.inv(fused.information)
-    prior_information = fused.information - evidence.curvature[k]
-    inverse_of_scan = np.linalg.inv(evidence.curvature[k] + WEAK_PRIOR)
+    prior_information = fused.information - evidence.curvature[0]
+    inverse_of_scan = np.linalg.inv(evidence.curvature[0] + WEAK_PRIOR)
     deviation_before = _root(hypothesis.model_covariance)
-    scan_deviation = _root(inverse_of_scan @ evidence.xi_model_covariance[k] @ inverse_of_scan)
-    model_deviation = deviation_before + inverse @ evidence.curvature[k] @ (scan_deviation - deviation_before)
+    scan_deviation = _root(inverse_of_scan @ evidence.xi_model_covariance[0] @ inverse_of_scan)
+    model_deviation = deviation_before + inverse @ evidence.curvature[0] @ (scan_deviation - deviation_before)
     # A velocity is dropped unless it was observed in every direction, at this scan and the one before.
     velocity = None
     if not unobserved and not hypothesis.unobserved_scans:
         velocity = smooth_velocity(hypothesis.velocity, se2.between(hypothesis.pose, fused.mean) / period, period)
     return TrackedHypothesis(
         pose=fused.mean,
-        noise_covariance=inverse @ (evidence.xi_noise_covariance[k] + prior_information) @ inverse,
+        noise_covariance=inverse @ (evidence.xi_noise_covariance[0] + prior_information) @ inverse,
         model_covariance=model_deviation @ model_deviation.T,
-        accuracy=float(evidence.accuracy[k]),
+        accuracy=float(evidence.accuracy[0]),
         complexity=fused.complexity,
-        xi=evidence.xi[k],
-        curvature=evidence.curvature[k],
+        xi=evidence.xi[0],
+        curvature=evidence.curvature[0],
         log_evidence=hypothesis.log_evidence,
         surroundings=hypothesis.surroundings,
         velocity=velocity,
-        slip_covariance=inverse @ prior_information @ fused.candidate.slip_covariance,
+        pose_slip_cross_covariance=inverse @ prior_information @ fused.candidate.pose_slip_cross_covariance,
         unobserved_scans=hypothesis.unobserved_scans + 1 if unobserved else 0,
     )
 
@@ -271,14 +280,14 @@ def select_best(poses: Array, log_weights: Array, count: int) -> list[int]:
     return kept
 
 
-def weigh(hypotheses: list[TrackedHypothesis], log_unknown: float, count: int) -> tuple[list[TrackedHypothesis], float]:
+def weigh(hypotheses: list[TrackedHypothesis], log_unknown: float) -> tuple[list[TrackedHypothesis], float]:
     """Normalises the weights of the best hypothesis at each place, and drops those of negligible weight.
 
-    Returns up to ``count`` hypotheses, best first, whose weights sum to 1, and the probability that the robot is at
-    none of them. ``log_unknown`` is its unnormalised log weight.
+    Returns up to `MAX_HYPOTHESES` hypotheses, best first, whose weights sum to 1, and the probability that the robot is
+    at none of them. ``log_unknown`` is its unnormalised log weight.
     """
     logs = np.array([each.log_weight for each in hypotheses])
-    best = select_best(np.array([each.pose for each in hypotheses]), logs, count)
+    best = select_best(np.array([each.pose for each in hypotheses]), logs, MAX_HYPOTHESES)
     log_known = np.logaddexp.reduce(logs[best])
     weights = np.exp(logs[best] - log_known)
     kept = weights > MIN_WEIGHT

@@ -14,12 +14,12 @@ has the probability 1 - unseen, and all measured ranges are equally likely.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import ndtr
 
 from services.estimator.precise import beam_sums
 
@@ -28,9 +28,6 @@ if TYPE_CHECKING:
 
     from common.geometry.se2 import Array
     from services.estimator.shared.generative_models import Expected
-
-
-_erf = np.vectorize(math.erf, otypes=[float])
 
 
 @dataclass(frozen=True)
@@ -52,10 +49,14 @@ class Evidence:
         """Returns the evidence at some of the poses."""
         return Evidence(*(values[rows] for values in vars(self).values()))
 
-    def scale(self, row: int, factor: float) -> None:
-        """Multiplies the derivatives at one pose, and the covariances of xi, by ``factor``, in place."""
-        for values in (self.xi, self.curvature, self.xi_noise_covariance, self.xi_model_covariance):
-            values[row] *= factor
+    def at(self, row: int) -> Evidence:
+        """Returns the evidence at one of the poses."""
+        return Evidence(*(values[row : row + 1] for values in vars(self).values()))
+
+    def scaled(self, factor: float) -> Evidence:
+        """Returns the evidence with its derivatives, and the covariances of xi, multiplied by ``factor``."""
+        derivatives = (self.xi, self.curvature, self.xi_noise_covariance, self.xi_model_covariance)
+        return Evidence(self.accuracy, *(factor * each for each in derivatives))
 
 
 @dataclass(frozen=True)
@@ -121,7 +122,7 @@ class Likelihood:
     def cumulative(self, measured: Array, expected: Array, scale: Array, range_max: float) -> Array:
         """Probability (K,) of a range of at most ``measured`` (K,) m, given that the beam returns."""
         deviation = np.hypot(self.deviation(expected), scale)
-        core = 0.5 * (1 + _erf((measured - expected) / (np.sqrt(2) * deviation)))
+        core = ndtr((measured - expected) / deviation)
         early = np.minimum(measured / np.maximum(expected, 1e-3), 1.0)
         flat = np.minimum(measured / range_max, 1.0)
         return np.asarray((1 - self.short - self.random) * core + self.short * early + self.random * flat)

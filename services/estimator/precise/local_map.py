@@ -16,8 +16,8 @@ from scipy.spatial import cKDTree
 
 from common.geometry import se2
 from common.geometry.se2 import Array
-from services.estimator.precise.gauss_newton import View
 from services.estimator.precise.motion_model import MotionCandidate
+from services.estimator.precise.scan_likelihood import ScanLikelihood
 from services.estimator.precise.scan_surfaces import MIN_BEAMS
 from services.estimator.precise.surface_points import MIN_POINTS, Match, SurfacePoints, place_points
 
@@ -30,7 +30,8 @@ KEY_DISTANCE_M, KEY_TURN_RAD = 0.25, 0.35  # a key scan is taken after a motion 
 SEEN_RADIUS_M, SEEN_ACROSS_M = 0.15, 0.05
 MAX_SQUARED_MAHALANOBIS = 4.0  # of the result of a match from the prior
 CHANGE_MEMORY_S = 30.0  # time constant with which changes of the surroundings are forgotten (a guess)
-PRIOR_MOVED, PRIOR_STAYED = 1.0, 4.0  # surfaces that the map lacks, as if seen before the first scan (a guess)
+PRIOR_MOVED, PRIOR_STAYED = 1.0, 4.0  # pseudo-counts of surfaces that the map lacks (a guess)
+COUNT_PERIOD_S = 1.0  # a surface that moved or stayed counts once in this time between two scans, else in proportion
 # A beam that ends farther than this behind a surface has passed through it. Three standard deviations of the noise are
 # added in quadrature.
 PASSED_M = 0.1
@@ -45,12 +46,12 @@ class LocalScan:
     """A scan with its pose in the local frame."""
 
     pose: Array  # (3,) base_link in the local frame
-    view: View
+    scan: ScanLikelihood
 
     @property
     def points(self) -> Array:
         """End points (K, 2) of the beams that returned, m in the local frame."""
-        return place_points(self.view, self.pose)
+        return place_points(self.scan, self.pose)
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ class LocalMapScan(LocalScan):
     @property
     def unmapped_points(self) -> Array:
         """End points (K, 2), m in the local frame, of the beams not known to end at surfaces of the map."""
-        return self.points[~self.mapped[self.view.returned]] if self.tracked else self.points
+        return self.points[~self.mapped[self.scan.returned]] if self.tracked else self.points
 
 
 @dataclass
@@ -101,11 +102,12 @@ class ChangeRate:
 class MovedFraction:
     """Fraction of moving surfaces, such as people, among those that are not in the map; learned while driving.
 
-    It has a beta distribution, and returns to the prior with time. A surface is seen again and again, so it counts in
-    proportion to the time between two scans, but not more than once.
+    It has a beta distribution, whose parameters are counts of surfaces that return to the pseudo-counts of the prior
+    with time. A surface is seen again and again, so it counts in proportion to the time between two scans: once if
+    that is `COUNT_PERIOD_S` or more.
     """
 
-    moved: float = PRIOR_MOVED  # surfaces, forgotten exponentially
+    moved: float = PRIOR_MOVED
     stayed: float = PRIOR_STAYED
 
     @property
@@ -116,7 +118,7 @@ class MovedFraction:
     def learn(self, moved: int, stayed: int, period: float) -> None:
         """Learns from the surfaces of a scan, ``period`` s after the last one, and forgets earlier ones."""
         kept = math.exp(-period / CHANGE_MEMORY_S)
-        weight = min(1.0, period)
+        weight = min(1.0, period / COUNT_PERIOD_S)
         self.moved = kept * self.moved + (1 - kept) * PRIOR_MOVED + moved * weight
         self.stayed = kept * self.stayed + (1 - kept) * PRIOR_STAYED + stayed * weight
 
@@ -157,7 +159,7 @@ class LocalMap:
         self._points = self._unmapped = None
 
     def find_seen_and_appeared(
-        self, local: Array, view: View, mapped: npt.NDArray[np.bool_]
+        self, local: Array, scan: ScanLikelihood, mapped: npt.NDArray[np.bool_]
     ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
         """Two masks (B,) of the beams of a scan at ``local`` (3,).
 
@@ -168,26 +170,26 @@ class LocalMap:
           count as seen as soon as a key scan has points.
         - Appeared: the beam ends where a key scan saw free space. The surface is new, wherever the robot is.
         """
-        seen, appeared = np.zeros(len(view.ranges), np.bool_), np.zeros(len(view.ranges), np.bool_)
-        if not any(len(each.view.points) for each in self.scans):
+        seen, appeared = np.zeros(len(scan.ranges), np.bool_), np.zeros(len(scan.ranges), np.bool_)
+        if not any(len(each.scan.points) for each in self.scans):
             return seen, appeared
-        placed = LocalScan(local, view).points
-        noise = view.likelihood.deviation(view.ranges[view.returned])
+        placed = LocalScan(local, scan).points
+        noise = scan.likelihood.deviation(scan.ranges[scan.returned])
         near = self._surface_points().find_near(placed, SEEN_RADIUS_M, np.hypot(SEEN_ACROSS_M, 3 * noise))
         free = np.zeros(len(near), np.bool_)
         free[~near] = self._in_free_space(placed[~near])
-        appeared[view.returned] = free
-        unobserved = np.zeros(len(view.ranges), np.bool_)  # where the key scans saw neither a surface nor free space
-        unobserved[view.returned] = ~near & ~free
+        appeared[scan.returned] = free
+        unobserved = np.zeros(len(scan.ranges), np.bool_)  # where the key scans saw neither a surface nor free space
+        unobserved[scan.returned] = ~near & ~free
         known = near.copy()
-        unmapped = near & ~mapped[view.returned]
+        unmapped = near & ~mapped[scan.returned]
         distance, _ = self._tree_of_unmapped_points().query(placed[unmapped], distance_upper_bound=SEEN_RADIUS_M)
         known[unmapped] = np.isfinite(distance)
-        seen[:] = ~view.returned
-        seen[view.returned] = known
+        seen[:] = ~scan.returned
+        seen[scan.returned] = known
         # The first beam on a surface is the evidence for its place. If another part of it was seen before, more of a
         # known wall has come into view, which would count again with each such beam.
-        starts, surface = view.surfaces.starts, np.cumsum(view.surfaces.starts)
+        starts, surface = scan.surfaces.starts, np.cumsum(scan.surfaces.starts)
         seen |= starts & unobserved & (np.bincount(surface, seen)[surface] > 0)
         return seen, appeared
 
@@ -198,19 +200,19 @@ class LocalMap:
             free |= _passed(key, points, SEEN_RADIUS_M)
         return free
 
-    def match(self, starts: Array, view: View, prior: MotionCandidate) -> Match | None:
+    def match(self, starts: Array, scan: ScanLikelihood, prior: MotionCandidate) -> Match | None:
         """Returns the match of a scan with the key scans; ``starts`` (N, 3) and ``prior`` are in the local frame.
 
         Returns None if there are no key scans, if the scan has too few points, or fewer than half of them match, if the
         result contradicts ``prior``, or if the points have almost no information along some direction.
         """
-        if not self.scans or len(view.points) < MIN_POINTS:
+        if not self.scans or len(scan.points) < MIN_POINTS:
             return None
-        found = self._best_match(starts, view, prior)
+        found = self._best_match(starts, scan, prior)
         if found is None or found.matched_fraction < CLEAR_MATCHED_FRACTION:
             turned = np.repeat(starts[:1], len(EXTRA_HEADINGS_RAD), axis=0)
             turned[:, 2] = se2.wrap(turned[:, 2] + EXTRA_HEADINGS_RAD)
-            again = self._best_match(turned, view, prior)
+            again = self._best_match(turned, scan, prior)
             if again is not None and (found is None or again.score > found.score):
                 found = again
         return None if found is None or found.matched_fraction < MIN_MATCHED_FRACTION or found.degenerate else found
@@ -226,9 +228,9 @@ class LocalMap:
         covariance = match.covariance(turn.T @ prior_covariance @ turn + np.outer(motion, motion), moved_probability)
         return MotionCandidate(se2.compose(self.frame, match.pose), self.covariance + turn @ covariance @ turn.T, 1.0)
 
-    def _best_match(self, starts: Array, view: View, prior: MotionCandidate) -> Match | None:
+    def _best_match(self, starts: Array, scan: ScanLikelihood, prior: MotionCandidate) -> Match | None:
         points = self._surface_points()
-        found = [points.match(start, view, prior) for start in starts]
+        found = [points.match(start, scan, prior) for start in starts]
         plausible = [
             each for each in found if each is not None and prior.squared_distance(each.pose) < MAX_SQUARED_MAHALANOBIS
         ]
@@ -239,7 +241,7 @@ class LocalMap:
         if self._points is None:
             points = np.concatenate([each.points for each in self.scans])
             self._points = SurfacePoints.of(
-                points, np.concatenate([each.mapped[each.view.returned] for each in self.scans])
+                points, np.concatenate([each.mapped[each.scan.returned] for each in self.scans])
             )
         return self._points
 
@@ -258,7 +260,7 @@ def count_changes(last: LocalScan, now: LocalScan) -> int:
 def _count_passed(seen: LocalScan, by: LocalScan) -> int:
     """Number of surfaces in the scan ``seen`` of which more than half of the points are passed by beams of ``by``."""
     passed = _passed(by, seen.points, PASSED_M)
-    surface = np.cumsum(seen.view.surfaces.starts)[seen.view.returned]
+    surface = np.cumsum(seen.scan.surfaces.starts)[seen.scan.returned]
     beams, passed_beams = np.bincount(surface), np.bincount(surface, passed)
     return int(((passed_beams >= MIN_BEAMS) & (passed_beams > 0.5 * beams)).sum())
 
@@ -269,22 +271,22 @@ def is_key_pose(last: Array, pose: Array) -> bool:
     return bool(np.hypot(motion[0], motion[1]) >= KEY_DISTANCE_M or abs(motion[2]) >= KEY_TURN_RAD)
 
 
-def _passed(scan: LocalScan, points: Array, distance: float) -> npt.NDArray[np.bool_]:
-    """Mask (K,) of the local points (K, 2) m that beams of the scan passed by more than ``distance`` m.
+def _passed(by: LocalScan, points: Array, distance: float) -> npt.NDArray[np.bool_]:
+    """Mask (K,) of the local points (K, 2) m that beams of the scan ``by`` passed by more than ``distance`` m.
 
     Three standard deviations of the noise are added in quadrature.
     """
-    ranges, beam, inside = _beams_towards(scan.view, se2.compose(scan.pose, scan.view.mount), points)
-    margin = np.hypot(distance, 3 * scan.view.likelihood.deviation(ranges))
-    return np.asarray(inside & (scan.view.nearest_of_neighbours[beam] > ranges + margin))
+    ranges, beam, inside = _beams_towards(by.scan, se2.compose(by.pose, by.scan.mount), points)
+    margin = np.hypot(distance, 3 * by.scan.likelihood.deviation(ranges))
+    return np.asarray(inside & (by.scan.nearest_of_neighbours[beam] > ranges + margin))
 
 
 def _beams_towards(
-    view: View, laser: Array, points: Array
+    scan: ScanLikelihood, laser: Array, points: Array
 ) -> tuple[Array, npt.NDArray[np.intp], npt.NDArray[np.bool_]]:
     """Distances (K,) in m of points (K, 2) from a laser pose, their beams (K,), and whether they are in its view."""
     local = se2.transform(se2.inverse(laser), points)
-    order, angles = view.sorted_beams
+    order, angles = scan.sorted_beams
     turned = angles[0] + (np.arctan2(local[:, 1], local[:, 0]) - angles[0]) % (2 * np.pi)
     place = np.searchsorted((angles[1:] + angles[:-1]) / 2, turned)
     inside = (place > 0) & (place < len(angles) - 1)

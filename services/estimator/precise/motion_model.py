@@ -76,7 +76,7 @@ class MotionCandidate:
     covariance: Array  # (3, 3) in map
     probability: float
     # (3, 3) of the pose with the scale errors of odometry, which are in units of their standard deviation
-    slip_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    pose_slip_cross_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
     def squared_distance(self, pose: Array) -> float:
         """Squared Mahalanobis distance of ``pose`` (3,) from the mean."""
@@ -100,16 +100,18 @@ def predict_motion(
     odom: Array | None = None,
     command: Array | None = None,
     velocity: Array | None = None,
-    slip_covariance: Array | None = None,
+    pose_slip_cross_covariance: Array | None = None,
 ) -> list[MotionCandidate]:
     """Returns the candidates after ``period`` s, from the last posterior (3,), (3, 3); the last one is the widest.
 
-    ``slip_covariance`` (3, 3) is that of the posterior, 0 by default. ``odom`` (3,) is the motion since then in
-    base_link. ``command`` and ``velocity`` (3,) are in m/s, m/s, rad/s in base_link; a command takes precedence
-    over the velocity.
+    ``pose_slip_cross_covariance`` (3, 3) is that of the posterior, 0 by default. ``odom`` (3,) is the motion since then
+    in base_link. ``command`` and ``velocity`` (3,) are in m/s, m/s, rad/s in base_link; a command takes precedence over
+    the velocity.
     """
     full_speed = np.array([noise.speed, noise.speed, noise.turn]) * period
-    before = MotionCandidate(pose, covariance, 1.0, np.zeros((3, 3)) if slip_covariance is None else slip_covariance)
+    before = MotionCandidate(
+        pose, covariance, 1.0, np.zeros((3, 3)) if pose_slip_cross_covariance is None else pose_slip_cross_covariance
+    )
     likely = 1 - noise.unexpected
     # Of each motion that odometry does not give
     probability_of_others = likely if odom is None else likely * noise.unexpected
@@ -205,16 +207,18 @@ def _propagate(before: MotionCandidate, step: Array, deviation: Array, probabili
     pose_jacobian, step_jacobian = se2.compose_jacobians(before.mean, step)
     covariance = pose_jacobian @ before.covariance @ pose_jacobian.T + (step_jacobian * deviation**2) @ step_jacobian.T
     return MotionCandidate(
-        se2.compose(before.mean, step), covariance, probability, pose_jacobian @ before.slip_covariance
+        se2.compose(before.mean, step), covariance, probability, pose_jacobian @ before.pose_slip_cross_covariance
     )
 
 
 def _add_slip(candidate: MotionCandidate, lost: Array, yaw: float) -> MotionCandidate:
     """Adds the motion (3,) in base_link that slipping may have ``lost``, one standard deviation, at heading ``yaw``."""
     growth = se2.rotation(yaw) * lost
-    cross = growth @ candidate.slip_covariance.T
+    cross = growth @ candidate.pose_slip_cross_covariance.T
     covariance = candidate.covariance + cross + cross.T + growth @ growth.T
-    return replace(candidate, covariance=covariance, slip_covariance=candidate.slip_covariance + growth)
+    return replace(
+        candidate, covariance=covariance, pose_slip_cross_covariance=candidate.pose_slip_cross_covariance + growth
+    )
 
 
 def widen_unobserved(
@@ -247,7 +251,11 @@ def limit_covariance(candidate: MotionCandidate, unknown: Array) -> MotionCandid
         return candidate
     scale = 1 / np.maximum(excess, 1.0)
     covariance = candidate.covariance * np.outer(scale, scale)
-    return replace(candidate, covariance=covariance, slip_covariance=candidate.slip_covariance * scale[:, None])
+    return replace(
+        candidate,
+        covariance=covariance,
+        pose_slip_cross_covariance=candidate.pose_slip_cross_covariance * scale[:, None],
+    )
 
 
 def reachable_poses(noise: MotionNoise, pose: Array, period: float, basin: float) -> Array:

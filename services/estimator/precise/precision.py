@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common.robot.ranges import is_surface
-from services.estimator.precise.gauss_newton import CORRELATION_LENGTH_M
 from services.estimator.precise.noise import estimate_noise
 from services.estimator.precise.residuals import (
     LeastSquares,
@@ -22,11 +21,12 @@ from services.estimator.precise.residuals import (
     sum_over_pairs,
     variance_by_noise,
 )
+from services.estimator.precise.scan_likelihood import CORRELATION_LENGTH_M
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
-    from services.estimator.precise.gauss_newton import View
     from services.estimator.precise.likelihood import Likelihood
+    from services.estimator.precise.scan_likelihood import ScanLikelihood
 
 MIN_UPDATE_WEIGHT = 0.1  # of the newest scan, or key scan, in an average; the older ones fade accordingly
 MIN_CHANGED_FRACTION, MAX_CHANGED_FRACTION = 0.02, 0.5  # guesses
@@ -34,8 +34,9 @@ MIN_CHANGED_FRACTION, MAX_CHANGED_FRACTION = 0.02, 0.5  # guesses
 # walls, from which noise could be measured.
 MAX_NOISE_FACTOR = 4.0
 # The covariance of the errors on one segment of a surface is taken for the variance of the map's errors, so a segment
-# must be short enough that these are nearly equal along it. `CORRELATION_LENGTH_M` is longer: it says how far along a
-# surface errors still add up instead of averaging out.
+# must be short enough that these are nearly equal along it. Its length is measured across the beams: the sum of their
+# ranges times their spacing, so a segment of a surface that they graze is longer. `CORRELATION_LENGTH_M` is longer: it
+# says how far along a surface errors still add up instead of averaging out.
 SEGMENT_LENGTH_M = 0.5
 # Larger errors, with three standard deviations of the noise added in quadrature, are not the map's, but changes of the
 # surroundings.
@@ -119,14 +120,14 @@ class Precision:
         self.covariance_sum = self.covariance_sum_variance = self.expected_sum = self.model_variance = 0.0
         self.scans = 0
 
-    def learn_changes(self, view: View, pose: Array) -> None:
+    def learn_changes(self, scan: ScanLikelihood, pose: Array) -> None:
         """Learns the fraction of beams that do not end at the map's first surface, from a key scan at ``pose`` (3,)."""
-        used = view.ranges > -np.inf  # not NaN either
-        mapped = float(view.surface_evidence(pose[None]).weights.sum()) / max(1, int(used.sum()))
+        used = scan.ranges > -np.inf  # not NaN either
+        mapped = float(scan.surface_evidence(pose[None]).weights.sum()) / max(1, int(used.sum()))
         self.changed_fraction += MIN_UPDATE_WEIGHT * (1 - mapped - self.changed_fraction)
         self.changed_fraction = float(np.clip(self.changed_fraction, MIN_CHANGED_FRACTION, MAX_CHANGED_FRACTION))
 
-    def learn_map_error(self, view: View, pose: Array) -> None:
+    def learn_map_error(self, scan: ScanLikelihood, pose: Array) -> None:
         """Learns the map's errors from those of the prediction of a key scan at ``pose`` (3,).
 
         The map's errors are alike for beams on the same segment of a surface, but the scanner's noise is independent.
@@ -134,22 +135,22 @@ class Precision:
         changes about this is known (`LeastSquares.expected_covariance`). Scans at one place show the same errors, so
         only key scans are used.
         """
-        expected = view.expected(pose)
+        expected = scan.expected(pose)
         surface, scale, slope = expected.ranges[0], expected.scale[0], expected.slope[0]
         with np.errstate(invalid="ignore", divide="ignore"):
-            errors, noise = (view.ranges - surface) / slope, view.likelihood.deviation(surface) / slope
+            errors, noise = (scan.ranges - surface) / slope, scan.likelihood.deviation(surface) / slope
             used = (np.abs(errors) < np.hypot(MAX_MAP_ERROR_M, 3 * noise)) & np.isfinite(scale)
-        if used.sum() < max(MIN_LEARNING_BEAMS, MIN_LEARNING_FRACTION * len(view.ranges)):
+        if used.sum() < max(MIN_LEARNING_BEAMS, MIN_LEARNING_FRACTION * len(scan.ranges)):
             return
         errors, noise, surface, slope = errors[used], noise[used], surface[used], slope[used]
-        model_variance, spacing = (scale[used] / slope) ** 2, surface * view.spacing
-        surfaces = np.cumsum(view.surfaces.starts)[used]
+        model_variance, spacing = (scale[used] / slope) ** 2, surface * scan.spacing
+        surfaces = np.cumsum(scan.surfaces.starts)[used]
         segments = segment_ids(surfaces, spacing, SEGMENT_LENGTH_M)
         robust = robust_covariance(errors, segments) - float(np.median(model_variance))
-        if robust > view.map_error**2:  # with too small an assumed error, all surfaces would look changed
-            view = replace(view, map_error=float(np.sqrt(robust)))
-        # Weighted by length of surface instead of by beam, because near surfaces have more beams.
-        lengths = view.surface_evidence(pose[None]).weights[0, used] * spacing
+        if robust > scan.map_error**2:  # with too small an assumed error, all surfaces would look changed
+            scan = replace(scan, map_error=float(np.sqrt(robust)))
+        # Weighted by the length that each covers across the beams, because near surfaces have more beams.
+        lengths = scan.surface_evidence(pose[None]).weights[0, used] * spacing
         if sum_over_pairs(segments, lengths) <= 0:
             return
         design = np.column_stack([expected.jacobian[0, used] / slope[:, None], np.ones(len(errors))])
@@ -166,15 +167,15 @@ class Precision:
         weight = _update_weight(self.scans)
         self.model_variance += weight * (float(np.average(model_variance, weights=lengths)) - self.model_variance)
         if self.cell:
-            # Both in m³: a variance times the length of surface over which errors are alike, which for independent ones
-            # is the length that one beam covers. The former is as measured, without the prior, by which the offset of a
+            # Both in m³: a variance times the length over which errors are alike, which for independent ones is the
+            # length that one beam covers. The former is as measured, without the prior, by which the offset of a
             # grid drawn exactly along its cells would remain uncertain for long.
             correlated_part = (
                 max(0.0, self.covariance_sum) / max(self.expected_sum, MIN_EXPECTED_SUM) * CORRELATION_LENGTH_M
             )
             independent_part = float(np.average(model_variance + noise**2, weights=lengths) * lengths.mean())
             variance = (correlated_part + independent_part) * float(fit.inverse[3, 3])
-            self._learn_offset(view.map_offset + float(fit.gain[3] @ errors), variance)
+            self._learn_offset(scan.map_offset + float(fit.gain[3] @ errors), variance)
 
     def _learn_offset(self, measured: float, variance: float) -> None:
         """Learns the offset from a key scan, where it was ``measured`` in m with the ``variance`` in m²."""

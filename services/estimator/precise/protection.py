@@ -21,11 +21,11 @@ from services.estimator.precise.hypotheses import WEAK_PRIOR
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
-    from services.estimator.precise.gauss_newton import View
     from services.estimator.precise.likelihood import Evidence
+    from services.estimator.precise.scan_likelihood import ScanLikelihood
 
 EXCEEDANCE_PROBABILITY = 1e-4  # that the error exceeds the protection level, by design
-MISTAKEN_FRACTION = 0.01  # of a scan's surfaces, taken for a surface of the map but another one (a guess)
+MISTAKEN_FRACTION = 0.01  # of a scan's surfaces, matched to a wrong surface of the map (a guess)
 BISECTIONS = 20  # of an interval of some metres, to micrometres
 
 
@@ -39,14 +39,14 @@ class EstimateError:
     mistaken: float  # probability that a surface is mistaken, the same for each
 
     @classmethod
-    def from_scan(cls, view: View, pose: Array, covariance: Array, explained: float) -> EstimateError:
+    def from_scan(cls, scan: ScanLikelihood, pose: Array, covariance: Array, explained: float) -> EstimateError:
         """The error of ``pose`` (3,), at which the map explains the fraction ``explained`` of the scan's beams.
 
         ``covariance`` (3, 3) in map is that if no surface was mistaken. The number of mistaken surfaces does not depend
         on how many the map explains, so the fewer it explains, the more probably each of these is mistaken.
         """
         to_base = se2.rotation(-float(pose[2]))
-        offsets, widening = _estimate_without_each_surface(view.evidence_of_each_surface(pose), to_base)
+        offsets, widening = _estimate_without_each_surface(scan.evidence_of_each_surface(pose), to_base)
         mistaken = MISTAKEN_FRACTION / max(explained, MISTAKEN_FRACTION)
         return cls(to_base @ covariance @ to_base.T, offsets, widening, mistaken)
 

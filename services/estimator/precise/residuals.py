@@ -67,7 +67,7 @@ class LeastSquares:
 
     @classmethod
     def of(cls, design: Array, weights: Array) -> LeastSquares:
-        """See the attributes."""
+        """The fit for ``design`` (K, P), the derivative of the errors by the parameters, and ``weights`` (K,)."""
         weighted = design * weights[:, None]
         inverse = np.linalg.inv(design.T @ weighted + DAMPING * np.eye(design.shape[1]))
         return cls(design, weights, inverse, inverse @ weighted.T)

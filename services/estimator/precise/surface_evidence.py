@@ -40,8 +40,8 @@ COINCIDENCE = 0.3  # probability (a guess) that something new is within `NEAR_SI
 NEAR_SIGMAS = 3.0
 # If the map's range at the next beam is farther from the straight continuation of the surface, another surface starts.
 BORDER_M = 0.1
-PLAUSIBLE_SIGMAS = 2.0  # a larger error makes it less probable that a beam ends at a surface of the map
-MEAN_PENALTY = 0.04  # nats, of Gaussian errors due to that; it is added back, so that the penalty is 0 on average
+PLAUSIBLE_SIGMAS = 2.0  # a larger error is penalised, see `_log_density`
+MEAN_PENALTY = 0.04  # nats, mean of this penalty for Gaussian errors; it is added back, so that their mean is 0
 
 STATES = 4  # a constant, so that loops over the states are unrolled; array operations would allocate memory
 jit = numba.njit(cache=True, nogil=True, error_model="numpy")

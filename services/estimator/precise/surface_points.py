@@ -15,8 +15,9 @@ from scipy.special import expit, logit
 
 from common.geometry import se2
 from common.geometry.se2 import Array
-from services.estimator.precise.gauss_newton import View, position_information
+from services.estimator.precise.gauss_newton import position_information
 from services.estimator.precise.motion_model import MotionCandidate
+from services.estimator.precise.scan_likelihood import ScanLikelihood
 
 CELL_M = 0.05  # points within one cell are averaged
 NEIGHBOURS, NEIGHBOUR_RADIUS_M = 10, 0.3  # points through which the line along a surface is fitted
@@ -93,7 +94,7 @@ class SurfacePoints:
         variances[line] = squares[line, 0] / squares[line, 1]
         return cls(points, mapped, np.asarray(vectors[:, :, 0] * line[:, None]), variances, tree)
 
-    def match(self, start: Array, view: View, prior: MotionCandidate) -> Match | None:
+    def match(self, start: Array, scan: ScanLikelihood, prior: MotionCandidate) -> Match | None:
         """Matches a scan by iteratively reweighted Gauss-Newton from the pose ``start`` (3,).
 
         Returns None if too few points have a corresponding one.
@@ -101,7 +102,7 @@ class SurfacePoints:
         prior_information = CAUCHY_SCALE_M**2 * np.linalg.inv(prior.covariance)
         pose = np.array(start)
         for radius in CORRESPONDENCE_RADII_M:
-            placed = place_points(view, pose)
+            placed = place_points(scan, pose)
             distance, nearest = self.tree.query(placed, distance_upper_bound=radius)
             paired = np.isfinite(distance)
             if paired.sum() < MIN_POINTS:
@@ -116,7 +117,7 @@ class SurfacePoints:
             step = np.linalg.solve(H + prior_information, pull)
             pose = pose + step
             pose[2] = se2.wrap(pose[2])
-        placed = place_points(view, pose)
+        placed = place_points(scan, pose)
         distance, nearest = self.tree.query(placed)
         error = self._distance_from_line(placed, nearest)
         score = ((distance < 2 * MATCHED_RADIUS_M) / (1 + (error / CAUCHY_SCALE_M) ** 2)).mean()
@@ -131,7 +132,7 @@ class SurfacePoints:
         shown_by_fixed = subtract_spurious(of_fixed, (along[fixed].T * spurious[fixed]) @ along[fixed])
         weakest = np.linalg.eigh(position_information(shown_by_fixed + TIE_BREAK * H))[1][:, 0]
         shown = weight * (J[:, :2] @ weakest) ** 2 - spurious * (along[:, :2] @ weakest) ** 2
-        surface = np.cumsum(view.surfaces.starts)[view.returned][paired]
+        surface = np.cumsum(scan.surfaces.starts)[scan.returned][paired]
         movable = np.bincount(surface[~fixed], shown[~fixed]) > MIN_INFORMATION_RATIO * high
         return Match(
             pose,
@@ -157,9 +158,9 @@ class SurfacePoints:
         return np.asarray(np.einsum("ni,ni->n", self.normals[index], points - self.points[index]))
 
 
-def place_points(view: View, pose: Array) -> Array:
+def place_points(scan: ScanLikelihood, pose: Array) -> Array:
     """End points (K, 2) m of the beams of a scan that returned, with base_link at ``pose`` (3,)."""
-    return se2.transform(se2.compose(pose, view.mount), view.points)
+    return se2.transform(se2.compose(pose, scan.mount), scan.points)
 
 
 def subtract_spurious(information: Array, spurious: Array) -> Array:

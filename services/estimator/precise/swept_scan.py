@@ -27,8 +27,8 @@ from services.estimator.precise.likelihood import Evidence
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
-    from services.estimator.precise.gauss_newton import View
     from services.estimator.precise.motion_model import MotionNoise
+    from services.estimator.precise.scan_likelihood import ScanLikelihood
 
 
 @dataclass(frozen=True)
@@ -75,19 +75,21 @@ class SweptEvidence:
     joint: Evidence  # by all nine unknowns: xi (N, 9) of scan and prior, matrices (N, 9, 9) of the scan alone
     prior: Array  # (N, 6, 6) information of the accelerations before the scan
     at_stamp: Array  # (3, 6) the pose's displacement at the stamp, per acceleration: s²
-    assumed: Array  # (6,) accelerations in map for which the view was corrected
+    assumed: Array  # (6,) accelerations in map for which the scan was corrected
 
     @classmethod
-    def from_scan(cls, view: View, poses: Array, limits: Array, period: float, assumed: Array) -> SweptEvidence:
-        """The evidence at ``poses`` (N, 3) of a view that was corrected to the middle of its sweep.
+    def from_scan(
+        cls, scan: ScanLikelihood, poses: Array, limits: Array, period: float, assumed: Array
+    ) -> SweptEvidence:
+        """The evidence at ``poses`` (N, 3) of a scan that was corrected to the middle of its sweep.
 
         It was also corrected for the ``assumed`` accelerations (6,) in map. ``limits`` (2, 3) are those in base_link,
         and ``period`` s is the time since the last scan.
         """
-        factors = np.array([np.ones_like(view.times), *acceleration_factors(view.times, period)])
-        weights = view.surface_evidence(poses).weights
+        factors = np.array([np.ones_like(scan.times), *acceleration_factors(scan.times, period)])
+        weights = scan.surface_evidence(poses).weights
         products = {
-            (i, j): view.evidence(poses, 0.0, weights * factors[i] * factors[j])
+            (i, j): scan.evidence(poses, 0.0, weights * factors[i] * factors[j])
             for i, j in combinations_with_replacement(range(len(factors)), 2)
         }
         parts = [[products[min(i, j), max(i, j)] for j in range(len(factors))] for i in range(len(factors))]
@@ -105,7 +107,7 @@ class SweptEvidence:
         for row, part in zip(limits, (slice(3), slice(3, 6)), strict=True):
             prior[:, part, part] = to_map @ np.diag(3 / row**2) @ to_map.transpose(0, 2, 1)
         joint.xi[:, 3:] -= prior @ assumed
-        at_stamp = np.kron(factors[1:, int(np.argmin(view.times))], np.eye(3))
+        at_stamp = np.kron(factors[1:, int(np.argmin(scan.times))], np.eye(3))
         return cls(poses, joint, prior, at_stamp, assumed)
 
     def of_pose(self) -> Evidence:

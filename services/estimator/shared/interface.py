@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
+from common.geometry import se2
+
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
 
@@ -32,6 +34,16 @@ class Observation:
         Then the duration of the motion in between is unknown.
         """
         return self.stamp is not None and stamp is not None and self.stamp < stamp
+
+    def period_since(self, stamp: float | None, nominal: float) -> float:
+        """Time in s since the last scan, which had the ``stamp`` in s; ``nominal`` if it is unknown or not positive."""
+        if stamp is None or self.stamp is None or self.stamp <= stamp:
+            return nominal
+        return self.stamp - stamp
+
+    def odometry_since(self, odom: Array | None) -> Array | None:
+        """Motion (3,) in base_link by odometry since ``odom`` (3,), that of the last scan; None if one is unknown."""
+        return None if self.odom is None or odom is None else se2.between(odom, self.odom)
 
 
 def start_belief(pose: Array, covariance: Array) -> tuple[Array, Array]:

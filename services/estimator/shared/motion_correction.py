@@ -23,8 +23,9 @@ def correct_motion(
 ) -> Observation:
     """The observation as if all beams had been measured in the middle of the sweep; ``mount`` (3,) is the laser.
 
-    The robot moves with ``velocity`` (3,) in base_link, and at each beam is displaced from there by ``displacements``
-    (B, 3). If the velocity is unknown, the observation is unchanged.
+    The robot moves with ``velocity`` (3,), m/s, m/s and rad/s in base_link. At each beam it is displaced from that
+    motion by ``displacements`` (B, 3), m, m and rad in base_link. If the velocity is unknown, the observation is
+    unchanged.
     """
     if velocity is None or not observation.time_increment:
         return observation

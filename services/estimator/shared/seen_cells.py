@@ -10,6 +10,7 @@ import numba
 import numpy as np
 
 from common.geometry.occupancy_grid import UNKNOWN
+from services.estimator.shared.grid_values import values_at
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -49,17 +50,15 @@ class SeenCells:
     def contains(self, points: Array) -> npt.NDArray[np.bool_]:
         """Mask (N,) of the points (N, 2) m in map that lie in seen cells."""
         j, i = np.floor((points - self.origin) / SEEN_CELL_M).astype(int).T
-        inside = (i >= 0) & (j >= 0) & (i < self.cells.shape[0]) & (j < self.cells.shape[1])
-        found = np.zeros(len(points), np.bool_)
-        found[inside] = self.cells[i[inside], j[inside]]
-        return found
+        return values_at(self.cells, i, j, beyond=False)
 
     def limit(self, lasers: Array, angles: Array, ranges: Array, jacobian: Array, scale: Array) -> None:
-        """Ends beams (N, B) where they enter cells that were not seen, with an infinite scale there, in place."""
+        """Ends beams (N, B) in place, with an infinite scale, once they have passed `SEEN_CELL_M` of unseen cells.
+
+        Less is ignored, as where a beam cuts the corner of a cell.
+        """
         lasers, angles = np.asarray(lasers, float).reshape(-1, 3), np.asarray(angles, float)
-        _end_in_unseen_cells(
-            self.cells, *self.origin, SEEN_CELL_M, lasers, angles, SEEN_CELL_M, ranges, jacobian, scale
-        )
+        _end_in_unseen_cells(self.cells, *self.origin, SEEN_CELL_M, lasers, angles, ranges, jacobian, scale)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -70,12 +69,11 @@ def _end_in_unseen_cells(
     h: float,
     lasers: Array,
     angles: Array,
-    allowed: float,
     ranges: Array,
     jacobian: Array,
     scale: Array,
 ) -> None:
-    """Ends each beam where it has passed more than ``allowed`` m of unseen cells, with infinite scale there."""
+    """Ends each beam where it has passed more than ``h`` m, the edge length, of unseen cells, with infinite scale."""
     rows, columns = seen.shape
     for k in range(lasers.shape[0]):
         for b in range(angles.shape[0]):
@@ -86,7 +84,7 @@ def _end_in_unseen_cells(
                 inside = x >= 0.0 and x < columns and y >= 0.0 and y < rows
                 if not inside or not seen[int(y), int(x)]:
                     unseen_length += step
-                    if unseen_length > allowed:
+                    if unseen_length > h:
                         ranges[k, b], scale[k, b] = t, np.inf
                         jacobian[k, b, :] = 0.0
                         break

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from common.geometry import se2
 from common.messages.definitions import BeliefHypothesis, Pose
 from common.robot.robot import Robot
 from common.robot.scan_geometry import Sector
@@ -13,6 +14,7 @@ from services.controller.policies.active_localisation import (
     INITIAL_WAIT_NS,
     ActiveLocaliser,
     StallTimer,
+    UnseenPoints,
 )
 from services.controller.policies.free_space import FreeSpace
 from services.controller.policies.geodesic_field import FreeSpaceGraph
@@ -34,6 +36,19 @@ def test_weight_of_the_second_hypothesis(weight, counted):
         assert paths is None
     else:
         assert paths.weights.tolist() == pytest.approx([1 - weight, counted])
+
+
+def test_obstacle_that_leaves_the_field_of_view():
+    """It is kept for 5 s where dead reckoning expects it, unless it should be in view again and is not."""
+    seen, empty, turn = scan(0, [3.0, 2.0, 0.0], room(10, 4)), np.zeros((0, 2)), np.array([0.0, 0.0, -0.5])
+    points, leg = UnseenPoints(), np.array([[-0.3, 0.5]])  # 121 degrees to the left; the scanner sees up to 135
+    assert np.array_equal(points.update(0, np.zeros(3), leg, seen), leg)
+    np.testing.assert_allclose(points.update(10**9, turn, empty, seen), se2.rotate(0.5, leg))
+    np.testing.assert_allclose(points.update(4 * 10**9, np.array([0.1, 0.0, 0.0]), empty, seen)[0, 1], 0.295, atol=0.01)
+    assert len(points.update(5 * 10**9, np.zeros(3), empty, seen)) == 0
+    points.update(6 * 10**9, np.zeros(3), leg, seen)
+    assert len(points.update(7 * 10**9, turn, empty, seen)) == 1
+    assert len(points.update(8 * 10**9, -turn, empty, seen)) == 0
 
 
 def test_time_for_progress():

@@ -15,6 +15,7 @@ from common.geometry.world import World
 from services.controller.policies.free_space import FreeSpace, Grid
 from services.controller.policies.geodesic_field import (
     MAX_WALL_COST,
+    OBSTACLE_GAP_M,
     WALL_COST_RANGE_M,
     WALL_GAP_M,
     FreeSpaceGraph,
@@ -162,7 +163,8 @@ def test_graph_of_present_obstacles(name):
         rebuilt = FreeSpaceGraph(graph.free, RADIUS)
         rebuilt.set_obstacles(points)
         distance = np.hypot(*(graph.grid.centres()[:, None] - points).transpose(2, 0, 1)).min(axis=1, initial=np.inf)
-        exact, clearance = np.minimum(graph.free.clearance.ravel(), distance), graph.clearance.ravel()
+        exact = np.minimum(graph.free.clearance.ravel(), distance - (OBSTACLE_GAP_M - WALL_GAP_M))
+        clearance = graph.clearance.ravel()
         relevant = exact < graph.min_clearance + WALL_COST_RANGE_M
         np.testing.assert_allclose(clearance[relevant], exact[relevant], rtol=0, atol=1e-12)
         assert (clearance[~relevant] >= graph.min_clearance + WALL_COST_RANGE_M).all()

@@ -12,6 +12,7 @@ from common.geometry.world import Obstacle, World
 from common.messages.definitions import BeliefHypothesis, Pose
 from common.messages.requests import PredictReply
 from common.robot.robot import Robot
+from common.robot.scanner import SCANNERS
 from services.controller.policies.planner import GeodesicPolicy
 from services.controller.policies.straight_line import StraightLinePolicy
 from tests.common.geometry.maps import rooms
@@ -76,6 +77,35 @@ def test_time_without_beliefs_is_not_time_without_progress(pause_s, refused):
     stamps_s = np.arange(50) * 0.066 + np.where(np.arange(50) > 25, pause_s, 0.0)
     decisions = [policy.decide(belief(int(1e9 * stamp), pose), np.zeros(3), np.zeros(3)) for stamp in stamps_s]
     assert any(decision.refused for decision in decisions) == refused
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_turning_around_is_not_being_stuck(kind):
+    """A robot that turns slowly first has to turn to a goal behind it."""
+    robot = Robot(drive=kind, max_turn=0.5)
+    _, statuses, _ = drive(HALL, robot, (5.0, 2.5, 0.0), goal(4.8, 2.5), 300)
+    assert statuses[-1].state == "reached"
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("kind", KINDS)
+def test_gap_between_boxes(kind, seed):
+    """The path leads through gaps only if motions through them are allowed, with noise as well."""
+    world = room(10, 6, box(5, 3.35, 0.46, 0.65, "a"), box(5.09, 1.98, 0.46, 0.65, "b"))
+    scanner = SCANNERS["tim571"].with_beams(271)
+    start, to = (2.03, 2.16, 0.86), goal(7.31, 3.15)
+    _, statuses, contacts = drive(
+        world, Robot(drive=kind), start, to, 240, known=room(10, 6), scanner=scanner, seed=seed
+    )
+    assert (statuses[-1].state, contacts) == ("reached", 0)
+
+
+def test_corridor_that_tells_little_about_the_pose():
+    """The ambiguity of the line ahead is summed exactly enough that the robot drives on."""
+    robot = Robot(drive="differential", max_speed=1.5, acceleration=0.3)
+    scanner = SCANNERS["tim571"].with_beams(135).model_copy(update={"range_max": 4.0})
+    _, statuses, _ = drive(room(20, 4), robot, (1.5, 2.0, 0.0), goal(18.5, 2.0), 300, scanner=scanner)
+    assert statuses[-1].state == "reached"
 
 
 def test_driving_past_the_goal_is_not_being_stuck():

@@ -71,11 +71,11 @@ def test_interpolation():
 @pytest.mark.parametrize(
     ("scanner", "reason"),
     [
-        (SCANNERS["lms200"], "does not look towards -135 deg of base_link"),
-        (like_tim571(mount=(0.2, 0.0, 0.2)), "does not look towards -135 deg"),
-        (like_tim571(fov=7.0), "its beams go round more than once, 401 deg from"),
-        (like_tim571(beams=61), r"beams are 4.50 deg apart, theirs 1.00, and 4 times"),
-        (like_tim571(mount=(0.2, 0.1, 0.0)), r"mounted at \(0.2, 0.1\) m, theirs at \(0.2, 0\) m"),
+        (SCANNERS["lms200"], "has no beams towards -135 deg in base_link"),
+        (like_tim571(mount=(0.2, 0.0, 0.2)), "has no beams towards -135 deg"),
+        (like_tim571(fov=7.0), "the scan's beams cover 401 deg, more than a full turn"),
+        (like_tim571(beams=61), r"beams are 4.50 deg apart; these weights accept at most 4.00 deg"),
+        (like_tim571(mount=(0.2, 0.1, 0.0)), r"mounted at \(0.2, 0.1\) m, but the weights are for \(0.2, 0\) m"),
     ],
 )
 def test_unfit_scanner(scanner, reason):

@@ -93,7 +93,7 @@ def test_known_start():
 @pytest.mark.parametrize("beams", [622, 811])
 def test_shipped_weights(beams):
     """From the map's centre, 25 scans: most beliefs end within 1 m, the median within 0.25 m."""
-    model, card = weights.load(weights.find(SHIPPED, "corridor", "paper", beams))
+    model, card = weights.load(weights.find(SHIPPED, "corridor", beams))
     world, rng = load_world("corridor"), np.random.default_rng(5)
     assert card.world == world, "the corridor changed after the weights were trained: train them again"
     errors = []

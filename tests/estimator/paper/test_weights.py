@@ -26,7 +26,7 @@ def card(**changes) -> weights.ModelCard:
 
 def saved(folder) -> tuple:
     torch.manual_seed(0)
-    path = weights.path_of(folder, "room", "paper", 64)
+    path = weights.path_of(folder, "room", 64)
     decoder = Decoder(card().shape())
     weights.save(path, decoder, card())
     return path, decoder
@@ -43,17 +43,17 @@ def test_saved_and_loaded(tmp_path):
 
 def test_find(tmp_path):
     path, _ = saved(tmp_path)
-    assert weights.available(tmp_path, "room", "paper") == {64: path}
-    assert weights.find(tmp_path, "room", "paper", 64) == path
+    assert weights.available(tmp_path, "room") == {64: path}
+    assert weights.find(tmp_path, "room", 64) == path
     with pytest.raises(UserError, match="presage train --world room --preset paper --scanner tim571 --beams 99"):
-        weights.find(tmp_path, "room", "paper", 99)
+        weights.find(tmp_path, "room", 99)
     with pytest.raises(UserError, match="there are none in"):
-        weights.find(tmp_path / "empty", "room", "paper", 64)
+        weights.find(tmp_path / "empty", "room", 64)
 
 
 @pytest.mark.parametrize("beams", [622, 811])
 def test_shipped_weights(beams):
-    path = weights.find(SHIPPED, "corridor", "paper", beams)
+    path = weights.find(SHIPPED, "corridor", beams)
     model, read = weights.load(path)
     assert path.stat().st_size < 4e6
     assert read.samples == 13_000

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -381,10 +382,13 @@ def test_alternatives_along_a_corridor():
     feed(made, scene, here, 1)
     before = replace(made.hypotheses[0], noise_covariance=np.diag([4.0, 1e-6, 1e-6]))
     made.hypotheses = [before]
-    view = made._view(scene.observe(scene.clean((here + turn)[None])[0], 1 / 15))
+    view = made._scan_likelihood(scene.observe(scene.clean((here + turn)[None])[0], 1 / 15))
     motions = made._predict_motion(before, 1 / 15, None, None)  # standing still is expected
     match = made._match_map(view, [motions], 1 / 15, with_odometry=False)
+    evidence = deepcopy(match.evidence)
     best, motion = made._fuse(0, match, motions, scene.observe(scene.clean((here + turn)[None])[0], 1 / 15))
+    for name, values in vars(evidence).items():
+        assert np.array_equal(getattr(match.evidence, name), values)  # the match still states what the scan shows
     assert np.abs(best.pose - here - turn).max() < 0.01
     assert not made._find_alternatives(view, before, motion, motions)  # the match did not make the pose more certain
     found = made._find_alternatives(view, best, motion, motions)

@@ -13,7 +13,7 @@ from common.geometry import se2
 from common.geometry.ray_casting import MIN_COSINE
 from common.geometry.world import World
 from services.estimator.precise import beam_sums, global_seeds
-from services.estimator.precise.gauss_newton import MAX_STEP, Prior, View
+from services.estimator.precise.gauss_newton import MAX_STEP, Prior
 from services.estimator.precise.global_seeds import Seeds, thin_places
 from services.estimator.precise.hypotheses import (
     SURROUNDINGS_TRANSITIONS,
@@ -34,6 +34,7 @@ from services.estimator.precise.motion_model import (
     predict_motion,
     widen_unobserved,
 )
+from services.estimator.precise.scan_likelihood import ScanLikelihood
 from services.estimator.precise.search import NEAR_SCHEDULE_M
 from services.estimator.shared.generative_models import Expected, RayCaster
 from tests.estimator.models import ROOM
@@ -49,7 +50,7 @@ def scan(pose, rng, sigma=0.02):
 
 
 def view(ranges, likelihood=None, range_max=25.0):
-    return View(RayCaster(ROOM), likelihood or Likelihood(), MOUNT, ANGLES, ranges, range_max)
+    return ScanLikelihood(RayCaster(ROOM), likelihood or Likelihood(), MOUNT, ANGLES, ranges, range_max)
 
 
 @pytest.mark.parametrize(("expected", "scale"), [(5.0, 1e-3), (5.0, 0.3), (12.0, 0.05), (np.inf, 0.1)])
@@ -282,8 +283,10 @@ def test_drift():
     def drifted(steps):
         pose, P, drift = TRUTH, np.zeros((3, 3)), None
         for step in steps:
-            moved = expected_motion(predict_motion(noise, pose, P, 0.1, odom=np.array(step), slip_covariance=drift))
-            pose, P, drift = moved.mean, moved.covariance, moved.slip_covariance
+            moved = expected_motion(
+                predict_motion(noise, pose, P, 0.1, odom=np.array(step), pose_slip_cross_covariance=drift)
+            )
+            pose, P, drift = moved.mean, moved.covariance, moved.pose_slip_cross_covariance
         return se2.rotation(-TRUTH[2]) @ P @ se2.rotation(-TRUTH[2]).T
 
     assert drifted([[0.2, 0, 0]] * 50) == pytest.approx(np.diag([1.0, 0, 0]), abs=1e-9)
@@ -320,12 +323,12 @@ def test_hypothesis_weights():
         make_hypothesis(0.01, -3.0),
         make_hypothesis(9.0, -5000.0),
     ]
-    found, unknown = weigh(hypotheses, -2.0, 8)
+    found, unknown = weigh(hypotheses, -2.0)
     assert [m.pose[0] for m in found] == [0.0, 5.0]
     assert found[0].weight / found[1].weight == pytest.approx(np.e)
     assert sum(m.weight for m in found) == pytest.approx(1)
     assert unknown / (1 - unknown) == pytest.approx(np.exp(-2) / (1 + np.exp(-1)))
-    (best,), unknown = weigh(hypotheses, 5000.0, 1)
+    (best,), unknown = weigh(hypotheses[1:2], 5000.0)
     assert best.weight == unknown == 1
 
 
@@ -334,7 +337,7 @@ def test_unobserved_directions():
     hall = RayCaster(World(name="hall", boundary=[(0, 0), (20, 0), (20, 2), (0, 2)]))
     pose = np.array([10.0, 1.0, 0.3])
     clean = hall.expect(pose[None], ANGLES).ranges[0]
-    seen = View(hall, Likelihood(), np.zeros(3), ANGLES, clean, 25.0)
+    seen = ScanLikelihood(hall, Likelihood(), np.zeros(3), ANGLES, clean, 25.0)
     curvature = seen.evidence(pose[None]).curvature
     assert unobserved_directions(seen, pose[None], curvature)[0].shape == (0, 3)
     rough, near = replace(seen, map_error=0.04), pose + np.array([[dx, 0, 0] for dx in (-0.04, 0, 0.04)])

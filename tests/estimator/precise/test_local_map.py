@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from common.geometry import se2
 from common.geometry.world import World
 from lab.accuracy.scenes import Scene
-from services.estimator.precise.gauss_newton import View
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.local_map import (
     KEY_DISTANCE_M,
@@ -27,6 +26,7 @@ from services.estimator.precise.local_map import (
     count_changes,
 )
 from services.estimator.precise.motion_model import MotionCandidate
+from services.estimator.precise.scan_likelihood import ScanLikelihood
 from services.estimator.shared.generative_models import RayCaster
 from tests.estimator.models import ROOM
 from tests.estimator.precise.test_changes import HALL
@@ -38,7 +38,7 @@ STEP = np.diag([0.2, 0.2, 0.3]) ** 2
 def view(scene, pose):
     seen = scene.observe(scene.clean(np.array(pose)[None])[0], 0.0)
     mount = np.array(scene.scanner.mount)
-    return View(RayCaster(HALL), Likelihood(), mount, seen.angles, seen.ranges, seen.range_max)
+    return ScanLikelihood(RayCaster(HALL), Likelihood(), mount, seen.angles, seen.ranges, seen.range_max)
 
 
 def match_near(made, pose, scan):
@@ -115,7 +115,7 @@ def changed(scan, beams, factor):
     """The scan with some of its ranges multiplied."""
     ranges = scan.ranges.copy()
     ranges[beams] *= factor
-    return View(scan.model, scan.likelihood, scan.mount, scan.angles, ranges, scan.range_max)
+    return ScanLikelihood(scan.model, scan.likelihood, scan.mount, scan.angles, ranges, scan.range_max)
 
 
 def test_seen_surfaces():
@@ -227,7 +227,7 @@ def test_moved_fraction():
 def test_beams_of_a_corrected_scan():
     """Each point belongs to its own beam, although the beams are not evenly spaced."""
     angles = np.linspace(-2, 2, 50) + 0.03 * np.sin(np.linspace(0, 6, 50))
-    uneven = View(RayCaster(HALL), Likelihood(), np.zeros(3), angles, np.full(50, 2.0), 25.0)
+    uneven = ScanLikelihood(RayCaster(HALL), Likelihood(), np.zeros(3), angles, np.full(50, 2.0), 25.0)
     _, beam, inside = _beams_towards(uneven, HERE, se2.transform(HERE, uneven.points))
     assert inside.sum() == 48
     assert (beam[inside] == np.arange(1, 49)).all()

@@ -48,7 +48,7 @@ def test_errors_and_beam_classes():
     error = np.abs(found.ranges - ANALYTIC_WORLD.ray_distances(poses, ANGLES))
     # A curve of 0.4 m between nodes 0.05 m apart bulges by 0.05² / (8 * 0.4) = 0.8 mm.
     assert np.quantile(error, 0.98) < 2e-3
-    unsure = (found.dip < 0.03) | (found.edge < 0.75) | (found.facing < 0.3)
+    unsure = (found.clearance < 0.03) | (found.depth_ratio < 0.75) | (found.cos_incidence < 0.3)
     assert error[~unsure].max() < 5e-3
     assert error[unsure].max() > 0.1  # large errors occur only in these classes
 

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from common.geometry import se2
 from common.geometry.world import World
-from services.estimator.precise.gauss_newton import View
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.precision import Precision
 from services.estimator.precise.residuals import LeastSquares, error_covariance
+from services.estimator.precise.scan_likelihood import ScanLikelihood
 from services.estimator.shared.generative_models import Expected, RayCaster
 from tests.estimator.models import ROOM
 
@@ -49,7 +49,7 @@ def learned(model, noise, seed):
         ranges = clean + noise * rng.standard_normal(len(clean))
         likelihood = precision.update_noise(Likelihood(sigma=CONFIGURED_SIGMA_M), ranges, ANGLES)
         precision.learn_map_error(
-            View(model, likelihood, MOUNT, ANGLES, ranges, 25.0, map_error=precision.map_error), pose
+            ScanLikelihood(model, likelihood, MOUNT, ANGLES, ranges, 25.0, map_error=precision.map_error), pose
         )
     return precision.map_error
 
@@ -64,7 +64,8 @@ def test_noise_is_no_error_of_the_map(noise, seed):
 
 @pytest.mark.parametrize("value", [np.inf, -np.inf])
 def test_scans_without_returns_show_no_noise(value):
-    precision, exact = Precision(), Likelihood(sigma=0.01)  # a tenth of it is less than the least noise that is learned
+    # So that the estimate from no range at all, MIN_SIGMA_M, would be near enough to be learned
+    precision, exact = Precision(), Likelihood(sigma=0.01)
     assert precision.update_noise(exact, np.full(622, value), ANGLES) == exact
     assert not precision.noise_scans
 
@@ -98,7 +99,7 @@ def learned_in_small_rooms(deviation, cell=0.0, beams=400, noise=0.01):
         true, in_map = room(0.0, rng), RayCaster(room(deviation, rng))
         for pose in true.sample_poses(20, rng, 0.5):
             ranges = true.ray_distances(pose[None], angles)[0] + noise * rng.standard_normal(beams)
-            view = View(
+            view = ScanLikelihood(
                 in_map, Likelihood(noise), np.zeros(3), angles, ranges, 25.0,
                 map_error=precision.map_error, correlated_fraction=precision.correlated_fraction,
             )  # fmt: skip
@@ -153,7 +154,7 @@ def learn_in_cells(precision, offset, count, rng, assumed=None):
     for pose in ROOM.sample_poses(count, rng, 0.3):
         seen = RayCaster(ROOM).expect(se2.compose(pose, MOUNT)[None], ANGLES)
         ranges = seen.ranges[0] + offset * seen.slope[0] + 0.02 * rng.standard_normal(len(ANGLES))
-        view = View(
+        view = ScanLikelihood(
             RayCaster(ROOM), Likelihood(sigma=0.02), MOUNT, ANGLES, ranges, 25.0, map_error=precision.map_error,
             map_offset=precision.offset if assumed is None else assumed,
         )  # fmt: skip

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from common.geometry.world import World
 from services.estimator.precise import surface_evidence
-from services.estimator.precise.gauss_newton import View
 from services.estimator.precise.likelihood import Likelihood
+from services.estimator.precise.scan_likelihood import ScanLikelihood
 from services.estimator.precise.scan_surfaces import ScanSurfaces
 from services.estimator.precise.surface_evidence import CHANGED_STATE_PRIOR, SurfaceEvidence, find_borders
 from services.estimator.shared.generative_models import Expected, RayCaster
@@ -190,7 +190,7 @@ def test_edges_of_a_grid():
     cells = {"box": {"center": (3.8, 3.0), "size": (0.1, 0.3)}}
     in_map = RayCaster(World(name="square", boundary=SQUARE, obstacles=[cells]))
     log_likelihood = [
-        View(in_map, Likelihood(SIGMA_M), np.zeros(3), ANGLES, scan(WALL, [column]), 25.0, map_cell=cell)
+        ScanLikelihood(in_map, Likelihood(SIGMA_M), np.zeros(3), ANGLES, scan(WALL, [column]), 25.0, map_cell=cell)
         .surface_evidence(WALL[:1])
         .log_likelihood[0]
         for cell in (0.0, 0.05)

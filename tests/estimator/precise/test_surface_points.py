@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from common.geometry.world import World
 from lab.accuracy.scenes import Scene
-from services.estimator.precise.gauss_newton import View
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.motion_model import MotionCandidate
+from services.estimator.precise.scan_likelihood import ScanLikelihood
 from services.estimator.precise.surface_points import SurfacePoints, place_points, subtract_spurious
 from services.estimator.shared.generative_models import RayCaster
 
@@ -26,7 +26,7 @@ def view(*obstacles, seed=1):
     scene = Scene.of(World(name="corridor", boundary=CORRIDOR, obstacles=list(obstacles)), 622, seed)
     seen = scene.observe(scene.clean(HERE[None])[0], 0.0)
     mount = np.array(scene.scanner.mount)
-    return View(RayCaster(scene.world), Likelihood(), mount, seen.angles, seen.ranges, seen.range_max)
+    return ScanLikelihood(RayCaster(scene.world), Likelihood(), mount, seen.angles, seen.ranges, seen.range_max)
 
 
 def person(x, y=1.0):

@@ -9,9 +9,9 @@ from common.geometry import se2
 from common.robot.motion_distortion import correct_beams
 from lab.accuracy.motion_distortion import DistortionJob, run
 from lab.accuracy.scenes import Scene
-from services.estimator.precise.gauss_newton import View
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.motion_model import MotionNoise
+from services.estimator.precise.scan_likelihood import ScanLikelihood
 from services.estimator.precise.swept_scan import SweptEvidence, acceleration_factors, acceleration_limits
 from services.estimator.shared.generative_models import RayCaster
 from tests.estimator.models import ROOM
@@ -26,7 +26,7 @@ def swept_view(seed):
     scene = Scene.of(ROOM, 271, seed)
     seen, mount = scene.observe(scene.clean(POSE[None])[0], 0.0), np.array(scene.scanner.mount)
     times = np.linspace(-HALF_SWEEP, HALF_SWEEP, len(seen.angles))
-    return View(RayCaster(ROOM), Likelihood(), mount, seen.angles, seen.ranges, seen.range_max, times=times)
+    return ScanLikelihood(RayCaster(ROOM), Likelihood(), mount, seen.angles, seen.ranges, seen.range_max, times=times)
 
 
 def path(times, first, second):
@@ -58,7 +58,7 @@ def test_gradient_by_the_accelerations():
         moved = sum(factor[:, None] * each for factor, each in zip(factors, accelerations.reshape(2, 3), strict=True))
         in_base = se2.rotate(-POSE[2], moved[:, :2])
         ranges, angles = correct_beams(view.ranges, view.angles, np.column_stack([in_base, moved[:, 2]]), view.mount)
-        corrected = View(view.model, view.likelihood, view.mount, angles, ranges, view.range_max)
+        corrected = ScanLikelihood(view.model, view.likelihood, view.mount, angles, ranges, view.range_max)
         return float(corrected.evidence(POSE[None]).accuracy[0])
 
     step = 0.01

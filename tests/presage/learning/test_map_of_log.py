@@ -119,7 +119,7 @@ def test_ranges_in_another_unit(tmp_path):
     )
     for made, message in ((millimetres, "no two beams end near each other"), (standing, "is too large for")):
         real_drive.save(path, replace(made, odom=made.poses))
-        with pytest.raises(UserError, match=rf"{message}.* range_max in section log"):
+        with pytest.raises(UserError, match=rf"{message}.* `range_max` \(section `log` of"):
             map_command(MapOptions(path, tmp_path / "f.yaml", reading=HERE), QUIET, QUIET)
     assert not (tmp_path / "f.yaml").exists()
 

@@ -19,6 +19,19 @@ jit = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @jit
+def _entry(x: float, y: float, ux: float, uy: float, rows: int, columns: int) -> float:
+    """Distance after which a beam is inside a grid: 0 if it starts there, +inf if it misses the grid. All in cells."""
+    enter, leave = 0.0, np.inf
+    for start, direction, size in ((x, ux, columns), (y, uy, rows)):
+        if direction != 0.0:
+            first, last = -start / direction, (size - start) / direction
+            enter, leave = max(enter, min(first, last)), min(leave, max(first, last))
+        elif not 0 <= start < size:
+            return np.inf
+    return enter if enter < leave else np.inf
+
+
+@jit
 def count_crossings(
     starts: Array,
     unit: Array,
@@ -41,12 +54,16 @@ def count_crossings(
     rows, columns = surface.shape
     for b in range(ranges.shape[0]):
         x, y, ux, uy = starts[b, 0] / h, starts[b, 1] / h, unit[b, 0], unit[b, 1]
-        j, i = int(x), int(y)
+        t = _entry(x, y, ux, uy, rows, columns)
+        if t == np.inf:
+            continue
+        # Rounding may put the place of entry just outside.
+        j, i = min(max(int(x + t * ux), 0), columns - 1), min(max(int(y + t * uy), 0), rows - 1)
         sx, sy = (1 if ux > 0 else -1), (1 if uy > 0 else -1)
         # Amanatides and Woo 1987: step from cell to cell, across the nearer edge in x or in y.
         ax = ((j + (ux > 0)) - x) / ux if ux != 0.0 else np.inf
         ay = ((i + (uy > 0)) - y) / uy if uy != 0.0 else np.inf
-        end, t = ranges[b] / h, 0.0
+        end = ranges[b] / h
         while t < end and 0 <= i < rows and 0 <= j < columns:
             out = min(ax, ay)
             if surface[i, j]:

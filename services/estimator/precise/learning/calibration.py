@@ -13,11 +13,13 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ConfigDict
 
+from common.errors import UserError
 from common.geometry import se2
-from services.estimator.precise.gauss_newton import View, polish
+from services.estimator.precise.gauss_newton import polish
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.motion_model import MotionNoise
 from services.estimator.precise.noise import robust_excess
+from services.estimator.precise.scan_likelihood import ScanLikelihood
 from services.estimator.precise.settings import PreciseSettings
 
 if TYPE_CHECKING:
@@ -29,7 +31,8 @@ EM_STEPS = 30  # of expectation maximisation
 PRIOR_BEAMS = 10.0  # pseudo-count of each kind of beam
 CHI2_MEDIAN = 2.366  # median of chi squared with three degrees of freedom
 MAX_POSITION_ERROR_M = 0.3  # larger errors mean that another place was found; the covariance does not describe them
-MIN_EXPLAINED_RATIO = 0.77  # minimum share of explained beams, relative to the usual one: the default if 97 % are usual
+# Minimum fraction of explained beams, relative to the usual one; if 97 % are usual, this is the default.
+MIN_EXPLAINED_RATIO = 0.77
 # Probabilities at which the calibration curve is evaluated.
 PROBABILITIES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 
@@ -43,17 +46,18 @@ class Calibration:
     likelihood: Likelihood
     motion: MotionNoise
     scans: int  # held out
-    usual: float  # share of a scan's beams that end at surfaces of the map: median over the scans
+    usual: float  # fraction of a scan's beams that end at surfaces of the map: median over the scans
     inflation: float  # factor on the covariance
     floor_position: float  # m, remaining deviation in x and in y: error of the reference poses and of the map
     floor_heading: float  # rad
     log_likelihood: float  # nats per beam
     nees_median: float  # of poses found from one scan, with the covariance as published; ideal: 2.37
     nees_mean: float  # ideal: 3
-    coverage: tuple[tuple[float, float], ...]  # pairs of a range's cumulative probability and the share of beams below
+    # pairs of a range's cumulative probability and the fraction of beams below
+    coverage: tuple[tuple[float, float], ...]
 
     def settings(self) -> PreciseSettings:
-        """Parameters of the estimator; the threshold of explained beams is relative to the usual share here."""
+        """Parameters of the estimator; the threshold of explained beams is relative to the usual fraction."""
         return PreciseSettings(
             min_explained_fraction=MIN_EXPLAINED_RATIO * self.usual,
             inflation=self.inflation,
@@ -90,13 +94,16 @@ def calibrate(model: GenerativeModel, held_out: ReferenceDrive, motion: MotionNo
     """Calibrates on scans from which ``model`` has not learned; ``sigma`` m is the scanner's noise."""
     lasers = se2.compose(held_out.poses, held_out.mount)
     expected = model.expect(lasers, held_out.angles)
-    likelihood = learn_shares(held_out.ranges, expected, held_out.range_max, Likelihood(sigma))
-    views = [
-        View(model, likelihood, held_out.mount, held_out.angles, scan, held_out.range_max) for scan in held_out.ranges
+    likelihood = learn_outlier_fractions(held_out.ranges, expected, held_out.range_max, Likelihood(sigma))
+    likelihoods = [
+        ScanLikelihood(model, likelihood, held_out.mount, held_out.angles, ranges, held_out.range_max)
+        for ranges in held_out.ranges
     ]
-    fitted = [polish(view, pose[None]) for view, pose in zip(views, held_out.poses, strict=True)]
-    explained = [float(view.surface_evidence(pose).explained[0]) for view, (pose, _) in zip(views, fitted, strict=True)]
-    energy = sum(view.evidence(pose[None]).accuracy[0] for view, pose in zip(views, held_out.poses, strict=True))
+    fitted = [polish(scan, pose[None]) for scan, pose in zip(likelihoods, held_out.poses, strict=True)]
+    explained = [
+        float(scan.surface_evidence(pose).explained[0]) for scan, (pose, _) in zip(likelihoods, fitted, strict=True)
+    ]
+    energy = sum(scan.evidence(pose[None]).accuracy[0] for scan, pose in zip(likelihoods, held_out.poses, strict=True))
     floor, inflation, nees = _pose_precision(fitted, held_out.poses)
     return Calibration(
         likelihood=likelihood,
@@ -120,7 +127,7 @@ def _pose_precision(
 
     Compares poses (1, 3) found from one scan each, and the evidence there, with the reference poses (N, 3). The floors
     come from robust deviations. The inflation is the one with which the median of the squared errors is right, so that
-    a few poor reference poses do not decide.
+    a few poor reference poses do not decide. Raises UserError if the scans do not show the pose.
     """
     errors, covariances = [], []
     for reference, (found, evidence) in zip(references, fitted, strict=True):
@@ -129,6 +136,11 @@ def _pose_precision(
             inverse = np.linalg.inv(evidence.curvature[0] + np.eye(3))
             errors.append(error + inverse @ evidence.xi[0])
             covariances.append(inverse @ (evidence.xi_noise_covariance[0] + evidence.xi_model_covariance[0]) @ inverse)
+    if not errors:
+        raise UserError(
+            f"none of the {len(fitted)} held-out scans fits the model within {MAX_POSITION_ERROR_M:g} m of its "
+            "reference pose: check the reference poses and the mount of the laser, and drive where walls are in range"
+        )
     error, stated = np.array(errors), np.array(covariances)
 
     def excess_deviation(values: Array, variance: Array) -> float:
@@ -142,23 +154,29 @@ def _pose_precision(
         return np.asarray(np.einsum("ni,nij,nj->n", error, np.linalg.inv(inflation * stated + floor), error))
 
     low, high = 1.0, 1e4  # bisection for the inflation
-    for _ in range(40):
-        middle = float(np.sqrt(low * high))
-        low, high = (middle, high) if np.median(nees(middle)) > CHI2_MEDIAN else (low, middle)
-    return (position, heading), high, nees(high)
+    try:
+        for _ in range(40):
+            middle = float(np.sqrt(low * high))
+            low, high = (middle, high) if np.median(nees(middle)) > CHI2_MEDIAN else (low, middle)
+        return (position, heading), high, nees(high)
+    except np.linalg.LinAlgError:
+        raise UserError(
+            "some held-out scans show too few surfaces to find the pose: leave out the part of the drive where the "
+            "scanner sees no walls, or drive nearer to walls in different directions"
+        ) from None
 
 
 def _coverage(
     likelihood: Likelihood, measured: Array, expected: Expected, range_max: float
 ) -> tuple[tuple[float, float], ...]:
-    """Share of ranges below each quantile of the density, where a surface is expected; ideally the quantile itself."""
+    """Fraction of ranges below each quantile of the density, where a surface is expected; ideally the probability."""
     use = np.isfinite(measured) & np.isfinite(expected.scale) & (expected.ranges < range_max)
     below = likelihood.cumulative(measured[use], expected.ranges[use], expected.scale[use], range_max)
     return tuple((p, float((below <= p).mean())) for p in PROBABILITIES)
 
 
-def learn_shares(measured: Array, expected: Expected, range_max: float, start: Likelihood) -> Likelihood:
-    """Fits the shares of the density to scans (N, B) by expectation maximisation; sigma remains that of ``start``."""
+def learn_outlier_fractions(measured: Array, expected: Expected, range_max: float, start: Likelihood) -> Likelihood:
+    """Fits the fractions of the density to scans (N, B) by expectation maximisation; sigma stays that of ``start``."""
     surface = (expected.ranges < range_max) & np.isfinite(expected.scale) & (measured > -np.inf)  # excludes NaN
     hit = surface & np.isfinite(measured)
     o, g, m = measured[hit], np.maximum(expected.ranges[hit], 1e-3), expected.scale[hit]

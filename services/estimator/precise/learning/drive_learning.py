@@ -78,7 +78,8 @@ def learn_drive(
         visited = np.concatenate([visited, free_places(final, np.unique(simulated.starts, axis=0))])
     places = seed_places(final.field, visited, final.seen)
     report("learned", 1.0)
-    return LearningResult(final, places, calibration, range_errors(trial, held_out))
+    errors = absolute_range_errors(trial, held_out)
+    return LearningResult(final, places, calibration, errors[np.isfinite(errors)])
 
 
 def hold_out(drive: ReferenceDrive) -> tuple[ReferenceDrive, ReferenceDrive]:
@@ -87,14 +88,8 @@ def hold_out(drive: ReferenceDrive) -> tuple[ReferenceDrive, ReferenceDrive]:
     return drive.part(~is_held_out), drive.part(is_held_out)
 
 
-def range_errors(model: GenerativeModel, scans: ReferenceDrive) -> Array:
-    """Errors (K,) in m of the ranges that a model predicts, where a surface is expected and was measured."""
-    errors = errors_of_beams(model, scans)
-    return errors[np.isfinite(errors)]
-
-
-def errors_of_beams(model: GenerativeModel, scans: ReferenceDrive) -> Array:
-    """Errors (N, B) in m of the ranges that a model predicts; NaN where no surface is expected or was measured."""
+def absolute_range_errors(model: GenerativeModel, scans: ReferenceDrive) -> Array:
+    """Absolute errors (N, B) in m of predicted ranges; NaN where no surface is expected or was measured."""
     expected = model.expect(se2.compose(scans.poses, scans.mount), scans.angles)
     known = np.isfinite(scans.ranges) & np.isfinite(expected.ranges) & np.isfinite(expected.scale)
     errors = np.full(known.shape, np.nan)
@@ -106,6 +101,7 @@ def _learn_model(
     drive: ReferenceDrive, recipe: Recipe, simulated: Beams | None, report: Callable[[float], None], *, replayed: bool
 ) -> FieldModel:
     measured = Beams.of(drive.poses, drive.mount, drive.angles, drive.ranges)
+    measured.check_any()
     beams = measured
     if simulated is not None and replayed:
         beams = measured.joined(remove_contradicted(measured, simulated, recipe.resolution))
@@ -117,14 +113,12 @@ def _learn_model(
 def learn_model(beams: Beams, recipe: Recipe, report: Callable[[float], None] = lambda _done: None) -> FieldModel:
     """Learns a model that predicts the beams; its scales, the deviations of its errors, are left at their defaults."""
     field = learn_field(beams, recipe, lambda _, done: report(done))
-    # Rounded to half precision, as the field will be stored and read.
-    field = replace(field, phi=field.phi.astype(np.float16).astype(np.float32))
-    return FieldModel(field, seen=seen_cells(beams))
+    return FieldModel(field.as_stored(), seen=seen_cells(beams))
 
 
 def free_places(model: FieldModel, places: Array) -> Array:
     """The places (N, 2) m in map that are in seen free space."""
-    free = model.field.near(places) > SEED_CLEARANCE_M
+    free = model.field.value_at(places) > SEED_CLEARANCE_M
     return np.asarray(places[free if model.seen is None else free & model.seen.contains(places)])
 
 
@@ -158,5 +152,5 @@ def remove_contradicted(measured: Beams, replayed: Beams, h: float) -> Beams:
     gone = cells.at(cells.contradicted_by(measured), replayed.ends())
     present = field_of_surfaces(measured, h)
     reach = present.trace(np.column_stack([replayed.starts, replayed.directions]), np.zeros(1)).ranges[:, 0]
-    blocked = (reach < replayed.ranges - MAX_ERROR_M) | (present.near(replayed.starts) <= 0)
+    blocked = (reach < replayed.ranges - MAX_ERROR_M) | (present.value_at(replayed.starts) <= 0)
     return replayed.part(~(gone | blocked))

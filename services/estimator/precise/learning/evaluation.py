@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common.geometry import se2
-from services.estimator.precise.gauss_newton import View, polish
+from services.estimator.precise.gauss_newton import polish
 from services.estimator.precise.likelihood import Likelihood
+from services.estimator.precise.scan_likelihood import ScanLikelihood
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -42,18 +43,18 @@ def evaluate_model(
 ) -> ModelErrors:
     """Compares the model with noiseless scans ``ranges`` (N, B) m at base_link poses (N, 3).
 
-    ``sigma`` m is the scanner's noise, and ``relative`` the part of it that grows with the range, as a share of that.
+    ``sigma`` m is the scanner's noise, and ``relative`` the part that grows with the range, as a fraction of the range.
     """
     likelihood = Likelihood(sigma, relative=relative)
     expected = model.expect(se2.compose(poses, mount), angles)
     both = np.isfinite(ranges) & np.isfinite(expected.ranges)
     range_error = np.abs(ranges[both] - expected.ranges[both])
     position_errors, nees, rng = [], [], np.random.default_rng(0)
-    for pose, scan in zip(poses, ranges, strict=True):
+    for pose, exact in zip(poses, ranges, strict=True):
         for draw in range(1 + NOISE_DRAWS):  # the first one without noise
-            noise = likelihood.deviation(scan) * rng.standard_normal(len(scan)) if draw else 0.0
-            view = View(model, likelihood, mount, angles, scan + noise, range_max)
-            found, evidence = polish(view, pose[None])
+            noise = likelihood.deviation(exact) * rng.standard_normal(len(exact)) if draw else 0.0
+            scan = ScanLikelihood(model, likelihood, mount, angles, exact + noise, range_max)
+            found, evidence = polish(scan, pose[None])
             inverse = np.linalg.inv(evidence.curvature[0] + 1e-6 * np.eye(3))
             error = se2.difference(found[0], pose) + inverse @ evidence.xi[0]  # with a last step to the minimum
             if draw:

@@ -37,7 +37,7 @@ PASSING_CELLS = 0.25  # a beam passes a node within this distance
 EM_STEPS = 15  # of expectation maximisation
 OUTLIER_SHARE, OUTLIER_RANGE_M = 0.1, 25.0  # weight and width of the uniform part of the density
 MAX_ERROR_M = 0.1  # a larger error means that the beam ended at another surface
-MIN_FACING = 0.15  # minimum |n . u| of a beam that shapes the field: cosine of its angle of incidence
+MIN_COS_INCIDENCE = 0.15  # minimum |n . u| of a beam that shapes the field: cosine of its angle of incidence
 PRIOR_COUNT, PRIOR_SCALE_M = 20, 0.05  # pseudo-count of each class, and its error, for classes that are seldom seen
 MIN_SCALE_M = 1e-3
 SEED_CLEARANCE_M = 0.1  # minimum distance from surfaces of a place where a search begins
@@ -79,9 +79,9 @@ def learn_field(
 
 def seen_cells(beams: Beams) -> SeenCells:
     """The cells in which the beams passed or ended."""
-    ends = beams.ends()
-    low = np.minimum(ends.min(0), beams.starts.min(0)) - SEEN_CELL_M
-    shape = np.ceil((np.maximum(ends.max(0), beams.starts.max(0)) - low) / SEEN_CELL_M).astype(int)[::-1] + 1
+    low, high = beams.bounds()
+    low = low - SEEN_CELL_M
+    shape = np.ceil((high - low) / SEEN_CELL_M).astype(int)[::-1] + 1
     cells = np.zeros(shape, np.bool_)
     mark_seen_cells(beams.starts - low, beams.unit(), beams.ranges, SEEN_CELL_M, cells)
     return SeenCells(cells, (float(low[0]), float(low[1])))
@@ -156,26 +156,26 @@ def _add_errors(
 
     def trace(part: Beams) -> Array:
         traced = field.trace(np.column_stack([part.starts, part.directions]), np.zeros(1))
-        return np.column_stack([traced.ranges, traced.facing])
+        return np.column_stack([traced.ranges, traced.cos_incidence])
 
-    ranges, facing = np.concatenate(_map_parts(trace, beams, threads)).T
+    ranges, cos_incidence = np.concatenate(_map_parts(trace, beams, threads)).T
     unit = beams.unit()
     error = beams.ranges - ranges
-    good = np.isfinite(ranges) & (np.abs(error) < MAX_ERROR_M) & (facing > MIN_FACING)
-    behind = np.where(np.isfinite(ranges), error, 0.0) * facing  # m, perpendicular to the surface
+    good = np.isfinite(ranges) & (np.abs(error) < MAX_ERROR_M) & (cos_incidence > MIN_COS_INCIDENCE)
+    behind = np.where(np.isfinite(ranges), error, 0.0) * cos_incidence  # m, perpendicular to the surface
     ny, nx = field.phi.shape
     for counts, which in ((ended, good), (passed, np.isfinite(ranges) & (behind > PASSED_DEPTH_M))):
         where = (beams.starts[which] + ranges[which, None] * unit[which] - field.origin) / field.resolution
         node = np.clip(np.round(where).astype(int), 0, [nx - 1, ny - 1])
         np.add(counts, np.bincount(node[:, 1] * nx + node[:, 0], minlength=ny * nx), out=counts)
-    facing = facing[good]
+    cos_incidence = cos_incidence[good]
     where = (beams.starts[good] + ranges[good, None] * unit[good] - field.origin) / field.resolution
     node = np.minimum(np.maximum(where.astype(int), 0), [nx - 2, ny - 2])
     u, v = (where - node).T
     for di, dj, w in ((0, 0, (1 - u) * (1 - v)), (0, 1, u * (1 - v)), (1, 0, (1 - u) * v), (1, 1, u * v)):
         index = (node[:, 1] + di) * nx + node[:, 0] + dj
-        up += np.bincount(index, w * error[good] / facing, ny * nx)
-        norm += np.bincount(index, w / facing**2, ny * nx)
+        up += np.bincount(index, w * error[good] / cos_incidence, ny * nx)
+        norm += np.bincount(index, w / cos_incidence**2, ny * nx)
 
 
 def learn_scales(field: DistanceField, poses: Array, mount: Array, angles: Array, ranges: Array, sigma: float) -> Array:

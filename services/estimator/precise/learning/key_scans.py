@@ -29,8 +29,8 @@ PLACE_M, HEADINGS = 0.5, 4  # one key scan is kept for each square of this size 
 MAX_KEY_SCANS = 4000  # with 622 beams, 10 MB; if there are more, the squares become twice as large
 MAX_PROTECTION = np.array([0.2, 0.2, np.deg2rad(5)])  # m, m, rad: protection level of a trusted pose
 VERIFIED_AFTER_M = 5.0  # of driving: about a room
-# A version is learned from at least this many key scans, of which this many and this share are new.
-MIN_KEY_SCANS, MIN_NEW, MIN_NEW_SHARE = 50, 20, 0.1
+# A version is learned from at least this many key scans, of which this many and this fraction are new.
+MIN_KEY_SCANS, MIN_NEW, MIN_NEW_FRACTION = 50, 20, 0.1
 MAX_GAP_S = 1.0  # longest time without `tracking` after which the robot is still assumed to be where it was tracked
 # A pose jumps if it moves by more than this between two scans, beyond this multiple of the robot's full speed.
 JUMP_M, JUMP_RAD = 0.2, 0.2
@@ -66,11 +66,10 @@ class KeyScanCollector:
         self.angles, self.mount, self.range_max = angles, np.asarray(mount, float), range_max
         self._motion = motion or MotionNoise()
         self.verified: dict[tuple[int, int, int], KeyScan] = {}  # by cell
-        self.verified_total = 0  # scans verified so far, including those that newer ones replaced
         self.dropped_total = 0  # scans dropped because their pose may be wrong
         self.learned_until = -np.inf  # s, stamp of the newest key scan from which the model in use was learned
         self._unverified: deque[KeyScan] = deque()
-        self._taken_total = 0
+        self._taken_until = -np.inf  # s, stamp of the newest key scan that was taken
         self._size = PLACE_M
         self._path = 0.0  # m
         self._path_end: Array | None = None  # (3,) pose up to which the path was added
@@ -126,11 +125,11 @@ class KeyScanCollector:
 
     def take_drive(self) -> ReferenceDrive | None:
         """Returns the verified key scans in order of time if enough of them are new since the last time, else None."""
-        new = self.verified_total - self._taken_total
-        if len(self.verified) < MIN_KEY_SCANS or new < max(MIN_NEW, MIN_NEW_SHARE * len(self.verified)):
-            return None
-        self._taken_total = self.verified_total
         keys = self._in_order()
+        new = sum(key.stamp > self._taken_until for key in keys)
+        if len(keys) < MIN_KEY_SCANS or new < max(MIN_NEW, MIN_NEW_FRACTION * len(keys)):
+            return None
+        self._taken_until = keys[-1].stamp
         return ReferenceDrive(
             np.array([key.stamp for key in keys]),
             np.array([key.pose for key in keys]),
@@ -157,7 +156,6 @@ class KeyScanCollector:
         while self._unverified and self._unverified[0].path <= self._path - VERIFIED_AFTER_M:
             key = self._unverified.popleft()
             self.verified[key.cell(self._size)] = key
-            self.verified_total += 1
         while len(self.verified) > MAX_KEY_SCANS:
             self._size *= 2
             self.verified = {key.cell(self._size): key for key in self._in_order()}

@@ -10,14 +10,13 @@ from scipy import ndimage
 
 from common.geometry import se2
 from services.estimator.precise.field import FieldModel
-from services.estimator.precise.gauss_newton import Prior, View
+from services.estimator.precise.gauss_newton import Prior
 from services.estimator.precise.global_seeds import Seeds
 from services.estimator.precise.learning.drive_learning import (
-    errors_of_beams,
+    absolute_range_errors,
     free_places,
     hold_out,
     learn_model,
-    range_errors,
     remove_contradicted,
     replay_model,
 )
@@ -32,6 +31,7 @@ from services.estimator.precise.learning.map_alignment import align_to_map, with
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.noise import estimate_noise, robust_excess
+from services.estimator.precise.scan_likelihood import ScanLikelihood
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -56,7 +56,8 @@ class ModelVersion:
     model: FieldModel
     seeds: Seeds
     key_poses: Array  # (N, 3) poses in map at which the key scans agree best
-    errors: Array  # (K,) m, of the ranges of held-out key scans, where the model that was in use predicts them as well
+    test_scans: int  # held-out key scans that were new to both models
+    errors: Array  # (K,) m, of their ranges, where the model that was in use predicts them as well
     present_errors: Array  # (K,) m, the same with the model that was in use
 
 
@@ -71,10 +72,15 @@ def learn_version(
     """Learns a field from key scans and the ``original`` model, which knows the surroundings of ``places`` (S, 2) m.
 
     Returns None if the new field predicts held-out key scans no better than the model in use, ``present``, which was
-    learned from key scans up to the stamp ``learned_until`` s: only later ones are new to both. It may predict them
-    better by predicting more surfaces, if it is not much worse at those that both predict.
+    learned from key scans up to the stamp ``learned_until`` s: only later ones are new to both, and if there are none,
+    it also returns None. The field may predict them better by predicting more surfaces, if it is not much worse at
+    those that both predict.
     """
     tracked = remove_moving_objects(keys)
+    test_scans = hold_out(tracked)[1]
+    test_scans = test_scans.part(test_scans.stamps > learned_until)
+    if not len(test_scans.poses):
+        return None
     sigma = estimate_noise(tracked.ranges, tracked.angles)
     original, present = (with_offset(model, tracked) for model in (original, present))
     error = _estimate_map_error(original, tracked, sigma)
@@ -87,11 +93,9 @@ def learn_version(
     # A trial field, learned without the held-out key scans, shows whether learning is an improvement.
     others, held_out = hold_out(aligned)
     trial = _learn(others, overlapping, recipe, EPOCHS)
-    _, unaligned = hold_out(tracked)
-    unaligned = unaligned.part(unaligned.stamps > learned_until)
     errors, present_errors = (
-        errors_of_beams(model, _match_key_scans(model, unaligned, unaligned.poses, sigma))[
-            np.isfinite(unaligned.ranges)
+        absolute_range_errors(model, _match_key_scans(model, test_scans, test_scans.poses, sigma))[
+            np.isfinite(test_scans.ranges)
         ]
         for model in (trial, present)
     )
@@ -107,7 +111,8 @@ def learn_version(
     starts = seed_places(final.field, np.concatenate([visited, free_places(final, places)]), final.seen)
     starts, scales = (values.astype(np.float32).astype(np.float64) for values in (starts, scales))  # as published
     model = replace(final, field=final.field.with_solids(starts), scales=scales)
-    return ModelVersion(model, Seeds.at(model, starts), aligned.poses, errors, present_errors)
+    seeds = Seeds.at(model, starts)
+    return ModelVersion(model, seeds, aligned.poses, len(test_scans.poses), errors, present_errors)
 
 
 def remove_moving_objects(keys: ReferenceDrive) -> ReferenceDrive:
@@ -141,8 +146,8 @@ def mean_error(errors: Array) -> float:
 
 def _estimate_map_error(model: GenerativeModel, keys: ReferenceDrive, sigma: float) -> float:
     """Estimates the standard deviation in m of the model's own errors, without the scanner's noise ``sigma`` m."""
-    errors = range_errors(model, keys)
-    errors = errors[errors < MAX_ERROR_M]
+    errors = absolute_range_errors(model, keys)
+    errors = errors[errors < MAX_ERROR_M]  # not NaN either
     variance = robust_excess(errors, np.array(sigma**2)) if len(errors) else 0.0
     return float(np.sqrt(max(variance, PRECISE_M**2)))
 
@@ -172,6 +177,6 @@ def _match_key_scans(model: GenerativeModel, keys: ReferenceDrive, priors: Array
     information, likelihood = np.diag(ALIGNMENT_DEVIATION**-2.0)[None], Likelihood(sigma)
     poses = []
     for pose, prior, ranges in zip(keys.poses, priors, keys.ranges, strict=True):
-        view = View(model, likelihood, keys.mount, keys.angles, ranges.astype(float), keys.range_max)
-        poses.append(view.descend(pose[None], Prior(prior[None], information), ALIGNMENT_SCHEDULE_M)[0][0])
-    return replace(keys, poses=np.array(poses))
+        scan = ScanLikelihood(model, likelihood, keys.mount, keys.angles, ranges.astype(float), keys.range_max)
+        poses.append(scan.descend(pose[None], Prior(prior[None], information), ALIGNMENT_SCHEDULE_M)[0][0])
+    return replace(keys, poses=np.array(poses).reshape(-1, 3))

@@ -45,9 +45,10 @@ def align_to_map(original: GenerativeModel, key_scans: ReferenceDrive) -> Refere
 
 
 def with_offset(model: Model, key_scans: ReferenceDrive) -> Model:
-    """Moves the surfaces of a grid's model to where the key scans measured them; returns other models unchanged.
+    """Returns a grid's model with the offset at which its surfaces are where the key scans measured them.
 
-    A grid's rays end at the front of its occupied cells, but the real surfaces are somewhere inside them.
+    A grid's rays end at the front of its occupied cells, but the real surfaces are somewhere inside them. Returns the
+    model unchanged if it is not that of a grid, or if no beam ends within `MAX_ERROR_M` of its surfaces.
     """
     if not isinstance(model, RayCaster) or model.world.grid is None:
         return model
@@ -57,4 +58,4 @@ def with_offset(model: Model, key_scans: ReferenceDrive) -> Model:
     with np.errstate(invalid="ignore", divide="ignore"):
         behind = (used_scans.ranges - expected.ranges) / expected.slope
         used = (np.abs(behind) < MAX_ERROR_M) & np.isfinite(expected.scale)
-    return replace(model, offset=float(np.median(behind[used]))) if used.any() else model
+    return replace(model, offset=model.offset + float(np.median(behind[used]))) if used.any() else model

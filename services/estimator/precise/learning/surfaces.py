@@ -14,11 +14,13 @@ from common.errors import UserError
 from common.geometry.se2 import Array, compose
 from services.estimator.precise.field import DistanceField, Floats
 from services.estimator.precise.learning.beam_cells import count_crossings
+from services.estimator.shared.grid_values import values_at
 
 BEAMS_AT_ONCE = 2_000_000  # processed together, which limits memory
 MAX_CELLS = 100_000_000  # 250 000 m² in cells of 5 cm, which need 6 GB
 WRONG_RANGES = (
-    "Are the ranges in m? From which range on there is no return is set with range_max in section log of --config"
+    "Check that ranges are in metres, and that `range_max` (section `log` of the --config file) is the range that the "
+    "driver reports for no return"
 )
 POOL_CELLS = 1  # cells to each side whose points are pooled to find a normal
 ELEMENT_RADIUS_CELLS = 2.0  # around a surface element, within which it shapes the field
@@ -42,6 +44,11 @@ class Beams:
         returned = np.isfinite(ranges) & (ranges > 0)
         row, column = np.nonzero(returned)
         return cls(lasers[row, :2], lasers[row, 2] + angles[column], ranges[returned])
+
+    def check_any(self) -> None:
+        """Raises UserError if there are no beams."""
+        if not len(self.ranges):
+            raise UserError(f"no surface to learn from: no two beams end near each other. {WRONG_RANGES}")
 
     def ends(self) -> Array:
         """End points (R, 2), m in map."""
@@ -93,8 +100,7 @@ class SurfaceCells:
     @classmethod
     def of(cls, beams: Beams, cell_m: float) -> SurfaceCells:
         """The cells of ``cell_m`` m in which beams end. Raises UserError if there are too many, or no beams."""
-        if not len(beams.ranges):
-            raise UserError(f"no surface to learn from: no two beams end near each other. {WRONG_RANGES}")
+        beams.check_any()
         low, high = beams.bounds()
         low = low - 4 * cell_m
         shape = np.ceil((high + 4 * cell_m - low) / cell_m).astype(int)[::-1] + 1
@@ -141,23 +147,21 @@ class SurfaceCells:
     def contradicted_by(self, beams: Beams) -> npt.NDArray[np.bool_]:
         """Mask (rows, columns) of cells whose surface element is absent: most beams that meet it pass through it."""
         crossed = _pooled(self.crossings(beams))
-        cell, inside = self._cells_at(beams.ends())
+        row, column = self._cells_at(beams.ends())
+        inside = (row >= 0) & (column >= 0) & (row < self.counts.shape[0]) & (column < self.counts.shape[1])
         ended = np.zeros(self.counts.shape)
-        np.add.at(ended, tuple(cell[inside].T), 1.0)
+        np.add.at(ended, (row[inside], column[inside]), 1.0)
         ended = _pooled(ended)
         return are_mostly_passed(ended, crossed)
 
     def at(self, mask: npt.NDArray[np.bool_], points: Array) -> npt.NDArray[np.bool_]:
         """The values (N,) of a mask (rows, columns) at points (N, 2) m in map; False beyond the grid."""
-        cell, inside = self._cells_at(points)
-        found = np.zeros(len(points), np.bool_)
-        found[inside] = mask[tuple(cell[inside].T)]
-        return found
+        return values_at(mask, *self._cells_at(points), beyond=False)
 
-    def _cells_at(self, points: Array) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.bool_]]:
-        """Rows and columns (N, 2) of points (N, 2) m in map, and whether they are inside the grid."""
-        cell = np.floor((points - self.low) / self.cell_m).astype(int)[:, ::-1]
-        return cell, np.asarray(((cell >= 0) & (cell < self.counts.shape)).all(axis=1))
+    def _cells_at(self, points: Array) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+        """Rows (N,) and columns (N,) of points (N, 2) m in map."""
+        column, row = np.floor((points - self.low) / self.cell_m).astype(int).T
+        return row, column
 
 
 def are_mostly_passed(ended: Array, passed: Array) -> npt.NDArray[np.bool_]:

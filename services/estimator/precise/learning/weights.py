@@ -71,10 +71,8 @@ def save(path: Path, model: FieldModel, places: Array, card: FieldCard) -> None:
 
     The field is stored in half precision, whose resolution is finest near zero, at surfaces.
     """
-    # Rounded as they will be stored and read.
-    phi, places = model.field.phi.astype(np.float16), np.asarray(places, np.float32).astype(np.float64)
-    field = replace(model.field, phi=phi.astype(np.float32)).with_solids(places)
-    model = replace(model, field=field)
+    places = np.asarray(places, np.float32).astype(np.float64)  # rounded as they will be stored and read
+    model = replace(model, field=model.field.as_stored().with_solids(places))
     write(path, model, Seeds.at(model, places), card)
 
 

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from common.errors import UserError
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.global_seeds import Seeds
-from services.estimator.precise.learning.calibration import learn_motion, learn_shares
+from services.estimator.precise.learning import calibration
+from services.estimator.precise.learning.calibration import learn_motion, learn_outlier_fractions
 from services.estimator.precise.learning.drive_learning import learn_drive
 from services.estimator.precise.learning.field_learning import Recipe, learn_field, seen_cells
 from services.estimator.precise.learning.surfaces import Beams
-from services.estimator.precise.likelihood import Likelihood
+from services.estimator.precise.likelihood import Evidence, Likelihood
 from services.estimator.precise.noise import estimate_noise
 from services.estimator.shared.generative_models import Expected
 from services.estimator.shared.interface import Observation
@@ -33,12 +37,31 @@ def learned(drive):
     return learn_drive(drive.part(np.arange(SCANS // 2)), RECIPE, None, lambda *_: None)
 
 
+def test_drive_without_returns(drive):
+    """Also where the surfaces of a map are given."""
+    none = replace(drive, ranges=np.full_like(drive.ranges, np.inf))
+    simulated = Beams.of(drive.poses, drive.mount, drive.angles, drive.ranges)
+    with pytest.raises(UserError, match=r"no surface to learn from: .*Check that ranges are in metres"):
+        learn_drive(none, RECIPE, simulated, lambda *_: None)
+
+
+@pytest.mark.parametrize(
+    ("curvature", "off", "message"),
+    [(0.0, 0.0, "too few surfaces to find the pose"), (100.0, 1.0, "none of the 4 held-out scans fits the model")],
+)
+def test_scans_that_do_not_show_the_pose(curvature, off, message):
+    matrices = curvature * np.eye(3)[None]
+    fitted = [(np.array([[off, 0.0, 0.0]]), Evidence(np.zeros(1), np.zeros((1, 3)), *[matrices] * 3))] * 4
+    with pytest.raises(UserError, match=message):
+        calibration._pose_precision(fitted, np.zeros((4, 3)))
+
+
 def test_outlier_shares():
     rng = np.random.default_rng(3)
     surface = rng.uniform(2, 8, (200, 121))
     expected = Expected(surface, np.full(surface.shape, 1e-3), np.zeros((*surface.shape, 3)))
     measured = disturbed(surface + SIGMA * rng.standard_normal(surface.shape), rng)
-    found = learn_shares(measured, expected, RANGE_MAX, Likelihood(SIGMA))
+    found = learn_outlier_fractions(measured, expected, RANGE_MAX, Likelihood(SIGMA))
     assert found.short == pytest.approx(SHORT / (1 - NONE), abs=0.005)
     assert found.random == pytest.approx(LONG / (1 - NONE), abs=0.004)
     assert found.unseen == pytest.approx(NONE, abs=0.002)

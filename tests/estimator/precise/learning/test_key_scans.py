@@ -164,6 +164,19 @@ def test_drive_when_enough_is_new():
     assert len(drive.keys.take_drive().poses) > len(taken.poses)
 
 
+def test_replaced_scans_are_not_new():
+    """A robot that drives to and fro at a few places replaces their key scans, but has few new ones."""
+    drive = Drive().go(35)
+    assert drive.keys.take_drive() is not None
+    for _ in range(5):
+        drive.x = 20.0
+        drive.go(9)
+    assert drive.keys.take_drive() is None
+    drive.x = 5.0
+    drive.go(20)
+    assert drive.keys.take_drive() is not None
+
+
 def test_correction_for_motion():
     """Ranges are those at the stamp, although the robot drives on while the scanner turns."""
     world = World(name="w", boundary=[(-20, -2), (20, -2), (20, 2), (-20, 2)])

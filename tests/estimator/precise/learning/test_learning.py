@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from common.errors import UserError
+from common.geometry import se2
 from common.geometry.world import World
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.global_seeds import Seeds
 from services.estimator.precise.learning import field_learning, surfaces, weights
 from services.estimator.precise.learning.evaluation import evaluate_model
 from services.estimator.precise.learning.field_learning import Recipe, learn_field, learn_scales
-from services.estimator.precise.learning.surfaces import Beams, field_of_surfaces
+from services.estimator.precise.learning.surfaces import Beams, SurfaceCells, field_of_surfaces
 from services.estimator.shared.digest import sha256
 from tests.estimator.models import ROOM, SCANNER
 
@@ -90,6 +91,18 @@ def test_spike_in_free_space():
     cleared = field_learning._clear_passed_nodes(replace(field, phi=spiky), beams, 2).ravel()
     assert (cleared[beside] > 0).mean() > 0.95
     assert np.array_equal(cleared[clearance < 0], field.phi.ravel()[clearance < 0])
+
+
+@pytest.mark.parametrize("turn", np.deg2rad([0, 90, 180, 270]))
+def test_removed_wall_seen_from_outside(turn):
+    """Beams that start outside of the former model's grid contradict its wall, on each of its sides."""
+    x, noise = np.linspace(0.0, 2.0, 201), np.random.default_rng(0).normal(0.0, 0.01, 201)
+    near, far = (se2.rotate(turn, np.column_stack([x, np.full(201, y)])) for y in (0.0, 9.0))
+    inside = Beams(near, np.full(201, turn + np.pi / 2), 1.05 + noise)
+    outside = Beams(far, np.full(201, turn - np.pi / 2), np.full(201, 9.0))
+    cells = SurfaceCells.of(inside, 0.1)
+    assert cells.at(cells.contradicted_by(outside), inside.ends()).mean() > 0.9
+    assert not cells.contradicted_by(replace(outside, starts=far + 5.0)).any()
 
 
 def test_beams_without_return():

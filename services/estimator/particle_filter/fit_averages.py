@@ -9,7 +9,7 @@ MAX_RANDOM_SHARE = 0.4
 
 
 @dataclass
-class Recovery:
+class FitAverages:
     """Short- and long-term averages of how well the estimate explains the scans.
 
     AMCL averages the particles' likelihoods. These are products over many beams, which vary by e^20 between good scans
