@@ -73,17 +73,25 @@ class Estimator:
         given = [name for name, is_given in (("model", model != "learned"), ("sigma", sigma is not None)) if is_given]
         for warning in ignored_settings(preset, given):
             warnings.warn(warning, stacklevel=2)
+        generative_model = None if isinstance(model, str | Path) else model
+        for name, part, method in (
+            ("model", generative_model, "expect"),
+            ("likelihood", likelihood, "evaluate"),
+            ("optimiser", optimiser, "descend"),
+        ):
+            if part is not None and not hasattr(part, method):
+                raise UserError(f"{name}: give an object with the method {method}, not {part!r}")
         options = EstimatorOptions(
             world if isinstance(world, World) else str(world),
             preset,
             model=str(model) if isinstance(model, str | Path) else "",
-            generative_model=None if isinstance(model, str | Path) else model,
+            generative_model=generative_model,
             likelihood=likelihood,
             optimiser=optimiser,
             models=None if models is None else Path(models),
             sigma=sigma,
             seed=seed,
-            initial_pose=None if initial_pose is None else np.asarray(initial_pose, float),
+            initial_pose=None if initial_pose is None else _start_of(initial_pose),
             descent=descent or Descent(),
         )
         self._make = prepare_factory(options)
@@ -176,3 +184,14 @@ class Estimator:
         elif not self._geometry.same(geometry, bound_to_beams=self._bound_to_beams):
             raise UserError("the scanner, its mount or its noise has changed: make another Estimator for this scan")
         return self._core
+
+
+def _start_of(pose: Numbers) -> npt.NDArray[np.float64]:
+    """The initial pose as (3,) or (2,); raises UserError for another shape."""
+    try:
+        start = np.asarray(pose, float)
+    except (TypeError, ValueError):
+        raise UserError(f"initial_pose: give x, y in m and perhaps yaw in rad, not {pose!r}") from None
+    if start.shape not in {(2,), (3,)} or not np.isfinite(start).all():
+        raise UserError(f"initial_pose: give x, y in m and perhaps yaw in rad, not {pose!r}")
+    return start

@@ -30,7 +30,7 @@ from pydantic_settings import (
 
 from common.bus.bus import DEFAULT_ENDPOINT, Link
 from common.bus.security import Credentials, read_credentials
-from common.errors import UserError, first_fault, first_problem
+from common.errors import UserError, first_fault, first_problem, similar_key
 from common.messages.topics import ROBOT_NAME_PATTERN
 from common.names import split_names
 from common.yaml_text import NOT_YAML, parse_yaml
@@ -175,6 +175,9 @@ def load_settings(cls: type[S], argv: list[str] | None = None) -> S:
         name = ".".join(map(str, first["loc"])) or "settings"
         variable = f"PRESAGE_{cls.service.upper()}_{name.upper()}" if name in cls.private else f"PRESAGE_{name.upper()}"
         problem = first_problem(error)
+        if first["type"] == "extra_forbidden":
+            similar = similar_key(name, cls.model_fields)
+            problem += f"; did you mean {similar}?" if similar else ""
         if first["type"] == "string_pattern_mismatch" and name in cls.model_fields:
             problem = f"{first['input']!r} is not valid; expected: {cls.model_fields[name].description}"
         raise UserError(

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import TYPE_CHECKING, ClassVar, TypeVar
 
-from common.bus.bus import Bus, open_bus
+from common.bus.bus import Bus, open_bus, wait_until
 from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
 from common.log import Logger, begin_logging, logger, report_failure, set_up_logging
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from types import FrameType
 
 S = TypeVar("S", bound=ServiceSettings)
+
+LINK_TIMEOUT_S = 2.0  # a router that runs answers sooner
 
 
 class Service(ABC):
@@ -149,6 +151,9 @@ def main(settings_class: type[S], make: Callable[[S], Service], argv: list[str] 
         )
         service = make(settings)
         with open_bus(settings.link(), give_up=lambda: handler.stop_requested) as bus:
+            if settings.connect and not wait_until(lambda: bus.linked() or handler.stop_requested, LINK_TIMEOUT_S):
+                waiting = f"nothing answers at {settings.connect} yet; waiting (--connect names another address)"
+                service.log.warning(waiting)
             handler.run(service.make_loop(bus))
         service.log.info("ended")
     except UserError as error:

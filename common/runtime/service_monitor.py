@@ -107,18 +107,6 @@ def _last_time(report: Report, robot: str, topic: str, kind: str) -> float:
     return max((row[kind] for row in rows if kind in row), default=-math.inf)
 
 
-def start_command(service: str, robot: str, connect: str = "") -> str:
-    """The shell command that starts a service. ``connect``: endpoints, or empty for the default."""
-    if service == "router":
-        return "python -m common.router"
-    command = f"python -m services.{service}"
-    if robot != "robot":
-        command += f" --robot {robot}"
-    if connect:
-        command += f" --connect {connect}"
-    return command
-
-
 class CountTimes:
     """Remembers when each count of a service last increased."""
 
@@ -176,7 +164,16 @@ class ServiceMonitor:
                 del self._services[name]
 
     def add_health(self, health: Health, now: float) -> None:
-        """Stores a health message."""
+        """Stores a health message.
+
+        Ignores those of an idle instance while another one works: the recorder that `presage up` keeps ready is idle
+        while `presage record` records.
+        """
+        last = self._services.get(health.service)
+        if last is not None and last.health is not None and health.idle and not last.health.idle:
+            other = health.instance != last.health.instance
+            if other and now - last.report.time <= REPORT_TIMEOUT_S:
+                return
         service = self._find_or_add(health.service, now)
         if service is not None and service.health is not None and health.uptime < service.health.uptime:
             self._services.pop(health.service)  # the service was restarted

@@ -18,6 +18,7 @@ class MySettings(ServiceSettings):
     """Settings; each is also an option of the command line and an environment variable."""
 
     service = "estimator"
+    program = "python my_estimator.py"  # in --help
     start: str = "0,0,0"
 
 

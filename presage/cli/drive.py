@@ -12,7 +12,7 @@ from common.errors import UserError
 from common.geometry import se2
 from common.limits import MAX_COORDINATE_M
 from presage.cli.session_options import chosen_link
-from presage.terminal.options import ALLOW_NEGATIVE_NUMBERS, console
+from presage.terminal.options import CommandWithNumbers, console, number
 
 if TYPE_CHECKING:
     from common.messages.definitions import Pose
@@ -26,26 +26,17 @@ Floor = Annotated[
 ]
 
 
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise typer.BadParameter(
-            f"{text} is neither a number nor an option of this command; --connect and --robot stand before the command"
-        ) from None
-
-
 @app.command(
-    context_settings=ALLOW_NEGATIVE_NUMBERS,
+    cls=CommandWithNumbers,
     rich_help_panel="Drive",
     short_help="Send the robot to a goal, or cancel it.",
 )
 def goal(
     context: typer.Context,
-    x: Annotated[float | None, typer.Argument(help="x of the goal in the map, m.")] = None,
-    y: Annotated[float | None, typer.Argument(help="y of the goal in the map, m.")] = None,
+    x: Annotated[float | None, typer.Argument(parser=number, help="x of the goal in the map, m.")] = None,
+    y: Annotated[float | None, typer.Argument(parser=number, help="y of the goal in the map, m.")] = None,
     yaw: Annotated[
-        float | None, typer.Argument(parser=_number, help="Heading at the goal, deg. Defaults to any heading.")
+        float | None, typer.Argument(parser=number, help="Heading at the goal, deg. Defaults to any heading.")
     ] = None,
     tolerance: Annotated[
         float, typer.Option(min=0.001, help="Distance at which the goal counts as reached, m.")
@@ -56,7 +47,7 @@ def goal(
     ] = None,
     floor: Floor = "",
     wait: Annotated[
-        bool, typer.Option("--wait", help="Wait until the goal is reached, refused, or blocked for 30 s.")
+        bool, typer.Option("--wait", help="Wait until the goal is reached, refused, or without progress for 30 s.")
     ] = False,
     cancel: Annotated[bool, typer.Option("--cancel", help="Cancel the current goal and stop the robot.")] = False,
 ) -> None:
@@ -69,6 +60,8 @@ def goal(
     from common.messages.definitions import Goal
     from presage.live.commands import send_goal
 
+    if cancel and x is not None:
+        raise UserError("--cancel cancels the current goal, whichever it is: leave out the place")
     if not cancel and (x is None or y is None):
         raise UserError("a goal is two numbers, X Y in m (or --cancel)")
     if approach is not None and not abs(approach) <= MAX_HEADING_DEG:
@@ -102,14 +95,12 @@ def explore(context: typer.Context) -> None:
     raise typer.Exit(run(chosen_link(context), console))
 
 
-@app.command(
-    context_settings=ALLOW_NEGATIVE_NUMBERS, rich_help_panel="Drive", short_help="Move the simulated robot elsewhere."
-)
+@app.command(cls=CommandWithNumbers, rich_help_panel="Drive", short_help="Move the simulated robot elsewhere.")
 def teleport(
     context: typer.Context,
-    x: Annotated[float, typer.Argument(help="x in the map, m.")],
-    y: Annotated[float, typer.Argument(help="y in the map, m.")],
-    yaw: Annotated[float, typer.Argument(parser=_number, help="Heading, deg, counter-clockwise from x.")] = 90.0,
+    x: Annotated[float, typer.Argument(parser=number, help="x in the map, m.")],
+    y: Annotated[float, typer.Argument(parser=number, help="y in the map, m.")],
+    yaw: Annotated[float, typer.Argument(parser=number, help="Heading, deg, counter-clockwise from x.")] = 90.0,
     floor: Floor = "",
 ) -> None:
     """Move the simulated robot to another place, without any trace in its odometry.
@@ -123,7 +114,7 @@ def teleport(
 
 
 @app.command(
-    context_settings=ALLOW_NEGATIVE_NUMBERS,
+    cls=CommandWithNumbers,
     rich_help_panel="Drive",
     short_help="Restart localisation, near a position or globally.",
 )
@@ -131,10 +122,13 @@ def relocalise(
     context: typer.Context,
     x: Annotated[
         float | None,
-        typer.Argument(help="x in the map, m. Defaults to a search of the whole map (preset paper: its initial pose)."),
+        typer.Argument(
+            parser=number,
+            help="x in the map, m. Defaults to a search of the whole map (preset paper: its initial pose).",
+        ),
     ] = None,
-    y: Annotated[float | None, typer.Argument(help="y in the map, m.")] = None,
-    yaw: Annotated[float | None, typer.Argument(parser=_number, help="Heading, deg. Defaults to any heading.")] = None,
+    y: Annotated[float | None, typer.Argument(parser=number, help="y in the map, m.")] = None,
+    yaw: Annotated[float | None, typer.Argument(parser=number, help="Heading, deg. Defaults to any heading.")] = None,
     floor: Floor = "",
 ) -> None:
     """Reset the estimator and localise again, near a given position or globally; print the state and pose found.

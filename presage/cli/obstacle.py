@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from common.errors import UserError, first_fault
 from presage.cli.session_options import chosen_link
 from presage.session.running_sessions import OBSERVER
-from presage.terminal.options import ALLOW_NEGATIVE_NUMBERS, console
+from presage.terminal.options import CommandWithNumbers, console, number
 
 if TYPE_CHECKING:
     from common.geometry.world import Obstacle
@@ -22,14 +22,14 @@ app = typer.Typer(
 )
 
 Name = Annotated[str, typer.Argument(help="Name of the obstacle.")]
-X = Annotated[float, typer.Argument(help="x of the obstacle's centre in the map, m.")]
-Y = Annotated[float, typer.Argument(help="y of the obstacle's centre in the map, m.")]
+X = Annotated[float, typer.Argument(parser=number, help="x of the obstacle's centre in the map, m.")]
+Y = Annotated[float, typer.Argument(parser=number, help="y of the obstacle's centre in the map, m.")]
 Size = Annotated[tuple[float, float], typer.Option(help="Length and width of the box, m.")]
 Yaw = Annotated[float, typer.Option(help="Orientation of the box, deg.")]
 Radius = Annotated[float, typer.Option(help="Radius of a round obstacle, m. 0 makes a box.")]
 
 
-@app.command(context_settings=ALLOW_NEGATIVE_NUMBERS)
+@app.command(cls=CommandWithNumbers)
 def add(
     context: typer.Context,
     name: Name,
@@ -47,7 +47,7 @@ def add(
     _change(context, "add", name, _shape(x, y, size, yaw, radius))
 
 
-@app.command(context_settings=ALLOW_NEGATIVE_NUMBERS)
+@app.command(cls=CommandWithNumbers)
 def move(context: typer.Context, name: Name, x: X, y: Y) -> None:
     """Move an obstacle; it keeps its shape and orientation.
 
@@ -70,7 +70,7 @@ def remove(context: typer.Context, name: Name) -> None:
 
 @app.command("list")
 def list_(context: typer.Context) -> None:
-    """List the obstacles of the simulator with their shapes; those of the world file have numbers as names.
+    """List the obstacles of the simulator with their shapes. Those without a name in the world file have numbers.
 
     Example: `presage obstacle list`.
     """

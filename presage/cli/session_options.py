@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from common.bus.bus import Link
-from presage.session.running_sessions import OBSERVER, OPERATOR, link_of, running_sessions
+from common.runtime.session_files import running_sessions
+from presage.session.running_sessions import OBSERVER, OPERATOR, link_of
 
 RobotName = Annotated[
     str, typer.Option(envvar="PRESAGE_ROBOT", help="Robot name. Defaults to the only robot of the session.")

@@ -31,9 +31,9 @@ def check_session(link: Link, seconds: float) -> Iterator[Finding]:
         where = ", ".join(link.connect)
         yield Finding("no_router", True, f"session at {where}", where)
         for finding in evaluate_observation(observation, build_config_reply("doctor", "{}")):
-            yield finding
-            if finding.code == "missing" and not finding.ok:
-                yield from find_stopped_processes(finding.where)
+            is_missing = finding.code == "missing" and not finding.ok
+            stopped = list(find_stopped_processes(finding.where)) if is_missing else []
+            yield from stopped or [finding]  # it is to be resumed, not started again
     else:
         yield from observation
 

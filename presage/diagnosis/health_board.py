@@ -8,7 +8,8 @@ from statistics import median
 
 from common.messages.definitions import Health, Scan, Stamped
 from common.messages.topics import BELIEF, CMD_VEL, HEALTH, SCAN, Topic, expected_rate, topic_of
-from common.runtime.service_monitor import ServiceMonitor, ServiceStatus, start_command
+from common.runtime.service_monitor import ServiceMonitor, ServiceStatus
+from common.runtime.session_files import is_left_out, start_command
 
 LATENCY_WINDOW = 45  # number of messages whose median latency is shown: 3 s
 MIN_RATE_SHARE = 0.8  # share of the nominal rate below which a topic counts as slow
@@ -74,7 +75,12 @@ class HealthBoard:
 
     def rows(self, now: float) -> list[ServiceRow]:
         """One row for each service: first those that every session has, then the others by name."""
-        return [self._row(service) for service in self.monitor.services(now)]
+        return [self._row(service) for service in self.monitor.services(now) if not self._is_left_out(service)]
+
+    def _is_left_out(self, service: ServiceStatus) -> bool:
+        """Whether the session was started without a service that the robot does not need."""
+        never_seen = service.state == "absent" and service.since is None and not service.problem
+        return never_seen and is_left_out(service.name, self.robot, self.connect)
 
     def _row(self, service: ServiceStatus) -> ServiceRow:
         if service.state == "absent":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
@@ -13,7 +14,8 @@ from common.messages.requests import ConfigReply
 from common.messages.topics import BELIEF, CMD_VEL, PREDICTION, SCAN, TOPICS, TRUTH, expected_rate, topic_of
 from common.robot.scan_geometry import Sweep
 from common.runtime.protocol_check import describe_version_differences, same_protocol
-from common.runtime.service_monitor import REPLAY, SUBSTITUTES, start_command
+from common.runtime.service_monitor import REPLAY, REQUIRED_SERVICES, SUBSTITUTES
+from common.runtime.session_files import is_left_out, start_command
 from presage.diagnosis.bus_observation import BusObservation
 from presage.diagnosis.findings import Finding
 from presage.diagnosis.health_board import MIN_RATE_SHARE
@@ -32,6 +34,7 @@ def evaluate_observation(observation: BusObservation, own_config: ConfigReply) -
     yield from _presence(observation)
     yield from _duplicates(observation)
     yield from _versions(observation, own_config)
+    yield from _worlds(observation)
     yield from _clocks(observation)
     yield from _rates(observation)
     yield from _scanner(observation)
@@ -54,6 +57,8 @@ def _presence(observation: BusObservation) -> Iterator[Finding]:
         if service.state == "absent":
             advice = f"start it with: {start_command(service.name, observation.robot, observation.connect)}"
             needed = service.name in observation.monitor.missing(observation.seconds)
+            if not needed and is_left_out(service.name, observation.robot, observation.connect):
+                continue
             yield Finding("missing", False if needed else None, f"{name}: not running", service.name, advice)
         elif service.state == "silent":
             advice = "see its log; resume it or restart it"
@@ -95,6 +100,20 @@ def _versions(observation: BusObservation, own_config: ConfigReply) -> Iterator[
             if text := describe_version_differences(own_config, reply):
                 advice = "install the same versions everywhere: `make install`, or the same image"
                 yield Finding("versions", False, f"{where}: {text}", where, advice)
+
+
+def _worlds(observation: BusObservation) -> Iterator[Finding]:
+    """Compares the names of the services' worlds; the folders of a world file may differ between machines."""
+    worlds: dict[str, list[str]] = {}
+    for service in REQUIRED_SERVICES:
+        for reply in observation.replies.get(service, []):
+            # Empty while mapping: the controller plans in the map of the mapper.
+            if world := _setting(reply, "world"):
+                worlds.setdefault(Path(world).stem, []).append(service)
+    if len(worlds) > 1:
+        uses = "; ".join(f"{world}: {', '.join(services)}" for world, services in worlds.items())
+        advice = "start the services with the same --world, else poses and walls do not agree"
+        yield Finding("worlds", False, f"the services use different worlds ({uses})", observation.robot, advice)
 
 
 def _clocks(observation: BusObservation) -> Iterator[Finding]:
@@ -180,17 +199,17 @@ def _stamps(observation: BusObservation) -> Iterator[Finding]:
 
 def _time_may_stand(observation: BusObservation) -> bool:
     """Whether the stamps of scans may rightly stand still: in a replay, and in lockstep."""
-    lockstep = any(_pace(reply) == "lockstep" for reply in observation.replies.get("simulator", []))
+    lockstep = any(_setting(reply, "pace") == "lockstep" for reply in observation.replies.get("simulator", []))
     return lockstep or observation.monitor.present(REPLAY, observation.seconds)
 
 
-def _pace(reply: ConfigReply) -> str:
-    """The setting `pace` of a simulator; empty if its reply, as that of another program, has none."""
+def _setting(reply: ConfigReply, name: str) -> str:
+    """A setting of a service; empty if its reply, as that of another program, has none."""
     try:
         config = json.loads(reply.config)
     except ValueError:
         return ""
-    return str(config.get("pace", "")) if isinstance(config, dict) else ""
+    return str(config.get(name, "")) if isinstance(config, dict) else ""
 
 
 def _counts(observation: BusObservation) -> Iterator[Finding]:

@@ -15,6 +15,7 @@ from rich.table import Table
 from common.bus.bus import Link, wait_until
 from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
+from common.geometry.se2 import Array
 from common.messages.definitions import Belief, Goal, Pose, Status
 from common.messages.requests import (
     LocaliseRequest,
@@ -42,13 +43,16 @@ from presage.live.latest_messages import LatestMessages, session_bus
 from presage.terminal.progress import status_line
 
 # By the stamps of the messages. A person who blocks the robot usually moves on sooner.
-BLOCKED_TIMEOUT_S = 30.0
+PROGRESS_TIMEOUT_S = 30.0
+# Progress is a distance to the goal smaller than ever by the first, or a place away from that of the last progress by
+# the second, because the way around a wall may lead away from the goal. Backing off an obstacle is shorter.
+MIN_APPROACH_M, MIN_MOTION_M = 0.3, 1.0
 # Without statuses from the controller: time until a note is printed, and until the command gives up.
 STATUS_WARNING_S, STATUS_TIMEOUT_S = 3.0, 30.0
-MIN_PROGRESS_M = 0.3  # a smaller decrease of the distance to the goal does not end a blockage
 LOCALISATION_TIMEOUT_S = 10.0  # preset paper takes 3 s
 DISCOVERY_TIMEOUT_S, SAVE_TIMEOUT_S = 3.0, 30.0  # a large map takes a while to save
 MAX_TEXT = 200  # characters; longer texts are shortened
+GOAL_STAYS = "the robot keeps its goal; `presage goal --cancel` stops it"
 
 
 def topic_named(name: str) -> Topic:
@@ -62,7 +66,7 @@ def topic_named(name: str) -> Topic:
 def send_goal(link: Link, goal: Goal, console: Console, *, wait: bool) -> int:
     """Sends or cancels a goal; returns 0 if it is accepted (with ``wait``: reached), else 1."""
     with session_bus(link) as bus:
-        messages = LatestMessages(bus, STATUS)
+        messages = LatestMessages(bus, STATUS, BELIEF)
         if not bus.wait_matching(GOAL, 3.0):
             raise UserError("no controller receives goals: is it running?")
         status = messages.wait_for(Status, lambda _: True, STATUS_WARNING_S)
@@ -84,31 +88,57 @@ def send_goal(link: Link, goal: Goal, console: Console, *, wait: bool) -> int:
         try:
             return _follow(messages, goal, console) if wait else 0
         except KeyboardInterrupt:
-            console.print("the robot keeps its goal; `presage goal --cancel` stops it")
+            console.print(GOAL_STAYS)
             raise
 
 
 def _follow(messages: LatestMessages, goal: Goal, console: Console) -> int:
-    """Waits until the goal is reached (returns 0), or refused or blocked for too long (returns 1)."""
-    least_distance, blocked_ns, previous_ns = np.inf, 0, None
+    """Waits until the goal is reached (returns 0), or refused or without progress for too long (returns 1)."""
+    progress, waited_ns, previous_ns = _Progress(), 0, None
     with status_line("navigating", console) as show:
         while (status := _next_status(messages, console)) is not None:
             if status.goal_seq != goal.seq:
-                raise UserError("the goal was replaced by another" if status.goal else "the goal was cancelled")
-            if status.distance is not None and status.distance < least_distance - MIN_PROGRESS_M:
-                least_distance, blocked_ns = status.distance, 0
-            if status.distance is None and status.state == "navigating":  # to a lift; it drives again
-                blocked_ns = 0
-            if previous_ns is not None and status.state == "blocked":
-                blocked_ns += max(0, status.stamp_ns - previous_ns)
+                cancelled = "the goal was cancelled, or the controller was restarted"
+                raise UserError("the goal was replaced by another" if status.goal else cancelled)
+            belief = messages.latest.get(BELIEF.name)
+            if progress.is_made(status, belief if isinstance(belief, Belief) else None):
+                waited_ns = 0
+            elif previous_ns is not None:
+                waited_ns += max(0, status.stamp_ns - previous_ns)
             previous_ns = status.stamp_ns
-            if status.state == "reached" or status.refused or blocked_ns > BLOCKED_TIMEOUT_S * 1e9:
-                console.print(f"{status.state}: {status.reason}")
+            what = f"{status.state}: {status.reason}" if status.reason else status.state
+            if status.state == "reached" or status.refused:
+                console.print(what)
                 return 0 if status.state == "reached" else 1
+            if waited_ns > PROGRESS_TIMEOUT_S * 1e9:
+                console.print(f"{what}; no progress for {PROGRESS_TIMEOUT_S:g} s: {GOAL_STAYS}", soft_wrap=True)
+                return 1
             to_go = f"{status.distance:.2f} m to go" if status.distance is not None else ""
             text = ", ".join(filter(None, (status.state, to_go, status.reason)))
             show(text, f"{status.state} {status.reason}".rstrip())
-    raise UserError(f"the controller has published no status for {STATUS_TIMEOUT_S:g} s")
+    raise UserError(f"the controller has published no status for {STATUS_TIMEOUT_S:g} s; {GOAL_STAYS}")
+
+
+class _Progress:
+    """Finds out whether the robot gets nearer to its goal, or elsewhere."""
+
+    def __init__(self) -> None:
+        self._least_distance = np.inf
+        self._place: Array | None = None  # (2,) m in map, where the last progress was made
+
+    def is_made(self, status: Status, belief: Belief | None) -> bool:
+        """Whether there is progress since the last call that returned True."""
+        if status.distance is None and status.state == "navigating":
+            return True  # to a lift or in it, which may take long
+        # The pose of a lost robot moves although the robot may stand.
+        place = belief.pose.array()[:2] if belief is not None and belief.state != "lost" else None
+        nearer = status.distance is not None and status.distance < self._least_distance - MIN_APPROACH_M
+        moved = place is not None and (self._place is None or np.hypot(*(place - self._place)) > MIN_MOTION_M)
+        if nearer and status.distance is not None:
+            self._least_distance = status.distance
+        if nearer or moved:
+            self._place = self._place if place is None else place
+        return bool(nearer or moved)
 
 
 def _next_status(messages: LatestMessages, console: Console) -> Status | None:

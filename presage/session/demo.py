@@ -18,12 +18,13 @@ from common.geometry.world import World, load_world
 from common.messages.definitions import Belief, Goal, Health, Pose, Status, Truth
 from common.messages.topics import BELIEF, GOAL, HEALTH, STATUS, TRUTH
 from common.robot.robot import Robot
+from common.runtime.session_files import session_file
 from common.versions import commit
 from presage.live.latest_messages import LatestMessages
 from presage.recordings.session_figure import draw_session
 from presage.recordings.session_summary import print_summary, summarise
 from presage.session.page import show_page_link
-from presage.session.running_sessions import credentials_for, session_file
+from presage.session.running_sessions import credentials_for
 from presage.session.session_plan import plan_session
 from presage.session.stack import Stack
 from presage.terminal.options import arguments
@@ -80,7 +81,7 @@ def run_demo(demo: DemoOptions, stack: Stack, console: Console) -> tuple[Path, b
             stack.wait_alive(bus)
         if not demo.quiet:
             show_page_link(stack, console, open_it=demo.open_page)
-        with session_file(stack.endpoint, [stack.robot], stack.security):
+        with session_file(stack.endpoint, [stack.robot], stack.security, stack.start_commands()):
             reached = _localise(messages, stack, console) and _navigate(bus, messages, stack, goal, console)
         stack.check()
         for name in ("controller", "estimator", "simulator"):
@@ -117,8 +118,11 @@ def _choose_goal(demo: DemoOptions, world: World) -> tuple[float, float]:
         aligned = free[np.abs(free[:, 1] - start[1]) < 0.1 * (y1 - y0)]  # preset paper drives in a straight line
         farthest = aligned[np.argmax(np.abs(aligned[:, 0] - start[0]))] if len(aligned) else free[0]
         return (15.5, float(start[1])) if world.name == "corridor" else (float(farthest[0]), float(farthest[1]))
-    if (error := world.placement_error(np.array(demo.goal), robot.radius)) is not None:
-        raise UserError(f"goal {error} (--goal)")
+    if not world.has_room(np.array(demo.goal), robot.radius):
+        # Imported here because it is slow to import.
+        from services.controller.policies.planner import GeodesicPolicy
+
+        raise UserError(f"goal {GeodesicPolicy(robot, world).refusal(np.array(demo.goal))} (--goal)")
     return demo.goal
 
 

@@ -1,82 +1,20 @@
-"""The running sessions of this user, and how a command finds the one it is for."""
+"""How a command finds the session and the robot that it is for."""
 
 from __future__ import annotations
 
-import json
 import os
 import re
-import sys
-import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
 from pathlib import Path
-
-import psutil
 
 from common.bus.bus import DEFAULT_ENDPOINT, Link
 from common.bus.security import Credentials, read_credentials
 from common.errors import UserError
 from common.messages.topics import ROBOT_NAME_PATTERN
 from common.names import split_names
+from common.runtime.session_files import RunningSession, running_sessions
 
 OPERATOR, OBSERVER = ("operator",), ("observer", "operator")  # roles for commands that act, and that only read
-
-
-@dataclass(frozen=True)
-class RunningSession:
-    """A session that `presage up` or `presage demo` started on this machine."""
-
-    endpoint: str = DEFAULT_ENDPOINT
-    robots: tuple[str, ...] = ("robot",)
-    security: str = ""  # folder of credentials
-    pid: int = 0
-    started: float = 0.0  # creation time of the process: a later process may have the same pid
-
-
-def runtime_folder() -> Path:
-    """Folder with one file for each session: PRESAGE_RUNTIME_DIR, or a folder of this user for temporary files."""
-    if chosen := os.environ.get("PRESAGE_RUNTIME_DIR"):
-        return Path(chosen)
-    runtime = os.environ.get("XDG_RUNTIME_DIR", "")
-    if os.access(runtime, os.W_OK):
-        return Path(runtime, "presage")
-    if sys.platform == "win32":
-        name = "presage"  # each user has a folder for temporary files
-    else:
-        name = f"presage-{os.getuid()}"
-    return Path(tempfile.gettempdir(), name)
-
-
-@contextmanager
-def session_file(endpoint: str, robots: Sequence[str], security: Credentials | None) -> Iterator[None]:
-    """Keeps a file that describes this process's session while the block runs."""
-    process, folder = psutil.Process(), runtime_folder()
-    keys = "" if security is None else str(security.folder.parent)
-    session = RunningSession(endpoint, tuple(robots), keys, process.pid, process.create_time())
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    path = folder / f"{process.pid}.json"
-    path.write_text(json.dumps(asdict(session)), encoding="utf-8")
-    try:
-        yield
-    finally:
-        path.unlink(missing_ok=True)
-
-
-def running_sessions() -> list[RunningSession]:
-    """The running sessions of this user; ignores files that ended processes left behind."""
-    sessions = []
-    for path in sorted(runtime_folder().glob("*.json")):
-        with suppress(OSError, ValueError, TypeError, psutil.Error):
-            session = RunningSession(**json.loads(path.read_text(encoding="utf-8")))
-            if _is_own(path) and psutil.Process(session.pid).create_time() == session.started:
-                sessions.append(replace(session, robots=tuple(session.robots)))
-    return sessions
-
-
-def _is_own(path: Path) -> bool:
-    """False if another user wrote the file; except on Windows, anyone may write into a folder for temporary files."""
-    return sys.platform == "win32" or path.stat().st_uid == os.getuid()
 
 
 def find_session(connect: str) -> RunningSession:

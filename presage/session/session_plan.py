@@ -60,6 +60,11 @@ def plan_session(
     estimator_settings = load_settings(EstimatorSettings, estimator_args)
     # Estimator paper localises at one heading only, which its controller keeps.
     if estimator_settings.estimator == "paper" and not mapping:
+        if load_settings(ControllerSettings, controller_args).drive != "holonomic":
+            raise UserError(
+                "estimator paper needs a robot that moves without turning: set drive to holonomic, or choose another "
+                "estimator"
+            )
         controller_args += arguments(preset="paper")
     if mapping:
         simulator_args += arguments(hide_world=True)

@@ -27,6 +27,7 @@ from presage.session.ports import accepts_connections, check_port, free_port
 COLOURS = {"router": 37, "simulator": 36, "estimator": 35, "mapper": 35, "controller": 33, "recorder": 32, "viewer": 34}
 SECURITY_VARIABLES = {"PRESAGE_SECURITY", "PRESAGE_ROLE"}  # choose this process's credentials, not the children's
 SLOW_START_S = 4.0  # time without all services after which the user is told which are missing
+SECRETS = {"PRESAGE_VIEWER_TOKEN"}  # settings that are not shown
 ALIVE_TIMEOUT_S = 60.0  # for all services to start; the estimator may have to compile
 LINE_TIMEOUT_S = 30.0  # for a line of output
 TERMINATION_TIMEOUT_S = 5.0  # between SIGTERM and SIGKILL
@@ -45,11 +46,13 @@ class ServiceProcess:
     args: list[str] = field(default_factory=list)  # arguments of the Python interpreter
     service: str = ""  # service name in its liveliness token; defaults to `name`
     robot: str = ""  # robot it belongs to; defaults to the robot of the stack
+    settings: dict[str, str] = field(default_factory=dict)  # environment variables that are settings
 
-    def restart_command(self, stack: Stack) -> str:
+    @property
+    def restart_command(self) -> str:
         """Shell command that starts the same service again."""
-        variables = f"PRESAGE_CONNECT={stack.endpoint} PRESAGE_ROBOT={stack.robot} "
-        return ("" if self.name == "router" else variables) + shlex.join(["python", *self.args])
+        variables = [f"{name}={shlex.quote(value)}" for name, value in self.settings.items() if name not in SECRETS]
+        return " ".join([*variables, shlex.join(["python", *self.args])])
 
 
 class Stack:
@@ -179,6 +182,13 @@ class Stack:
                 )
             time.sleep(0.02)
 
+    def start_commands(self) -> dict[str, str]:
+        """Shell commands that start the children again, as `RunningSession` keeps them."""
+        return {
+            f"{process.robot}/{process.service}" if process.robot else name: process.restart_command
+            for name, process in self.processes.items()
+        }
+
     def ended(self) -> list[str]:
         """Names of the children that have ended."""
         return [name for name, process in self.processes.items() if process.child.poll() is not None]
@@ -216,6 +226,7 @@ class Stack:
                 name, child, threading.Thread(target=lambda: self._forward_output(process), daemon=True)
             )
             process.args = args
+            process.settings = {k: v for k, v in environment.items() if k.startswith("PRESAGE_")}
             process.reader.start()
             self.processes[name] = process
 

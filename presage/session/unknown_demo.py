@@ -25,12 +25,13 @@ from common.geometry.world import World, load_world
 from common.messages.definitions import Belief, Goal, Map, Pose, Stamped, Status, Truth
 from common.messages.requests import PoseRequest, Reply
 from common.messages.topics import BELIEF, GOAL, MAP, STATUS, TELEPORT, TRUTH
+from common.runtime.session_files import session_file
 from common.versions import commit
 from presage.live.latest_messages import LatestMessages
 from presage.recordings.session_figure import draw_session
 from presage.session.demo import DemoOptions, check_recorded, is_standing, new_recording
 from presage.session.page import show_page_link
-from presage.session.running_sessions import credentials_for, session_file
+from presage.session.running_sessions import credentials_for
 from presage.session.session_plan import plan_session
 from presage.session.stack import Stack
 from presage.terminal.options import arguments
@@ -284,7 +285,7 @@ def run_unknown_demo(demo: DemoOptions, stack: Stack, console: Console) -> tuple
             stack.wait_alive(bus)
         if not demo.quiet:
             show_page_link(stack, console, open_it=demo.open_page)
-        with session_file(stack.endpoint, [stack.robot], stack.security):
+        with session_file(stack.endpoint, [stack.robot], stack.security, stack.start_commands()):
             try:
                 run_steps(bus, observer)
             except StepError as error:

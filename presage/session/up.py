@@ -11,8 +11,9 @@ from rich.console import Console
 from common.bus.bus import open_bus
 from common.errors import UserError
 from common.runtime.config import load_settings
+from common.runtime.session_files import session_file
 from presage.session.page import show_page_link
-from presage.session.running_sessions import check_robot_name, credentials_for, session_file
+from presage.session.running_sessions import check_robot_name, credentials_for
 from presage.session.session_plan import SessionPlan, plan_session
 from presage.session.stack import Stack
 from presage.terminal.options import arguments
@@ -66,7 +67,7 @@ def run_up(options: UpOptions, console: Console) -> None:
             stack.wait_alive(bus)
         if page:
             show_page_link(stack, console, open_it=options.open_page)
-        with session_file(stack.endpoint, robots, stack.security):
+        with session_file(stack.endpoint, robots, stack.security, stack.start_commands()):
             if options.mapping:
                 console.print(
                     "[bold green]mapping[/]: click a goal, press Explore or use the arrow keys on the page, or use "
@@ -146,7 +147,7 @@ def _watch(stack: Stack, console: Console) -> None:
                 process = stack.processes[name]
                 console.print(
                     f"[bold red]{name} ended with status {process.child.returncode}[/]; it is not restarted. "
-                    f"Start it again with: {process.restart_command(stack)}",
+                    f"Start it again with: {process.restart_command}",
                     soft_wrap=True,
                 )
         if len(reported) == len(stack.processes):

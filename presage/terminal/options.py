@@ -8,8 +8,9 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
+from common.errors import UserError, similar_key
 from common.robot.scanner import SCANNERS
 from presage.terminal.settings_file import check_keys
 
@@ -18,10 +19,6 @@ console = Console(width=None if sys.stdout.isatty() else 150)
 
 # For commands whose result goes to standard output: progress and messages go to standard error.
 err_console = Console(stderr=True, width=None if sys.stderr.isatty() else 150)
-
-# Lets click pass a negative coordinate such as -1 as an argument instead of rejecting it as an unknown option. A
-# misspelt option is still rejected, because it is not a number.
-ALLOW_NEGATIVE_NUMBERS = {"ignore_unknown_options": True}
 
 WorldName = Annotated[str, typer.Option(help="World name, world file, or ROS map.yaml.")]
 EstimatorName = Annotated[str, typer.Option(help="Estimator preset: precise, paper, particle-filter or amcl-defaults.")]
@@ -61,6 +58,33 @@ class GroupWithOptions(TyperGroup):
                 place = f"; it stands before the command: {ctx.command_path} {option} ... {ctx.invoked_subcommand}"
                 error.message += place  # type: ignore[attr-defined]
             raise
+
+
+class CommandWithNumbers(TyperCommand):
+    """A command whose arguments may be negative numbers, such as -1, which are otherwise taken for options."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parses the command line. Raises UserError for an unknown option."""
+        ctx.ignore_unknown_options = True
+        known = {name for parameter in self.get_params(ctx) for name in (*parameter.opts, *parameter.secondary_opts)}
+        for word in args:
+            name = word.split("=", maxsplit=1)[0]
+            if name.startswith("--") and len(name) > 2 and name not in known:
+                if name in {"--connect", "--robot"}:
+                    raise UserError(f"{name} stands before the command, as in presage {name} NAME {self.name}")
+                similar = similar_key(name, known)
+                hint = f"did you mean {similar}?" if similar else f"presage {self.name} --help lists all"
+                raise UserError(f"{self.name} has no option {name}; {hint}")
+        return super().parse_args(ctx, args)
+
+
+def number(text: str) -> float:
+    """Parses an argument that is a number."""
+    try:
+        return float(text)
+    except ValueError:
+        hint = "; separate numbers by spaces, as in 15 1.5" if "," in text else ""
+        raise typer.BadParameter(f"{text!r} is not a number{hint}") from None
 
 
 def given_options(**options: object) -> dict[str, object]:

@@ -45,7 +45,7 @@ from common.messages.topics import (
     Query,
     Topic,
 )
-from common.runtime.service_monitor import start_command
+from common.runtime.session_files import start_command
 from services.viewer import visitor_requests as requests
 from services.viewer.state.roster import Roster
 

@@ -21,7 +21,8 @@ from common.messages.definitions import Health, Status
 from common.messages.topics import MAP, SCAN, Topic
 from common.messages.wire import DecodeError
 from common.runtime.service import Service
-from common.runtime.service_monitor import ServiceMonitor, start_command
+from common.runtime.service_monitor import ServiceMonitor
+from common.runtime.session_files import start_command
 from common.versions import versions
 from services.viewer.control import RobotControl, RobotLookup
 from services.viewer.playback import Playback

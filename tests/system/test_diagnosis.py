@@ -127,6 +127,7 @@ def test_faulty_session(process, bus, stopped_recorder, faulty_session, tmp_path
     assert "ahead of" in find_fault(found, "clocks", "estimator on far, near: its clock is 60.0 s")["what"]
     assert find_fault(found, "frozen", "no report")["where"] == "viewer"
     find_fault(found, "frozen", str(stopped_recorder.child.pid))
+    assert not [f for f in found if (f["code"], f["where"]) == ("missing", "recorder")]  # it is to be resumed
     assert "python -m services.controller" in find_fault(found, "missing", "controller")["advice"]
     find_fault(found, "rate", "scan: ")
     find_fault(found, "rate", "cmd_vel: 0.0 of 15 Hz")

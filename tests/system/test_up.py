@@ -13,6 +13,7 @@ from common.errors import UserError
 from common.geometry.world import World, save_world
 from common.messages.definitions import Belief, Health, Truth
 from common.messages.topics import BELIEF, GOAL, HEALTH, SCAN, STATUS, TRUTH
+from common.runtime.session_files import running_sessions, start_command
 from presage.live.latest_messages import LatestMessages
 from presage.session.demo import FIRST_BELIEF_TIMEOUT_S, _check_estimator
 from services.recorder.reader import read_recording
@@ -122,7 +123,7 @@ def up(process, free_port, tmp_path):
 
 
 def test_up_with_page_and_dead_service(up):
-    running, children, _ = up()
+    running, children, _ = up("--world", "corridor")
     assert len(children) == 6  # router, simulator, estimator, controller, viewer and an idle recorder
     (where,) = [line.split()[-1] for line in running.output.splitlines() if line.startswith("page:")]
     with Page(where) as page:
@@ -133,6 +134,11 @@ def test_up_with_page_and_dead_service(up):
     next(child for child in children if "services.estimator" in child.cmdline()).kill()
     running.wait_for("estimator ended with status -9")
     assert "python -m services.estimator" in running.output
+    (session,) = running_sessions()
+    command = start_command("estimator", session.robots[0], session.endpoint)
+    assert f"again with: {command}" in running.output
+    assert "PRESAGE_VIEWER_PORT=0" in command
+    assert command.endswith("python -m services.estimator --world=corridor")
     assert [ended(child) for child in children].count(False) == 5
     assert running.stop(signal.SIGINT) == 130
     assert wait_until(lambda: all(map(ended, children)), 10)

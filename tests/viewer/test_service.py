@@ -79,7 +79,8 @@ def test_empty_system(viewer, link):
         services = page.wait_for("services", lambda m: m["linked"])
         assert [row["name"] for row in services["missing"]] == ["simulator", "estimator", "controller"]
         start = services["missing"][1]["start"]
-        assert start == f"python -m services.estimator --robot {link.robot} --connect {link.connect[0]}"
+        command = f"python -m services.estimator --robot {link.robot} --connect {link.connect[0]}"
+        assert start == f"{command}  # add --world and --estimator of the session"
         rows = page.wait_for("services", lambda m: m["services"] and m["services"][0]["rates"])["services"]
         assert rows[0]["name"] == "viewer"
         answer = page.request("teleport", x=1, y=1, timeout=2.0)  # the viewer does not wait for a missing service

@@ -254,7 +254,7 @@ class ActiveLocaliser:
             sigma = reply.sigma.astype(np.float64).reshape(shape)
         energy = path_energy(paths, ranges, sigma, range_max, cost_to_goal, self._visited.novelty)
         best = int(np.argmin(energy.total))
-        self._viewpoint = paths.displacements[best], energy.of(best, energy.total)
+        self._viewpoint = paths.displacements[best], energy.of(best)
 
     def fail_prediction(self, reason: str) -> None:
         """Stores why the last request was not answered. The next one follows after `CHOICE_PERIOD_NS`."""
@@ -378,7 +378,7 @@ class ActiveLocaliser:
         self._give_up_if_stalled(belief.stamp_ns, length[best] * direction[best])
         lookahead = min(float(length[best]), MAX_LOOKAHEAD_M) * direction[best]
         return self._approach(
-            lookahead, surroundings, velocity, Decision(reason=reason, terms=energy.of(best, energy.total))
+            lookahead, surroundings, velocity, Decision(reason=reason, terms=energy.of(best))
         )
 
     def _probability_of_being_mapped(self, places: Array, belief: Belief) -> Array:

@@ -6,8 +6,8 @@ way. With preferences p(s) and the sensor model p(o | s), its expected free ener
     G(pi) = E_q[-ln p(s)] + E_q[H(p(o | s))] - E_q[ln q(s | o, pi) - ln q(s | pi)]
               risk            ambiguity        information gain, about the pose and about the place
 
-and the probability of a motion is softmax(-PROBABILITY_PRECISION G) (Parr, Pezzulo & Friston 2022, chapter 4).
-docs/method.md derives the terms, and lists the approximations.
+and the probability of a motion is softmax(-PROBABILITY_PRECISION G). docs/method.md states the terms, how they differ
+from Parr, Pezzulo & Friston 2022, and the approximations.
 """
 
 from __future__ import annotations
@@ -48,16 +48,15 @@ class ExpectedFreeEnergy:
         """G (N,) in nats."""
         return self.risk + self.ambiguity - self.pose_information - self.place_information
 
-    def of(self, motion: int, energy: Array) -> dict[str, float]:
-        """The terms of one motion by name, and its probability; ``energy`` (N,) is `total`, or +inf if excluded."""
+    def of(self, motion: int) -> dict[str, float]:
+        """The terms of one motion by name, and its probability among all N."""
         terms = {name: float(values[motion]) for name, values in vars(self).items()}
-        return terms | {"probability": float(motion_probabilities(energy)[motion])}
+        return terms | {"probability": motion_probability(float(self.total[motion]), self.total)}
 
 
-def motion_probabilities(energy: Array) -> Array:
-    """Probabilities (N,) of motions with expected free energies (N,) nats, of which at least one is finite."""
-    weight = np.exp(-PROBABILITY_PRECISION * (energy - np.min(energy)))
-    return np.asarray(weight / weight.sum())
+def motion_probability(energy: float, compared: Array) -> float:
+    """Probability of a motion with this ``energy`` among N with energies ``compared`` (N,), nats, +inf if excluded."""
+    return float(1 / np.exp(-PROBABILITY_PRECISION * (compared - energy)).sum())
 
 
 def expected_distance(distance: Array, variance: float) -> Array:

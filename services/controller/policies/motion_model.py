@@ -216,6 +216,8 @@ def _arcs(speeds: Array, bearing: float, distance: float, robot: Robot) -> Array
 def refined_motions(motion: Array, robot: Robot) -> Array:
     """Motions (N, 5) near a ``motion`` (5,): slightly faster or slower, and in slightly other directions."""
     factor, turn = (each.ravel() for each in np.meshgrid([0.85, 0.93, 1.0, 1.07, 1.15], np.linspace(-1, 1, 7)))
+    changed = (factor != 1) | (turn != 0)
+    factor, turn = factor[changed], turn[changed]
     actions = factor[:, None] * motion[:3]
     if robot.drive == "holonomic":
         actions[:, :2] = se2.rotate(np.deg2rad(4) * turn, actions[:, :2])

@@ -155,13 +155,19 @@ class SelectedMotion:
 
 
 def select_motion(
-    current: Array, lookahead: Array, surroundings: Surroundings, robot: Robot, belief: PoseBelief | None = None
+    current: Array,
+    lookahead: Array,
+    surroundings: Surroundings,
+    robot: Robot,
+    belief: PoseBelief | None = None,
+    cost_beyond: float = 0.0,
 ) -> SelectedMotion:
     """The candidate motion of least expected free energy.
 
     ``current`` (3,) is the present velocity and ``lookahead`` (2,) m the lookahead point, both in base_link. Motions
     are sampled around the latter, and then once more around the best of them. A motion is excluded if something is in
-    its way, or may come into its way before the robot stands.
+    its way, or may come into its way before the robot stands. ``cost_beyond`` m, that of the path from the lookahead
+    point on, is the same for all motions; it is only added to the risk in the result.
     """
     evaluator = _Evaluator(current, lookahead, surroundings, robot, belief or PoseBelief())
     sampled = evaluator.evaluate(motion_model.candidate_motions(current, lookahead, robot), braking_is_free=True)
@@ -169,7 +175,11 @@ def select_motion(
     chosen = sampled if sampled.least <= refined.least else refined
     hindered = float(sampled.energy.total.min()) < chosen.least - HINDERED_M * NATS_PER_METRE
     best = chosen.best
-    return SelectedMotion(chosen.motions[best, :3], chosen.poses[best], chosen.terms, hindered=hindered)
+    terms = chosen.energy.of(best)
+    terms["risk"] += 2 * NATS_PER_METRE * cost_beyond  # in the mean distance during the motion and in that at its end
+    compared = np.concatenate([sampled.allowed_energy, refined.allowed_energy])
+    terms["probability"] = float(efe.motion_probability(chosen.least, compared))
+    return SelectedMotion(chosen.motions[best, :3], chosen.poses[best], terms, hindered=hindered)
 
 
 @dataclass(frozen=True)
@@ -188,10 +198,6 @@ class _Evaluation:
     @property
     def least(self) -> float:
         return float(self.allowed_energy.min())
-
-    @property
-    def terms(self) -> dict[str, float]:
-        return self.energy.of(self.best, self.allowed_energy)
 
 
 class _Evaluator:

@@ -192,9 +192,10 @@ class GeodesicPolicy:
         if stop is not None:
             return stop
         lookahead = self.field.lookahead_point(pose[:2], path, stopping_distance(self.robot))
+        cost_beyond = self.field.cost_from(lookahead)
         lookahead = se2.rotate(-pose[2], lookahead - pose[:2])
         known = PoseBelief(pose, _covariance(belief), self._information)
-        selected = select_motion(velocity, lookahead, surroundings, self.robot, known)
+        selected = select_motion(velocity, lookahead, surroundings, self.robot, known, cost_beyond)
         action = turn_to_lookahead(
             velocity,
             selected.action,

@@ -181,10 +181,13 @@ def find_conflicts(keys: Mapping[str, Topic], alive: Mapping[str, Collection[str
     reasons += [f"{key} would drive the live robot" for key in driven]
     if not reasons:
         return ""
-    names = sorted({keys[key].name for held in (*found.values(), driven) for key in held})
+    held_keys = {key for held in (*found.values(), driven) for key in held}
+    leave_out = ""
+    if any(topic.rate for key, topic in keys.items() if key not in held_keys):  # else nothing would be left to see
+        leave_out = f", leave them out with --except {','.join(sorted({keys[key].name for key in held_keys}))}"
     return (
-        f"conflict with a live publisher: {'; '.join(reasons)}; leave them out with --except {','.join(names)}, use "
-        "other keys with --robot NAME, or publish anyway with --force"
+        f"conflict with a live publisher: {'; '.join(reasons)}; publish as another robot with --robot NAME"
+        f"{leave_out}, or publish anyway with --force"
     )
 
 

@@ -193,8 +193,10 @@ def test_signals_before_the_loop(process, when, text):
 
 
 def test_without_a_router(process, free_port):
-    running = process(SMALL, env={"PRESAGE_CONNECT": f"tcp/127.0.0.1:{free_port()}"})
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    running = process(SMALL, env={"PRESAGE_CONNECT": endpoint})
     running.wait_for("ready")
+    assert f"nothing answers at {endpoint} yet; waiting (--connect names another address)" in running.output
     assert running.stop() == 0, running.output
 
 

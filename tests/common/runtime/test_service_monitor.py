@@ -15,19 +15,18 @@ from common.runtime.service_monitor import (
     Report,
     ServiceMonitor,
     find_problem,
-    start_command,
 )
 
 NOW = 1000.0
 
 
-def health(service, uptime=9.0, note="", idle=False, **counts) -> Health:
+def health(service, uptime=9.0, note="", idle=False, instance="", **counts) -> Health:
     """``scan__received=3``: three scans were received."""
     rows = [
         TopicHealth(key=f"presage/robot/{topic}", **{kind: count})
         for topic, kind, count in ((*name.split("__"), count) for name, count in counts.items())
     ]
-    return Health(stamp_ns=0, service=service, uptime=uptime, note=note, idle=idle, topics=rows)
+    return Health(stamp_ns=0, service=service, uptime=uptime, note=note, idle=idle, instance=instance, topics=rows)
 
 
 def states(monitor, now) -> dict[str, str]:
@@ -145,13 +144,13 @@ def test_invented_services_are_limited():
     assert set(REQUIRED_SERVICES) <= states(monitor, NOW).keys()
 
 
-@pytest.mark.parametrize(
-    ("service", "robot", "connect", "command"),
-    [
-        ("estimator", "robot", "", "python -m services.estimator"),
-        ("router", "robot", "tcp/a:7447", "python -m common.router"),
-        ("viewer", "two", "tcp/a:7447", "python -m services.viewer --robot two --connect tcp/a:7447"),
-    ],
-)
-def test_start_commands(service, robot, connect, command):
-    assert start_command(service, robot, connect) == command
+def test_working_instance_hides_an_idle_one():
+    """`presage record` starts a second recorder beside the one that waits for a request."""
+    monitor = ServiceMonitor("robot")
+    ready = {"idle": True, "note": "not recording", "instance": "ready"}
+    monitor.add_health(health("recorder", uptime=9.0, **ready), NOW)
+    monitor.add_health(health("recorder", uptime=1.0, instance="records"), NOW + 0.5)
+    monitor.add_health(health("recorder", uptime=10.0, **ready), NOW + 1)
+    assert service(monitor, "recorder", NOW + 1).health.instance == "records"
+    monitor.add_health(health("recorder", uptime=13.0, **ready), NOW + 4)
+    assert service(monitor, "recorder", NOW + 4).health.instance == "ready"

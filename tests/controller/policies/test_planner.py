@@ -13,6 +13,7 @@ from common.messages.definitions import BeliefHypothesis, Pose
 from common.messages.requests import PredictReply
 from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS
+from services.controller.policies.expected_free_energy import NATS_PER_METRE
 from services.controller.policies.planner import GeodesicPolicy
 from services.controller.policies.straight_line import StraightLinePolicy
 from tests.common.geometry.maps import rooms
@@ -157,6 +158,17 @@ def test_side_of_a_box_that_was_never_seen():
     """On a narrow curve around a box, its side comes out of the sector behind the robot that the scanner cannot see."""
     changed, start = room(10, 5, box(7.5, 2.5, 0.3, 0.3)), (8.584, 3.845, 1.4)
     assert drive(changed, Robot(drive="holonomic"), start, goal(7.5, 2.5), 120, known=HALL)[2] == 0
+
+
+def test_published_energy():
+    """The risk includes the path beyond the lookahead point; the probability is that among all motions compared."""
+    policy, risks = GeodesicPolicy(Robot(), room(30, 5)), []
+    for x in (5.0, 10.0, 20.0):
+        policy.set_goal(np.array([25.0, 2.5]))
+        decision = policy.decide(belief(0, [x, 2.5, 0.0]), np.array([0.5, 0.0, 0.0]), np.zeros(3))
+        risks.append(decision.terms["risk"])
+        assert 0 < decision.terms["probability"] < 0.2  # several motions are nearly as good
+    np.testing.assert_allclose(-np.diff(risks), 2 * NATS_PER_METRE * np.array([5.0, 10.0]), rtol=0.05)
 
 
 @pytest.mark.parametrize("kind", KINDS)

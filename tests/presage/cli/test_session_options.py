@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from typer.testing import CliRunner
 
+from common.runtime.session_files import session_file
 from presage.cli.main import app
 from presage.live import commands
-from presage.session.running_sessions import session_file
 
 HERE = "tcp/127.0.0.1:7001"
 
@@ -23,7 +23,7 @@ HERE = "tcp/127.0.0.1:7001"
 def test_session(monkeypatch, options, command, line):
     monkeypatch.setattr(commands, "send_goal", lambda *_, **__: 0)
     monkeypatch.setattr("presage.diagnosis.doctor.run_doctor", lambda *_, **__: 0)
-    with session_file(HERE, ["truck"], None):
+    with session_file(HERE, ["truck"], None, {}):
         done = CliRunner(env={"PRESAGE_CONNECT": "", "PRESAGE_ROBOT": ""}).invoke(app, [*options, *command])
     assert (done.exit_code, done.stderr, done.stdout) == (0, line, "")
 

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from common.bus.bus import DEFAULT_ENDPOINT
 from common.messages.definitions import Belief, CmdVel, Health, Pose, Scan, TopicHealth, Twist
 from common.messages.topics import BELIEF, CMD_VEL, HEALTH, SCAN
 from common.runtime.service_monitor import REPORT_TIMEOUT_S
+from common.runtime.session_files import session_file
 from presage.diagnosis.health_board import LATENCY_WINDOW, HealthBoard
 from presage.diagnosis.top import tables
 
@@ -59,6 +61,19 @@ def test_states():
     assert (words["simulator"], words["estimator"], words["controller"]) == ("silent", "missing", "gone")
     start = "start it: python -m services.estimator --robot r2 --connect tcp/10.0.0.1:7447"
     assert start in " ".join(text(board, 9.0).replace("│", " ").split())
+
+
+def test_services_of_a_known_session(board):
+    """Its own commands start the missing ones; those that it was started without are no rows."""
+    world = "/a/folder/with/a/long/name/that/fits/into/no/column/of/the/table/office.yaml"
+    command = f"python -m services.estimator --world={world}"
+    commands = {"estimator": command, "recorder": "python -m services.recorder"}
+    with session_file(DEFAULT_ENDPOINT, ["robot"], None, commands):
+        names = [row.service.name for row in board.rows(0.0)]
+        note, shown = row(board, "estimator").note, text(board)
+    assert names == ["simulator", "estimator", "controller", "recorder"]
+    assert note == f"start it: {command}"
+    assert world in "".join(shown.replace("│", " ").split())
 
 
 def test_rates_and_counts(board):

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 
 import numpy as np
 import pytest
 
+from common.bus.bus import DEFAULT_ENDPOINT
 from common.messages.definitions import Health, Pose, Scan, TopicHealth
 from common.messages.topics import BELIEF, CMD_VEL, PREDICTION, SCAN, TOPICS, TRUTH
 from common.runtime.protocol_check import build_config_reply
 from common.runtime.service_monitor import REPORT_TIMEOUT_S, RESULT_TIMEOUT_S, ServiceMonitor
+from common.runtime.session_files import session_file
 from presage.diagnosis.bus_observation import BusObservation, check_endpoint
 from presage.diagnosis.rules import MAX_CLOCK_DIFFERENCE_S, evaluate_observation
 from services.recorder.files.message_counts import SequenceNumbers
@@ -71,6 +74,34 @@ def problems(seen: BusObservation) -> set[str]:
 )
 def test_presence(seen, codes):
     assert problems(seen) == codes
+
+
+def test_services_of_a_known_session():
+    """Its own commands start the missing ones; those that it was started without are not missing."""
+    seen = observed(["simulator", "controller"])
+    assert {finding.where for finding in findings(seen, "missing")} == {*NAMES, "recorder", "viewer"}
+    commands = {"estimator": "python -m services.estimator --world=office"}
+    with session_file(DEFAULT_ENDPOINT, ["robot"], None, commands):
+        missing = {finding.where: finding.advice for finding in findings(seen, "missing")}
+    assert missing.keys() == set(NAMES)
+    assert missing["estimator"] == "start it with: python -m services.estimator --world=office"
+
+
+@pytest.mark.parametrize(
+    ("estimator", "controller", "codes"),
+    [
+        ("office", "worlds/office.yaml", set()),
+        ("office", "", set()),  # while mapping
+        ("corridor", "office", {"worlds"}),
+    ],
+)
+def test_worlds(estimator, controller, codes):
+    seen = observed()
+    for name, world in {"simulator": "office", "estimator": estimator, "controller": controller}.items():
+        seen.replies[name] = [build_config_reply(name, json.dumps({"world": world}), 5.0)]
+    assert problems(seen) == codes
+    for finding in findings(seen, "worlds"):
+        assert "(office: simulator, controller; corridor: estimator)" in finding.what
 
 
 def test_missing_results():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from common.errors import UserError
 from common.geometry.world import World
 from presage.session.demo import DemoOptions, _choose_goal
 from tests.common.geometry.maps import building
@@ -16,3 +17,8 @@ SHORT = World(name="short", boundary=[(0, 0), (4, 0), (4, 4), (0, 4)])
 def test_goal_on_the_floor_of_the_start(seed):
     tower = building(ground=ROOM, first=SHORT)
     assert tower.floor_at(_choose_goal(DemoOptions(seed=seed), tower)).name == "ground"
+
+
+def test_goal_in_a_wall():
+    with pytest.raises(UserError, match=r"goal \(3.00, 3.95\) in room .*; the nearest place .* is \(.*\) \(--goal\)"):
+        _choose_goal(DemoOptions(goal=(3.0, 3.95)), ROOM)

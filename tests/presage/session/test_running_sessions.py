@@ -9,8 +9,9 @@ import pytest
 
 from common.bus.bus import DEFAULT_ENDPOINT
 from common.errors import UserError
+from common.runtime.session_files import runtime_folder, session_file
 from presage.session import credentials as secure
-from presage.session.running_sessions import OBSERVER, find_session, link_of, runtime_folder, session_file
+from presage.session.running_sessions import OBSERVER, find_session, link_of
 
 HERE = "tcp/127.0.0.1:7001"
 
@@ -23,7 +24,7 @@ def test_without_a_session(connect, endpoint):
 
 def test_one_session_and_its_robot(tmp_path):
     secure.init(tmp_path)
-    with session_file(HERE, ["truck"], link_security(tmp_path)):
+    with session_file(HERE, ["truck"], link_security(tmp_path), {}):
         link = link_of("", "", OBSERVER)
         assert (link.connect, link.robot, link.security.member.name) == ((HERE,), "truck", "observer")
         assert link_of("tcp/far:1", "").robot == "robot"
@@ -38,7 +39,7 @@ def link_security(folder):
 
 
 def test_several_robots_need_a_name():
-    with session_file(HERE, ["r-1", "r-2"], None):
+    with session_file(HERE, ["r-1", "r-2"], None, {}):
         assert link_of("", "r-2").robot == "r-2"
         with pytest.raises(UserError, match=r"several robots .* --robot`: r-1, r-2"):
             link_of("", "")

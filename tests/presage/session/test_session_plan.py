@@ -45,7 +45,11 @@ def test_arguments_of_services(tmp_path, monkeypatch):
             "presage train --world maze .*--model exact",
             {},
         ),
-        ({"estimator": ["--estimator=paper"], "drive": "differential"}, "preset paper moves without turning", {}),
+        (
+            {"estimator": ["--estimator=paper"], "drive": "differential"},
+            "set drive to holonomic, or choose another estimator",
+            {},
+        ),
     ],
 )
 def test_mistakes_are_one_line(wrong, says, variables, monkeypatch):

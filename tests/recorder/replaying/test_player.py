@@ -173,6 +173,9 @@ def test_conflicts():
     assert "presage/r/health/estimator" in find_conflicts(KEYS, {"r": {"estimator"}})
     assert find_conflicts({SCAN.key("r"): SCAN}, {"r": {"estimator"}}) == ""
     assert "simulator" in find_conflicts({SCAN.key("r"): SCAN}, {"r": {"simulator"}})
+    everything = find_conflicts(KEYS, {"r": {"simulator", "estimator", "controller", "recorder"}})
+    assert "as another robot with --robot NAME" in everything
+    assert "--except" not in everything  # next to nothing would be left
     assert "the replay of 'r'" in find_conflicts({BELIEF.key("r"): BELIEF}, {"r": {"replay"}})
 
 
@@ -183,7 +186,8 @@ def test_conflicts_of_commands_and_goals():
         (GOAL, "controller"),
         (DRIVE, "controller"),
     ):
-        conflict = find_conflicts({topic.key("r"): topic}, {"r": {service, "viewer"}})
+        both = {topic.key("r"): topic, BELIEF.key("r"): BELIEF}
+        conflict = find_conflicts(both, {"r": {service, "viewer"}})
         assert f"{topic.key('r')} would drive the live robot" in conflict
         assert f"--except {topic.name}," in conflict
         assert find_conflicts({topic.key("r"): topic}, {"r": {"estimator", "viewer"}}) == ""
