@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from presage.laser_scan import LaserScan
     from presage.logs.log import Reading
     from presage.logs.scan_files import Scans, read_scans
+    from services.estimator.paper.perception import Descent
     from services.estimator.precise.gauss_newton import GaussNewton, Optimiser
     from services.estimator.precise.likelihood import Evidence, Likelihood
     from services.estimator.shared.generative_models import Expected, GenerativeModel, RayCaster
@@ -29,6 +30,7 @@ _MODULES = {
     "presage.laser_scan": ("LaserScan",),
     "presage.logs.log": ("Reading",),
     "presage.logs.scan_files": ("Scans", "read_scans"),
+    "services.estimator.paper.perception": ("Descent",),
     "services.estimator.precise.gauss_newton": ("GaussNewton", "Optimiser"),
     "services.estimator.precise.likelihood": ("Evidence", "Likelihood"),
     "services.estimator.shared.generative_models": ("Expected", "GenerativeModel", "RayCaster"),
@@ -38,6 +40,7 @@ _MODULE_OF = {name: module for module, names in _MODULES.items() for name in nam
 
 __all__ = [
     "SCANNERS",
+    "Descent",
     "Estimator",
     "Evidence",
     "Expected",

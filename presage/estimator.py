@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from services.estimator.factory import EstimatorOptions, EstimatorPreset, Scanne
 from services.estimator.paper.perception import Descent
 from services.estimator.precise.gauss_newton import Optimiser
 from services.estimator.precise.likelihood import Likelihood
+from services.estimator.settings import ignored_settings
 from services.estimator.shared.generative_models import GenerativeModel
 from services.estimator.shared.interface import PoseEstimator, Posterior, Predicted
 
@@ -60,12 +62,17 @@ class Estimator:
             models: folder of weights; defaults to your trained ones for the world, else the shipped ones.
             likelihood: for preset "precise": density of a range; defaults to the calibrated one of the model.
             optimiser: for preset "precise": finds poses of least free energy; defaults to GaussNewton().
-            sigma: noise of the scanner in m; defaults to what the scans state, else 0.02.
+            sigma: for preset "precise": noise of the scanner in m; defaults to what the scans state, else 0.02.
             initial_pose: (3,) pose at the first scan, or (2,) without a heading; by default, anywhere.
             seed: random seed.
-            descent: parameters of preset "paper".
+            descent: parameters of preset "paper", which estimates x and y for one heading (`fixed_heading`).
 
         """
+        if descent is not None and preset != "paper":
+            raise UserError(f"descent is for preset paper only, not {preset}")
+        given = [name for name, is_given in (("model", model != "learned"), ("sigma", sigma is not None)) if is_given]
+        for warning in ignored_settings(preset, given):
+            warnings.warn(warning, stacklevel=2)
         generative_model = None if isinstance(model, str | Path) else model
         for name, part, method in (
             ("model", generative_model, "expect"),
@@ -101,6 +108,11 @@ class Estimator:
         self._core: PoseEstimator | None = None  # made for this geometry
         if self.scanner is not None:
             self._core_for(ScannerGeometry.of(self.scanner))
+
+    @property
+    def fixed_heading(self) -> float | None:
+        """The one heading in rad that preset paper knows; None for the others, and until the scanner is known."""
+        return getattr(self._core, "fixed_heading", None)
 
     def update(
         self, scan: LaserScan | Numbers, *, stamp: float | None = None, odom: Numbers | None = None

@@ -151,7 +151,8 @@ class Belief(Stamped):
     Any estimator can publish it: what it does not compute stays nil.
     """
 
-    state: Literal["localising", "tracking", "ambiguous", "lost"]  # operations.md explains these
+    # tracking: the pose is known; ambiguous: several poses are plausible; lost: the pose was known; localising: not yet
+    state: Literal["localising", "tracking", "ambiguous", "lost"]
     pose: Pose  # base_link in map
     covariance: Covariance | None = None  # (3, 3) of x, y, yaw in map, positive semidefinite
     xi: Floats | None = None  # (3,) dg' Pi (o - g), the negative gradient of accuracy in map: nats/m, nats/m, nats/rad
@@ -352,6 +353,7 @@ class Health(Stamped):
     service: Name
     uptime: NotNegative  # s, wall time
     topics: list[TopicHealth] = []  # noqa: RUF012
+    # numbers by name; each service has its own
     counters: dict[str, Count] = {}  # noqa: RUF012 - pydantic copies defaults
     note: Text = ""  # what the service waits for, or its last problem
     instance: Name = ""  # name of the process; each process counts its own seq

@@ -12,10 +12,10 @@ import typer
 from common.errors import UserError
 from lab.cli.navigation import dock, explore, navigate
 from lab.cli.options import Alpha, Estimators, ExperimentSeed, Out, Trials, show, worker_count
-from presage.terminal.options import console
+from presage.terminal.options import GroupWithOptions, console
 from presage.terminal.output import make_folder
 
-app = typer.Typer(no_args_is_help=True)
+app = typer.Typer(no_args_is_help=True, cls=GroupWithOptions)
 
 
 @app.callback()
@@ -144,6 +144,8 @@ def similar_objects(
     trials: Trials = 30,
 ) -> None:
     """Worlds with similar objects or two identical rooms: places found, wrong claims, and ambiguity kept.
+
+    First trains the estimators in three worlds, which takes several minutes however few the trials are.
 
     Example: `presage experiment aliasing --trials 5`.
     """

@@ -24,10 +24,7 @@ ExperimentSeed = Annotated[
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for NAME.json, .csv, .pdf, .png.")]
 Estimators = Annotated[
     str,
-    typer.Option(
-        help="Comma-separated names as in the table, but without the commas inside a name "
-        "('particle-filter odometry'). Defaults to all."
-    ),
+    typer.Option(help="Comma-separated names as in the table, where 'precise, odometry' is one name. Defaults to all."),
 ]
 Alpha = Annotated[
     float | None,

@@ -58,12 +58,18 @@ class ExperimentWorld:
 
 
 def parse_estimators(names: str, known: Iterable[str] = NAMES) -> tuple[str, ...]:
-    """Estimator names from a comma-separated text, in which a name is written without its own comma.
+    """Estimator names from a comma-separated text, with or without the comma inside a name.
 
-    "particle-filter odometry" stands for "particle-filter, odometry". Raises UserError for unknown names.
+    "particle-filter, odometry" and "particle-filter odometry" are one name. Raises UserError for unknown names.
     """
     by_name = {name.replace(",", ""): name for name in known}
-    parsed = [" ".join(part.split()) for part in names.split(",")]
+    parts = [" ".join(part.split()) for part in names.split(",")]
+    parsed: list[str] = []
+    for part in parts:
+        if parsed and part not in by_name and f"{parsed[-1]} {part}" in by_name:
+            parsed[-1] += f" {part}"  # the second half of a name
+        else:
+            parsed.append(part)
     if unknown := [name for name in parsed if name not in by_name]:
         raise UserError(f"no estimator {unknown[0]!r} in the experiments: choose from {', '.join(by_name)}")
     return tuple(by_name[name] for name in parsed)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -19,6 +20,7 @@ from common.errors import UserError
 from common.geometry.world import load_world
 from common.versions import checkout_state
 from lab.workers import pool
+from presage.terminal.progress import LINE_INTERVAL_S
 
 Job = TypeVar("Job")  # a frozen dataclass of plain values, because it is pickled and compared with stored jobs
 TrialResult = dict[str, Any]  # can be written as JSON
@@ -45,11 +47,18 @@ def run_trials(
     )
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(name, total=len(jobs), completed=len(done))
+        if not console.is_terminal:
+            console.print(f"{name}: {len(jobs) - len(done)} trials", highlight=False)
+        last_line_s = time.monotonic()
 
         def store_result(index: int, result: TrialResult) -> None:
             done[index] = result
             store.add(index, result)
             bar.advance(task)
+            nonlocal last_line_s
+            if not console.is_terminal and (now_s := time.monotonic()) - last_line_s >= LINE_INTERVAL_S:
+                last_line_s = now_s
+                console.print(f"{name}: {len(done)} of {len(jobs)} trials done", highlight=False)
 
         remaining = [index for index in range(len(jobs)) if index not in done]
         try:

@@ -77,10 +77,13 @@ def localize(
     from presage.logs.options import LogSettings
     from presage.replay.localize import LocalizeOptions, build_estimator_options
     from presage.replay.localize import localize as run
-    from services.estimator.settings import EstimatorSettings
+    from services.estimator.paper.perception import Descent
+    from services.estimator.settings import EstimatorSettings, ignored_settings
 
     chosen = arguments(config=config, estimator=estimator, initial_pose=initial_pose, **model_setting(model))
     settings, log = load_settings(EstimatorSettings, chosen), load_section(LogSettings, config, "log", mount=mount)
+    for warning in ignored_settings(settings.estimator, settings.changed | ({"sigma"} if log.sigma else set())):
+        err_console.print(f"warning: {warning}", highlight=False)
     estimator_options = build_estimator_options(
         file,
         world,
@@ -90,6 +93,7 @@ def localize(
         log.sigma or settings.sigma,
         settings.seed,
         settings.initial_pose,
+        Descent(alpha=settings.alpha, iterations=settings.iterations),
     )
     options = LocalizeOptions.of(
         file,

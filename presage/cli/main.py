@@ -28,6 +28,7 @@ from presage.interrupts import ignoring_interrupts, interruptible
 from presage.terminal.options import (
     Config,
     EstimatorName,
+    GroupWithOptions,
     Json,
     ModelName,
     OpenPage,
@@ -40,6 +41,7 @@ from presage.terminal.options import (
 )
 
 app = typer.Typer(
+    cls=GroupWithOptions,
     help="A robot that localises itself and navigates by predicting what its laser will see.",
     no_args_is_help=True,
     add_completion=False,

@@ -122,7 +122,8 @@ def rerun(
     Settings that are neither given nor in section `estimator` of --config keep their recorded values. The new
     recording contains all messages of the old one, and the new beliefs and predictions under presage/ROBOT-rerun/.
     Prints and draws (NEW.png, .pdf, data in .csv) the errors against the recorded truth, NEES, share of scans in state
-    tracking, computing times, and the difference between the two estimators.
+    tracking, computing times, and the difference between the two estimators. Estimator paper assumes one heading; a
+    warning says if the robot had another.
 
     Examples: `presage rerun run.mcap --estimator particle-filter --json pf.json`;
     `presage rerun run.mcap --model exact --out exact.mcap`;

@@ -304,6 +304,8 @@ def relocalise(link: Link, pose: Pose | None, console: Console, *, heading_known
     x, y, yaw = belief.pose.x, belief.pose.y, np.rad2deg(belief.pose.yaw)
     late = "" if belief.state == "tracking" else f" after {LOCALISATION_TIMEOUT_S:g} s, most probably"
     console.print(f"{belief.state}{late} at ({x:.3f}, {y:.3f}), {yaw:.1f} deg in the map", highlight=False)
+    if pose and heading_known and belief.estimator == "paper":
+        console.print(f"preset paper assumes this heading, and did not use {np.rad2deg(pose.yaw):g} deg")
     return 0 if belief.state == "tracking" else 1
 
 

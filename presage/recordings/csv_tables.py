@@ -128,6 +128,7 @@ class _TopicLayout:
     def __init__(self, topic: Topic) -> None:
         self.name, self.columns = topic.name, columns_of(topic.message)
         kinds = [(name, kind) for name, kind, _ in fields_of(topic.message)]
+        self.meanings = comments(topic.message)  # of the fields
         fixed = {column.name.split(".")[0] for column in self.columns}
         self.arrays = [name for name, kind in kinds if isinstance(kind, Binary) and name not in fixed]
         self.lists = {name: columns_of(get_args(kind)[0]) for name, kind in kinds if get_origin(kind) is list}
@@ -176,11 +177,13 @@ def export_csv(
             messages = with_progress(entries(recording, name), sum(counts[key] for key in keys), "csv", console)
             for topic, message, raw in messages:
                 layouts[topic.name].write(tables, message, [raw.logged_ns, raw.published_ns], arrays=arrays)
-        (new / README).write_text(_readme(recording, name, layouts, tables.rows), encoding="utf-8")
+        (new / README).write_text(_readme(recording, name, layouts, tables.rows, arrays=arrays), encoding="utf-8")
     return tables.rows
 
 
-def _readme(recording: Recording, robot: str, layouts: dict[str, _TopicLayout], rows: dict[str, int]) -> str:
+def _readme(
+    recording: Recording, robot: str, layouts: dict[str, _TopicLayout], rows: dict[str, int], *, arrays: bool
+) -> str:
     """Text of the README: the meaning of all columns."""
     lines = [
         f"# {recording.path.name}, robot {robot}",
@@ -188,14 +191,26 @@ def _readme(recording: Recording, robot: str, layouts: dict[str, _TopicLayout], 
         "Written by `presage export --format csv`. Units are SI; poses are of base_link in map unless noted otherwise.",
         "An empty cell means unknown. Ranges: inf is no return, -inf too close (REP-117), 0 not measured.",
         "`stamp_ns` is simulation or sensor time; `log_time_ns` and `publish_time_ns` are wall time.",
-        "Lists and arrays have their own files (TOPIC.FIELD.csv; -N is the number of columns of an array), whose rows",
-        "belong to the message with the same `log_time_ns` and `seq`.",
+        "Lists have their own files (TOPIC.FIELD.csv), whose rows belong to the message with the same `log_time_ns`",
+        "and `seq`. So have arrays (TOPIC.FIELD-N.csv, with N columns), "
+        + ("which are all here." if arrays else "which `presage export --format csv --arrays` writes."),
     ]
     for layout in layouts.values():
         lines += ["", f"## {layout.name}.csv ({rows.get(f'{layout.name}.csv', 0)} rows)", ""]
-        lines += ["| column | meaning |", "|---|---|"]
-        lines += [f"| `{name}` | {text} |" for name, text in TIMES.items()]
-        lines += [f"| `{column.name}` | {column.meaning} |" for column in layout.columns]
+        table = [*TIMES.items(), *((column.name, column.meaning) for column in layout.columns)]
+        lines += ["| column | meaning |", "|---|---|", *(_table_row(f"`{name}`", text) for name, text in table)]
         for name, columns in layout.lists.items():
-            lines += [f"| `{layout.name}.{name}.csv`: `{column.name}` | {column.meaning} |" for column in columns]
+            file = f"`{layout.name}.{name}.csv`"
+            lines += [_table_row(f"{file}: `{column.name}`", column.meaning) for column in columns]
+        for name in layout.maps:
+            lines.append(_table_row(f"`{layout.name}.{name}.csv`: `name`, `value`", layout.meanings[name]))
+        for name in layout.arrays:
+            file = f"`{layout.name}.{name}-N.csv`" + ("" if arrays else ", with `--arrays`")
+            lines.append(_table_row(file, layout.meanings[name]))
     return "\n".join(lines) + "\n"
+
+
+def _table_row(name: str, meaning: str) -> str:
+    """A row of a Markdown table."""
+    escaped = meaning.replace("|", "\\|")
+    return f"| {name} | {escaped} |"

@@ -104,6 +104,7 @@ class RecordedSession:
     counts: dict[str, int] = field(default_factory=dict)  # by key
     undecodable: int = 0
     scans: StampedRows = field(default_factory=lambda: StampedRows(0))
+    first_scan_seq: int = 0  # above 0 if the recording began after the scanner
     last_scan: Scan | None = None
     predicted: tuple[Scan, Prediction] | None = None  # the last scan with a prediction
     truth: StampedRows = field(default_factory=StampedRows)
@@ -116,6 +117,7 @@ class RecordedSession:
     goals: list[Goal] = field(default_factory=list)
     goal_times_ns: list[int] = field(default_factory=list)  # of each goal: stamp of the last scan or truth before it
     reached: list[Status] = field(default_factory=list)  # statuses in state reached
+    refused: list[Status] = field(default_factory=list)  # statuses that refuse a goal
     drops: ServiceDrops = field(default_factory=ServiceDrops)
 
     def energies(self) -> Array:
@@ -137,11 +139,21 @@ class RecordedSession:
 
     def reached_ns(self) -> int | None:
         """Stamp of the status that reports the last goal as reached, or None."""
+        status = self._first_of_goal(self.reached)
+        return None if status is None else status.stamp_ns
+
+    def refusal(self) -> str | None:
+        """Why the last goal was refused; None if it was not."""
+        status = self._first_of_goal(self.refused)
+        return None if status is None else status.reason
+
+    def _first_of_goal(self, statuses: list[Status]) -> Status | None:
+        """The first of the ``statuses`` that is about the last goal."""
         goal = self.goal()
         if goal is None:
             return None
         after = self.goal_times_ns[-1]
-        return next((s.stamp_ns for s in self.reached if s.goal == goal.pose and s.stamp_ns >= after), None)
+        return next((s for s in statuses if s.goal == goal.pose and s.stamp_ns >= after), None)
 
 
 def load_session(path: Path) -> RecordedSession:
@@ -206,6 +218,8 @@ class _Gatherer:
     def _status(self, status: Status, _: int) -> None:
         if status.state == "reached":
             self.session.reached.append(status)
+        if status.refused:
+            self.session.refused.append(status)
 
     def _health(self, health: Health, _: int) -> None:
         self.session.drops.add(health)
@@ -227,6 +241,8 @@ class _Gatherer:
             self.session.estimator = belief.estimator
 
     def _scan(self, scan: Scan, logged: int) -> None:
+        if not len(self.session.scans):
+            self.session.first_scan_seq = scan.seq
         if self.session.scans.add(scan.stamp_ns, logged):
             self._last_stamp_ns = scan.stamp_ns
             self.session.last_scan = self._waiting[scan.stamp_ns] = scan

@@ -33,7 +33,7 @@ TRUTH, BELIEF, MEASURED, GOAL = "#000000", "#D55E00", "#0072B2", "#009E73"
 WALL, FURNITURE, INK = "#8C8C8C", "#C8C8C8", "#555555"
 FORMATS = (".png", ".pdf", ".svg")
 MAX_TIES = 200  # lines between belief and truth
-MIN_LOG_VALUE = 1e-3  # m, smallest error on the logarithmic axis
+MIN_LOG_VALUE = 1e-5  # m, smallest error on the logarithmic axis
 
 
 def draw_session(path: Path, png: Path, *, title: str | None = None) -> None:
@@ -86,17 +86,25 @@ def _headline(session: RecordedSession) -> str:
     parts = [f"world {summary.world}" if summary.world else "world unknown"]
     if len(session.belief):
         estimator = f" by preset {session.estimator}" if session.estimator else ""
-        parts.append(
-            f"localised at scan {summary.localised_after_scans}{estimator}"
-            if summary.localised_after_scans is not None
-            else f"not localised{estimator}"
-        )
+        localised = "localised before the recording" if summary.localised_before_recording else "not localised"
+        if summary.localised_after_scans is not None:
+            localised = f"localised at scan {summary.localised_after_scans}"
+        parts.append(localised + estimator)
     if summary.position_error_m is not None:
-        parts.append(f"position error at the end {summary.position_error_m:.2f} m")
+        parts.append(f"position error at the end {_length(summary.position_error_m)}")
     if summary.goal_reached is not None:
-        distance = f", {summary.goal_distance_m:.2f} m away" if summary.goal_distance_m is not None else ""
-        parts.append(("goal reached" if summary.goal_reached else "goal not reached") + distance)
+        distance = f", {_length(summary.goal_distance_m)} away" if summary.goal_distance_m is not None else ""
+        parts.append(f"goal {summary.goal_result()}{distance}")
     return "  ·  ".join(parts if summary.complete else [*parts, "recording incomplete"])
+
+
+def _length(metres: float) -> str:
+    return f"{metres * 1e3:.1f} mm" if metres < 0.1 else f"{metres:.2f} m"
+
+
+def _tick(value: float, _: int | None) -> str:
+    """The label of a power of ten, such as 0.00001."""
+    return np.format_float_positional(value, precision=1, fractional=False, trim="-")
 
 
 def _missing(axes: Axes, what: str) -> None:
@@ -253,10 +261,10 @@ def _draw_errors(axes: Axes, session: RecordedSession) -> None:
     low, high = axes.get_ylim()
     if high < 2 * low:  # the curves are almost constant: avoid an axis that shows rounding errors
         axes.set_ylim(low / 2, 2 * high)
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_major_formatter(FuncFormatter(_tick))
     axes.grid(visible=True, which="minor", color="#EEEEEE", linewidth=0.4)
     axes.set(xlabel="time (s)", ylabel="distance (m)")
-    axes.legend(fontsize=8.5, frameon=False)
+    axes.legend(fontsize=8.5, frameon=False, labelspacing=0.2)
 
 
 def _mark_moments(axes: Axes, session: RecordedSession) -> None:

@@ -30,10 +30,13 @@ class SessionSummary:
     undecodable: int
     duration_s: float  # from the first to the last reception
     duration_stamped_s: float | None  # from the first to the last stamp of a scan
-    localised_after_scans: int | None
+    localised_before_recording: bool  # the state was tracking when the recording began, after the scanner
+    localised_after_scans: int | None  # None also if it was localised before the recording
     localised_after_s: float | None  # from the first scan
     localised_error_m: float | None  # at that scan
     goal_reached: bool | None  # according to the controller
+    goal_refusal: str | None  # why the controller refused the goal
+    goal_tolerance_m: float | None
     goal_distance_m: float | None  # from the true pose, at the end
     goal_distance_believed_m: float | None
     position_error_m: float | None  # at the end
@@ -51,9 +54,10 @@ class SessionSummary:
 
     def lines(self) -> list[tuple[str, str]]:
         """Rows of (name, value) for the terminal."""
-        localised = "never"
-        if self.localised_after_scans is not None:
-            localised = f"after {self.localised_after_scans} scans, with an error of {_metres(self.localised_error_m)}"
+        localised = "before the recording began" if self.localised_before_recording else "never"
+        if (count := self.localised_after_scans) is not None:
+            scans = "1 scan" if count == 1 else f"{count} scans"
+            localised = f"after {scans}, with an error of {_metres(self.localised_error_m)}"
         median, maximum = _metres(self.position_error_median_m), _metres(self.position_error_max_m)
         rows = [
             ("world", self.world or "unknown"),
@@ -64,7 +68,7 @@ class SessionSummary:
         if self.goal_reached is not None:
             true, believed = _metres(self.goal_distance_m), _metres(self.goal_distance_believed_m)
             rows += [
-                ("goal", "reached" if self.goal_reached else "not reached"),
+                ("goal", self.goal_result()),
                 ("distance to goal", f"{true}, believed {believed}"),
                 ("path", f"{_metres(self.path_m)} for {_metres(self.straight_line_m)} in a straight line"),
             ]
@@ -74,6 +78,15 @@ class SessionSummary:
             ("skipped by services", f"{self._skipped()}; undecodable {self.undecodable}"),
         ]
         return rows if self.complete else [*rows, ("incomplete", "the recording's end is missing or damaged")]
+
+    def goal_result(self) -> str:
+        """What became of the last goal."""
+        if self.goal_refusal is not None:
+            return self.goal_refusal.removeprefix("goal ")
+        if not self.goal_reached:
+            return "not reached"
+        distance, tolerance = self.goal_distance_m, self.goal_tolerance_m
+        return "believed reached" if distance and tolerance and distance > tolerance else "reached"
 
     def _skipped(self) -> str:
         """How many messages services did not use because newer ones had come, by topic."""
@@ -109,6 +122,8 @@ def summary_of(session: RecordedSession) -> SessionSummary:
     navigating = errors[(stamps >= goal_ns) & (stamps <= until)] if goal is not None else errors[:0]
     from_goal_on = np.concatenate([path[session.truth.stamps_ns >= goal_ns], path[-1:]])
     dropped = _dropped_by_key(session)
+    before = first == 0 and session.first_scan_seq > 0
+    after = None if before else first
     return SessionSummary(
         world=session.world.name if session.world else None,
         robot=session.robot,
@@ -120,10 +135,13 @@ def summary_of(session: RecordedSession) -> SessionSummary:
         undecodable=session.undecodable,
         duration_s=session.duration_s,
         duration_stamped_s=float(scans.max() - scans.min()) * 1e-9 if len(scans) else None,
-        localised_after_scans=None if first is None else first + 1,
-        localised_after_s=None if first is None or not len(scans) else float(stamps[first] - scans[0]) * 1e-9,
+        localised_before_recording=before,
+        localised_after_scans=None if after is None else after + 1,
+        localised_after_s=None if after is None or not len(scans) else float(stamps[after] - scans[0]) * 1e-9,
         localised_error_m=None if first is None else _last(errors[: first + 1]),
         goal_reached=None if goal is None else reached is not None,
+        goal_refusal=session.refusal(),
+        goal_tolerance_m=None if goal is None else goal.tolerance,
         goal_distance_m=_distance(path[-1:], goal),
         goal_distance_believed_m=_distance(session.belief.poses[-1:], goal),
         position_error_m=_last(errors),

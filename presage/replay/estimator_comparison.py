@@ -66,10 +66,10 @@ class BeliefSeries:
         )
 
 
-def compare(old: BeliefSeries, new: BeliefSeries, truth: Array | None) -> Comparison:
+def compare(old: BeliefSeries, new: BeliefSeries, truth: Array | None, changes: str = "") -> Comparison:
     """Compares the beliefs of the scans that both answered; of all scans if there are no recorded beliefs.
 
-    ``truth`` (N, 3) has a row for each new belief.
+    ``truth`` (N, 3) has a row for each new belief; ``changes`` names the settings that differ.
     """
     old_index, new_index = old.index(), new.index()
     both = [key for key in new_index if key in old_index] if old_index else list(new_index)
@@ -81,6 +81,7 @@ def compare(old: BeliefSeries, new: BeliefSeries, truth: Array | None) -> Compar
         old.result(old_rows, poses[: len(old_rows)]),
         new.result(rows, poses),
         {"recorded": len(old.stamps), "new": len(new.stamps)},
+        changes,
     )
 
 
@@ -139,6 +140,12 @@ class Comparison:
     old: EstimatorResult  # empty if no belief was recorded
     new: EstimatorResult
     answered: dict[str, int]  # number of all beliefs, "recorded" and "new"
+    changes: str = ""  # settings of the new estimator that differ from the recorded ones
+
+    @property
+    def new_title(self) -> str:
+        """Title of the new beliefs, with the settings that differ."""
+        return f"new: {self.new.name}" + (f", {self.changes}" if self.changes else "")
 
     def difference(self) -> Array:
         """Absolute differences (N, 3) in m, m, rad; (0, 3) if no belief was recorded."""
@@ -172,7 +179,7 @@ def comparison_table(comparison: Comparison) -> Table:
     result = Table(title=f"on the {numbers['scans_compared']} scans compared", title_justify="left")
     result.add_column("")
     result.add_column(f"recorded: {old['estimator'] or 'nothing'}", justify="right")
-    result.add_column(f"new: {new['estimator']}", justify="right")
+    result.add_column(comparison.new_title, justify="right")
     answered = numbers["scans_answered"]
     result.add_row("scans answered in total", str(answered["recorded"]), str(answered["new"]))
     for title, name, factor, unit in (
@@ -233,7 +240,7 @@ def figure_of_curves(columns: dict[str, Array], comparison: Comparison, title: s
     figure, (axes,) = figure_of(width=9.0)
     shown = [
         ("recorded_error_m", f"recorded: {comparison.old.name}", RECORDED_COLOUR, 1.1),
-        ("new_error_m", f"new: {comparison.new.name}", COLOURS.get(comparison.new.name, "#0072B2"), 1.5),
+        ("new_error_m", comparison.new_title, COLOURS.get(comparison.new.name, "#0072B2"), 1.5),
     ]
     if not any(np.isfinite(columns[name]).any() for name, *_ in shown):
         shown = [("difference_m", "difference between the two", "#0072B2", 1.5)]

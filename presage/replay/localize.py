@@ -31,6 +31,7 @@ from presage.logs.scan_files import Prior, Scans, read_scans
 from presage.terminal.output import check_file, provenance
 from presage.terminal.progress import progress, working
 from services.estimator.factory import EstimatorOptions, EstimatorPreset, check_start
+from services.estimator.paper.perception import Descent
 from services.estimator.shared.interface import Posterior
 from services.recorder.reader import read_recording
 from services.recorder.replaying.player import span
@@ -51,6 +52,7 @@ COLUMNS = (
     "probability",
     "update_ms",
 )
+HEADING_TOLERANCE_RAD = np.deg2rad(2.0)  # between the robot's heading and the one of preset paper
 STAMP_ROUNDING_S = 1e-6  # precision of a double for a stamp of the year 2020
 UPPER_TRIANGLE = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
 
@@ -105,6 +107,7 @@ def build_estimator_options(
     sigma: float | None,
     seed: int,
     initial_pose: str,
+    descent: Descent = Descent(),
 ) -> EstimatorOptions:
     """The estimator chosen on the command line; the world defaults to that of the recording.
 
@@ -119,8 +122,8 @@ def build_estimator_options(
         recorded = read_recording(file).world()
         if recorded is None:
             raise UserError(f"{file}: no world was recorded: give one with --world")
-        return EstimatorOptions(recorded, estimator, model, models, sigma, seed, pose)  # type: ignore[arg-type]
-    return EstimatorOptions(world, estimator, model, models, sigma, seed, pose)  # type: ignore[arg-type]
+        return EstimatorOptions(recorded, estimator, model, models, sigma, seed, pose, descent)  # type: ignore[arg-type]
+    return EstimatorOptions(world, estimator, model, models, sigma, seed, pose, descent)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -152,15 +155,39 @@ def run_estimator(
 def prepare_estimator(estimator_options: EstimatorOptions, console: Console) -> Estimator:
     """The chosen estimator, without its initial pose."""
     with working(f"preparing {estimator_options.estimator} for {estimator_options.world_argument}", console):
+        preset = estimator_options.estimator
         return Estimator(
             estimator_options.world,
-            estimator_options.estimator,
-            model=estimator_options.model,
+            preset,
+            model=estimator_options.model if preset == "precise" else "learned",
             models=estimator_options.models,
-            sigma=estimator_options.sigma,
+            sigma=estimator_options.sigma if preset == "precise" else None,
             seed=estimator_options.seed,
-            descent=estimator_options.descent,
+            descent=estimator_options.descent if preset == "paper" else None,
         )
+
+
+def heading_warning(estimator: Estimator, scans: Scans) -> str:
+    """A warning if the robot has another heading than the one that the estimator assumes; "" if it has not.
+
+    Uses the truth; without it the odometry, with a first heading that is assumed to be right.
+    """
+    heading = estimator.fixed_heading
+    if heading is None:
+        return ""
+    source, headings = scans.truth_is, np.zeros(0)
+    if scans.truth is not None:
+        headings = scans.truth[np.isfinite(scans.truth[:, 2]), 2]
+    if not len(headings) and scans.odom is not None:
+        source, headings = "the odometry", scans.odom[np.isfinite(scans.odom[:, 2]), 2]
+        headings = headings - headings[:1] + heading
+    others = int((np.abs(se2.wrap(headings - heading)) > HEADING_TOLERANCE_RAD).sum())
+    if not others:
+        return ""
+    return (
+        f"warning: preset paper assumes a heading of {np.rad2deg(heading):.0f} deg, but according to {source} the "
+        f"robot has another in {others} of {len(headings)} scans: their poses will be wrong"
+    )
 
 
 def localize(options: LocalizeOptions, console: Console) -> list[dict[str, Any]]:
@@ -182,11 +209,14 @@ def localize(options: LocalizeOptions, console: Console) -> list[dict[str, Any]]
         mount = np.zeros(3) if laser and kind == "npz" else None
         all_scans = read_scans(options.file, mount, options.reading)
     all_scans.print_notes(console)
-    scans = select_scans(options, all_scans).with_prior(options.prior)
+    selected = select_scans(options, all_scans)
+    scans = selected.with_prior(options.prior)
     if scans.stamps is None and options.out is not None and options.out.suffix == ".tum":
         raise UserError(f"{options.file}: its scans have no stamps, which a trajectory needs: choose .csv or .json")
     start, count = _start(options, scans), len(scans)
     estimator.check(scans[0])
+    if warning := heading_warning(estimator, selected):
+        console.print(warning, highlight=False, soft_wrap=True)
     rows: list[dict[str, Any]] = []
     try:
         found = run_estimator(estimator, scans, independent_scans=options.mode == "single", start=start)

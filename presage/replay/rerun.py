@@ -14,16 +14,16 @@ from __future__ import annotations
 import itertools
 import json
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
 from common.errors import UserError
-from common.geometry.world import load_world
+from common.geometry.world import known_worlds, load_world
 from common.log import set_up_logging
 from common.messages.definitions import Belief, Prediction, Scan, Stamped
 from common.messages.topics import BELIEF, PREDICTION, SCAN, Topic, topic_of
@@ -32,12 +32,13 @@ from common.versions import versions
 from presage.logs.scan_files import Scans, read_scans
 from presage.recordings.selection import robot_of
 from presage.replay.estimator_comparison import BeliefSeries, compare, comparison_table, draw_comparison
-from presage.replay.localize import TimedBelief, prepare_estimator, run_estimator
+from presage.replay.localize import TimedBelief, heading_warning, prepare_estimator, run_estimator
 from presage.replay.recorded_settings import estimator_settings, recorded_settings, settings_with
 from presage.terminal.output import check_file, provenance, write_json
 from presage.terminal.progress import progress
+from services.estimator.factory import EstimatorOptions, check_options
 from services.estimator.service import belief_message, estimator_options, prediction_message
-from services.estimator.settings import EstimatorSettings
+from services.estimator.settings import EstimatorSettings, ignored_settings
 from services.recorder.files.writer import RecordingWriter
 from services.recorder.reader import RawMessage, Recording, read_recording
 
@@ -74,16 +75,25 @@ def rerun_command(options: RerunOptions, json_file: Path | None, console: Consol
     robot = robot_of(recording)
     with tempfile.TemporaryDirectory(prefix="presage-") as folder:
         settings = settings_of(recording, options.chosen, Path(folder), console)
+        for warning in ignored_settings(settings.estimator, options.chosen):
+            console.print(f"warning: {warning}", highlight=False)
         out = options.target(settings.estimator)
         for beside in (".png", ".pdf", ".csv"):
             check_file(out.with_suffix(beside), "--out")
-        scans, chosen = read_scans(options.file).with_prior(settings.prior), estimator_options(settings)
-        localised = run_estimator(prepare_estimator(chosen, console), scans, start=chosen.initial_pose)
+        chosen = estimator_options(settings)
+        if "world" not in options.chosen:
+            chosen = _with_recorded_world(chosen, recording)
+        estimator, all_scans = prepare_estimator(chosen, console), read_scans(options.file)
+        scans = all_scans.with_prior(settings.prior)
+        estimator.check(scans[0])
+        if warning := heading_warning(estimator, all_scans):
+            console.print(warning, highlight=False, soft_wrap=True)
+        localised = run_estimator(estimator, scans, start=chosen.initial_pose)
         with closing(progress(localised, "localising", len(scans), console)) as shown:
             old, new = write_recording(recording, robot, settings, scans, shown, out)
     if foreign := sum(count for key, count in recording.counts.items() if topic_of(key) is None):
         console.print(f"{foreign} messages on keys that do not belong to presage are not copied")
-    comparison = compare(old, new, scans.truth)
+    comparison = compare(old, new, scans.truth, changes_text(recording, settings, options.chosen))
     console.print(comparison_table(comparison))
     for path in (out, *draw_comparison(comparison, out)):
         console.print(f"wrote {path}", highlight=False, soft_wrap=True)
@@ -106,6 +116,37 @@ def settings_of(recording: Recording, chosen: dict[str, Any], folder: Path, cons
     for note in (*(recorded.notes if recorded else ()), *unpacked.notes):
         console.print(note, highlight=False)
     return settings_with(EstimatorSettings, values)
+
+
+def _with_recorded_world(chosen: EstimatorOptions, recording: Recording) -> EstimatorOptions:
+    """The same options with the loaded world, so that messages do not name its file in the temporary folder.
+
+    Raises UserError if weights are missing.
+    """
+    chosen = replace(chosen, world=chosen.loaded_world)
+    try:
+        check_options(chosen, chosen.loaded_world)
+    except UserError as error:
+        if chosen.world_argument in known_worlds():
+            raise
+        attached = "model/world.yaml" if "model/world.yaml" in recording.attachments else "world.yaml"
+        raise UserError(
+            f"{error} ({chosen.world_argument} is the session's world, which {recording.path} contains as attachment "
+            f"{attached})"
+        ) from None
+    return chosen
+
+
+def changes_text(recording: Recording, settings: EstimatorSettings, chosen: Collection[str]) -> str:
+    """The ``chosen`` settings that differ from the recorded ones, such as "alpha 0.02"; not the estimator's name."""
+    recorded = recorded_settings(recording, "estimator")
+    before = {} if recorded is None else settings_with(EstimatorSettings, recorded.values).effective()
+    now = settings.effective()
+    return ", ".join(
+        f"{name} {now[name]}"
+        for name in chosen
+        if name != "estimator" and name in before and name in now and now[name] != before[name]
+    )
 
 
 def write_recording(

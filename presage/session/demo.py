@@ -196,6 +196,7 @@ def _navigate(bus: Bus, messages: LatestMessages, stack: Stack, place: tuple[flo
                 target = f"({place[0]:g}, {place[1]:g})"
                 line.update(f"navigating to {target}: {status.distance:.2f} m to go {status.reason}")
             if status.state == "reached":
+                console.print(f"reached: {status.reason}")
                 break
             passed = (status.stamp_ns - stamp) * 1e-9
             no_belief = status.state == "lost" and status.distance is None
@@ -226,5 +227,5 @@ def demo_command(demo: DemoOptions, json_file: Path | None) -> int:
         draw_session(recording, figure)
     print_summary(summary, recording, figure, console)
     write_json(json_file, {**summary.as_dict(), "seed": demo.seed, "commit": commit(), "arguments": sys.argv[1:]})
-    console.print("[bold green]goal reached[/]" if reached else "[bold red]goal not reached[/]")
+    console.print(f"[bold green]goal {summary.goal_result()}[/]" if reached else "[bold red]goal not reached[/]")
     return 0 if reached else 1

@@ -26,6 +26,7 @@ from presage.session.ports import accepts_connections, check_port, free_port
 
 COLOURS = {"router": 37, "simulator": 36, "estimator": 35, "mapper": 35, "controller": 33, "recorder": 32, "viewer": 34}
 SECURITY_VARIABLES = {"PRESAGE_SECURITY", "PRESAGE_ROLE"}  # choose this process's credentials, not the children's
+SLOW_START_S = 4.0  # time without all services after which the user is told which are missing
 SECRETS = {"PRESAGE_VIEWER_TOKEN"}  # settings that are not shown
 ALIVE_TIMEOUT_S = 60.0  # for all services to start; the estimator may have to compile
 LINE_TIMEOUT_S = 30.0  # for a line of output
@@ -137,10 +138,19 @@ class Stack:
 
         Raises UserError with the names of the missing services, or if a service has ended.
         """
-        deadline = time.monotonic() + ALIVE_TIMEOUT_S
+        start_s, explained = time.monotonic(), False
         while missing := self._missing(bus):
             self.check()
-            if time.monotonic() > deadline:
+            passed_s = time.monotonic() - start_s
+            if passed_s > SLOW_START_S and not explained:
+                explained = True
+                names = ", ".join(sorted(missing))
+                print(
+                    f"waiting for {names}: the first start compiles code, which can take half a minute",
+                    file=sys.stderr,
+                    flush=True,
+                )
+            if passed_s > ALIVE_TIMEOUT_S:
                 raise UserError(
                     f"not alive within {ALIVE_TIMEOUT_S:g} s: {', '.join(sorted(missing))}; see their log lines above"
                 )

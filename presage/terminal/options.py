@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 
 from common.errors import UserError, similar_key
 from common.robot.scanner import SCANNERS
@@ -42,6 +42,22 @@ Config = Annotated[
 Seed = Annotated[int | None, typer.Option(min=0, max=2**31, help="Random seed. Defaults to 0.")]
 Json = Annotated[Path | None, typer.Option("--json", help="Also write the results to this JSON file.")]
 OpenPage = Annotated[bool, typer.Option("--open", help="Open the live page in a browser, if there is one.")]
+
+
+class GroupWithOptions(TyperGroup):
+    """A group of commands; tells a user who gives one of its own options after the command where it stands."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Runs the command."""
+        try:
+            return super().invoke(ctx)
+        except Exception as error:
+            option = getattr(error, "option_name", None)
+            own = {name for parameter in self.params for name in parameter.opts}
+            if type(error).__name__ == "NoSuchOption" and option in own:  # typer does not export this class
+                place = f"; it stands before the command: {ctx.command_path} {option} ... {ctx.invoked_subcommand}"
+                error.message += place  # type: ignore[attr-defined]
+            raise
 
 
 class CommandWithNumbers(TyperCommand):

@@ -68,7 +68,7 @@ from services.estimator.precise.learning.key_scans import MIN_KEY_SCANS
 from services.estimator.precise.learning.live_learning import mean_error
 from services.estimator.precise.motion_model import MotionNoise
 from services.estimator.prediction_query import answer_prediction
-from services.estimator.settings import EstimatorSettings
+from services.estimator.settings import EstimatorSettings, ignored_settings
 from services.estimator.shared.interface import Observation, PoseEstimator, Posterior
 
 if TYPE_CHECKING:
@@ -155,6 +155,8 @@ class EstimatorService(Service):
         settings = self.settings
         if settings.learn != "none" and settings.estimator != "precise":
             raise UserError(f"--learn {settings.learn}: only estimator precise learns, not {settings.estimator}")
+        for warning in ignored_settings(settings.estimator, settings.changed):
+            self.log.warning(warning)
         if self.models is None:
             self.log.info("loading the world", world=settings.world)
             self.models = SharedModels(settings)

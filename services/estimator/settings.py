@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -14,6 +15,7 @@ from common.messages.topics import ROBOT_NAME_PATTERN
 from common.names import split_names
 from common.runtime.robot_settings import MotionLimitSettings
 
+PRESET_OF_SETTING = {"model": "precise", "sigma": "precise", "alpha": "paper", "iterations": "paper"}
 _PATTERN = r"[A-Za-z0-9_.*?-]{1,64}"  # name of a robot, or a pattern of names
 
 
@@ -98,6 +100,12 @@ class EstimatorSettings(MotionLimitSettings):
     ] = 10
 
     @property
+    def changed(self) -> set[str]:
+        """Names of the settings that differ from their default."""
+        fields = type(self).model_fields
+        return {name for name, field in fields.items() if getattr(self, name) != field.default}
+
+    @property
     def robot_names(self) -> list[str]:
         """The names in ``robots``, without the patterns."""
         names = split_names(self.robots)
@@ -113,3 +121,12 @@ class EstimatorSettings(MotionLimitSettings):
             )
         if (count := len(self.robot_names)) > self.max_robots:
             raise UserError(f"{count} robots are named, --max-robots is {self.max_robots}: raise it")
+
+
+def ignored_settings(estimator: str, given: Collection[str]) -> list[str]:
+    """Returns a warning for each of the ``given`` settings that this preset does not use."""
+    return [
+        f"{name} applies only to preset {preset}; ignored"
+        for name, preset in PRESET_OF_SETTING.items()
+        if name in given and preset != estimator
+    ]

@@ -35,6 +35,24 @@ def test_goal_is_reached(yaw):
     assert path_length([pose for *_, pose in log]) < 1.02 * np.hypot(7, 1)
 
 
+@pytest.mark.parametrize(
+    ("covariance", "reason"),
+    [
+        (None, "believed within 0.02 m of the goal"),  # as by preset paper
+        (np.diag([1e-6, 1e-6, 1e-6]), "within 0.02 m of the goal"),
+        (np.diag([4e-4, 1e-6, 1e-6]), "within 0.02 m of the goal, but the pose is only known to 0.04 m"),
+    ],
+)
+def test_reason_of_arrival(covariance, reason):
+    navigator = Navigator(world=ROOM)
+    navigator.on_goal(goal(2, 2))
+    for k in range(3):
+        navigator.on_scan(scan(k * PERIOD_NS, [2, 2, 0], ROOM))
+        at_goal = belief(k * PERIOD_NS, [2, 2, 0]).model_copy(update={"covariance": covariance})
+        _, status = navigator.step(at_goal)
+    assert (status.state, status.reason) == ("reached", reason)
+
+
 def test_robot_stands_when_the_goal_is_reached():
     navigator = Navigator(chosen_policy=GeodesicPolicy(Robot(), ROOM), world=ROOM)
     navigator.on_goal(goal(3, 2, yaw=-2, yaw_tolerance=0.05))

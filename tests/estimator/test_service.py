@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from structlog.testing import capture_logs
 
 from common.errors import UserError
 from common.geometry import se2
@@ -66,6 +67,15 @@ def a_scan(stamp, pose=None, **changes) -> Scan:
         "mount": Pose.of(SCANNER.mount),
     }  # fmt: skip
     return Scan(**{**values, **changes})
+
+
+def test_settings_of_another_preset_are_reported(opened_precise):
+    service = StoringService(EstimatorSettings(alpha=0.02, iterations=1, sigma=0.1))
+    service.models = opened_precise.models
+    with capture_logs() as lines:
+        service.open()
+    warnings = [line["event"] for line in lines if line["log_level"] == "warning"]
+    assert warnings == [f"{name} applies only to preset paper; ignored" for name in ("alpha", "iterations")]
 
 
 def test_belief_and_prediction(precise):

@@ -122,6 +122,7 @@ def test_mount_argument_replaces_the_scans(world, ranges):
         (lambda e, r: presage.Estimator("corridor", "kalman"), "no estimator 'kalman'"),
         (lambda e, r: presage.Estimator("corridor", model="best"), "no model 'best'"),
         (lambda e, r: presage.Estimator("corridor", sigma=0), "sigma: give the noise of the scanner in m"),
+        (lambda e, r: presage.Estimator("corridor", descent=presage.Descent()), "for preset paper only, not precise"),
         (
             lambda e, r: presage.Estimator("corridor", "particle-filter", optimiser=presage.GaussNewton()),
             "for preset precise only",
@@ -151,6 +152,27 @@ def test_mount_argument_replaces_the_scans(world, ranges):
 def test_refusals(estimator, ranges, call, why):
     with pytest.raises(presage.UserError, match=why):
         call(estimator, ranges)
+
+
+def test_parameters_of_another_preset():
+    with pytest.warns(UserWarning, match="^sigma applies only to preset precise; ignored$"):
+        presage.Estimator("corridor", "particle-filter", sigma=0.1)
+    with pytest.warns(UserWarning, match="^model applies only to preset precise; ignored$"):
+        presage.Estimator("corridor", "amcl-defaults", model="exact")
+
+
+def test_parameters_of_preset_paper(world):
+    """They change how far the belief moves with each scan."""
+    pose = np.array([4.0, 1.5, np.pi / 2])
+    scanner = presage.SCANNERS["tim571"]
+    scan = world.ray_distances(se2.compose(pose, np.array(scanner.mount))[None], scanner.angles())[0]
+    start = (4.3, 1.5)
+    moved = []
+    for descent in (None, presage.Descent(alpha=1e-5, iterations=1)):
+        estimator = presage.Estimator(world, "paper", scanner=scanner, initial_pose=start, descent=descent)
+        moved.append(np.hypot(*(estimator.update(scan).pose[:2] - start)))
+    assert moved[0] > 10 * moved[1] > 0
+    assert estimator.fixed_heading == pytest.approx(np.pi / 2, abs=1e-6)
 
 
 def test_example_estimator(ranges):

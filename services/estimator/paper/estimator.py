@@ -42,6 +42,7 @@ class PaperEstimator:
         ``fit`` converts scans of another scanner; by default scans have the beams of the training.
         """
         self.card, self.model = card, model
+        self.fixed_heading = card.heading  # rad, of every pose
         self.fit = fit or own_fit(card.scanner, card.scanner.angles(), np.array(card.scanner.mount), "")
         self._first = pose
         self.estimator = PaperPerception(

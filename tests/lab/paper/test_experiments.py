@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from dataclasses import replace
 
@@ -13,7 +14,7 @@ from rich.console import Console
 from common.errors import UserError
 from common.geometry.world import FOLDER
 from lab.accuracy.scenes import Scene
-from lab.experiments import results
+from lab.experiments import results, trials
 from lab.experiments.estimators import PAPER_DESCENT, ExperimentWorld, parse_estimators
 from lab.experiments.trials import TrialStore, run_trials
 from lab.pages import tables_page as page
@@ -36,6 +37,14 @@ def test_order_of_results(tmp_path, workers):
     assert [row["square"] for row in rows] == [0, 1, 4, 9, 16, 25]
     assert sorted((tmp_path / "ran").read_text().split()) == list("012345")
     assert [path.name for path in tmp_path.iterdir()] == ["ran"]
+
+
+def test_progress_without_a_terminal(tmp_path, monkeypatch):
+    monkeypatch.setattr(trials, "LINE_INTERVAL_S", 0.0)
+    console = Console(file=io.StringIO(), width=100)
+    run_trials("count", count, jobs(tmp_path), tmp_path, 1, console)
+    lines = [line for line in console.file.getvalue().splitlines() if line.startswith("count:")]
+    assert lines == ["count: 6 trials", *(f"count: {done} of 6 trials done" for done in range(1, 7))]
 
 
 def test_interrupted_run(tmp_path):
@@ -150,6 +159,8 @@ def test_best_step_size():
 
 def test_estimator_names():
     assert parse_estimators("paper,particle-filter heading known") == ("paper", "particle-filter, heading known")
+    assert parse_estimators("precise, odometry,paper") == ("precise, odometry", "paper")
+    assert parse_estimators("paper, 10 steps a scan , precise") == ("paper, 10 steps a scan", "precise")
     with pytest.raises(UserError, match="no estimator 'kalman'"):
         parse_estimators("paper,kalman")
 

@@ -32,3 +32,18 @@ def test_no_session(monkeypatch):
     monkeypatch.setattr(commands, "send_goal", lambda *_, **__: 0)
     done = CliRunner(env={"PRESAGE_CONNECT": "", "PRESAGE_ROBOT": ""}).invoke(app, ["goal", "1", "1"])
     assert (done.exit_code, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("command", "place"),
+    [
+        (["experiment", "e1", "--seed", "3"], "experiment --seed ... e1"),
+        (["echo", "belief", "--robot", "truck"], "--robot ... echo"),
+    ],
+)
+def test_option_of_the_group_after_the_command(command, place):
+    done = CliRunner(env={"COLUMNS": "200"}).invoke(app, command)
+    assert done.exit_code == 2
+    assert place in done.stderr
+    other = CliRunner(env={"COLUMNS": "200"}).invoke(app, ["experiment", "e1", "--nonsense"])
+    assert "stands before" not in other.stderr

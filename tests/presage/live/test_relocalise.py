@@ -41,6 +41,27 @@ def test_result(bus, link, monkeypatch, states, status, last_line):
     assert console.file.getvalue().splitlines()[-1] == last_line
 
 
+def test_heading_that_is_not_used(bus, link):
+    """Preset paper keeps the heading for which it was trained."""
+    requests, console = Inbox(), Console(file=io.StringIO(), width=150)
+    bus.serve(LOCALISE, requests)
+
+    def answer():
+        requests.get(10).reply(Reply().encode())
+        assert bus.wait_matching(BELIEF, 10)
+        found = Belief(stamp_ns=0, state="tracking", pose=Pose(x=3.0, y=1.5, yaw=1.5708), estimator="paper")
+        bus.put(BELIEF, found.encode())
+
+    estimator = threading.Thread(target=answer)
+    estimator.start()
+    assert commands.relocalise(link, Pose(x=3.0, y=1.5, yaw=0.0), console) == 0
+    estimator.join()
+    assert console.file.getvalue().splitlines()[1:] == [
+        "tracking at (3.000, 1.500), 90.0 deg in the map",
+        "preset paper assumes this heading, and did not use 0 deg",
+    ]
+
+
 def test_no_belief(bus, link, monkeypatch):
     monkeypatch.setattr(commands, "LOCALISATION_TIMEOUT_S", 0.1)
     requests = Inbox()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import shutil
 import subprocess
 from unittest.mock import Mock
@@ -75,6 +76,7 @@ def test_arrays(tmp_path):
     assert [rows[2][str(n)] for n in range(4)] == ["1.0", "inf", "-inf", "2.5"]
     assert rows[2]["stamp_ns"] == str(2 * driven.PERIOD_NS)
     assert len(rows_of(folder / "prediction.sigma-4.csv")) == driven.STEPS
+    assert "| `prediction.ranges-N.csv` | (B,) m" in (folder / "README.md").read_text()
 
 
 def test_readme_explains_columns(tmp_path):
@@ -85,6 +87,13 @@ def test_readme_explains_columns(tmp_path):
         assert all(
             f"`{column}`" in text or column in {"stamp_ns", "seq", "index", "name", "value"} for column in header
         )
+    table_rows = [line for line in text.splitlines() if line.startswith("|")]
+    assert all(len(re.split(r"(?<!\\)\|", row)) == 4 for row in table_rows)  # two cells
+    assert "negative log-likelihood -ln p(o \\| pose)" in text
+    assert "| `health.counters.csv`: `name`, `value` | numbers by name" in text
+    assert "| `prediction.ranges-N.csv`, with `--arrays` | (B,) m" in text
+    assert "which `presage export --format csv --arrays` writes" in text
+    assert ".md" not in text
     assert "| `twist.vx` | m/s, forward; base_link |" in text
     assert "| `free_energy` | nats" in text
 

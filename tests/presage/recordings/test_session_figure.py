@@ -55,6 +55,14 @@ def test_lines_of_panels(tmp_path):
     assert texts(figure) == ""
 
 
+def test_error_below_a_millimetre(tmp_path):
+    session = load_session(made.write(tmp_path / "run.mcap"))
+    session.true_poses = session.belief.poses + np.array([5e-4, 0, 0])
+    errors = figure_of(session, "run").axes[-1]
+    drawn = next(line for line in errors.lines if line.get_label() == "position error")
+    assert drawn.get_ydata() == pytest.approx(5e-4)
+
+
 @pytest.mark.parametrize(
     ("missing", "world", "expected"),
     [

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from common.errors import UserError
-from common.messages.definitions import Belief, Goal, Pose, Truth, Twist
+from common.messages.definitions import Belief, Goal, Pose, Scan, Status, Truth, Twist
 from common.messages.topics import BELIEF, GOAL, HEALTH, PREDICTION, SCAN, STATUS, TOPICS, TRUTH
 from presage.recordings.session_summary import load_session, summarise
 from services.recorder.files.writer import RecordingWriter
@@ -53,6 +54,7 @@ def test_missing_topics_give_none(tmp_path):
     known = {name for name, value in scans.as_dict().items() if value is not None}
     assert known == {
         "robot", "complete", "scans", "messages", "undecodable", "duration_s", "duration_stamped_s", "dropped_by_key",
+        "localised_before_recording",
     }  # fmt: skip
     assert dict(scans.lines())["localised"] == "never"
     empty = summarise(made.write(tmp_path / "empty.mcap", *TOPICS, world=False))
@@ -133,6 +135,32 @@ def test_cancelled_goal(tmp_path):
     )
     assert summarise(path).goal_reached is None
     assert summarise(path).goal_distance_m is None
+
+
+def test_goal_reached_only_in_the_belief(recording):
+    summary = summarise(recording)
+    assert summary.goal_result() == "reached"
+    assert replace(summary, goal_distance_m=0.2).goal_result() == "believed reached"
+    assert replace(summary, goal_distance_m=None).goal_result() == "reached"
+
+
+def test_refused_goal(tmp_path):
+    reason = "goal refused: (400.00, 1.00) is off the map"
+    pose = Pose(x=400, y=1)
+    refused = Status(stamp_ns=1, state="blocked", reason=reason, refused=True, goal=pose)
+    path = write(tmp_path / "refused.mcap", truth(0, 0.0), (GOAL, Goal(stamp_ns=0, pose=pose)), (STATUS, refused))
+    assert (summarise(path).goal_reached, summarise(path).goal_refusal) == (False, reason)
+    assert dict(summarise(path).lines())["goal"] == "refused: (400.00, 1.00) is off the map"
+
+
+@pytest.mark.parametrize(
+    ("seq", "expected"), [(0, "after 1 scan, with an error of 0.500 m"), (7, "before the recording began")]
+)
+def test_localised_at_the_first_scan(tmp_path, seq, expected):
+    scan = SCAN, Scan.of_scanner(made.SCANNER, np.ones(made.SCANNER.beams), 0).model_copy(update={"seq": seq})
+    path = write(tmp_path / "begun.mcap", truth(0, 0.0), scan, belief(0, 0.5))
+    assert dict(summarise(path).lines())["localised"] == expected
+    assert summarise(path).localised_before_recording == bool(seq)
 
 
 def test_unreadable_payload_and_file(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import re
 import shutil
@@ -27,6 +28,7 @@ from presage.logs.log import Reading
 from presage.logs.scan_files import Scans, read_scans
 from presage.replay.localize import COLUMNS, LocalizeOptions, build_estimator_options, localize, select_scans
 from presage.replay.rerun import RerunOptions, rerun_command
+from services.estimator.paper.perception import Descent
 from services.estimator.shared.model_folder import SHIPPED
 from services.recorder.files.writer import RecordingWriter
 from tests.conftest import WAIT_TIMEOUT_S
@@ -56,8 +58,9 @@ def npz(folder: Path, mount=SCANNER.mount, **changes) -> Path:
 def job(file, mode="global", frame="base_link", estimator="precise", model="learned", world="corridor", **more):
     out = more.pop("out", None)
     models = more.pop("models", None)
+    descent = more.pop("descent", Descent())
     estimator_options = build_estimator_options(
-        file, world, estimator, model, models, 0.02, 0, more.pop("initial_pose", "")
+        file, world, estimator, model, models, 0.02, 0, more.pop("initial_pose", ""), descent
     )
     given = {"odometry": True, "out": out, **more}
     return LocalizeOptions.of(file, estimator_options, mode, frame, given.pop("reading", Reading()), **given)
@@ -377,3 +380,41 @@ def test_recording_of_a_restarted_simulation(tmp_path):
     priors = {prior: scans.with_prior(prior)[1] for prior in ("motion", "odometry", "command")}
     given = {prior: (scan.odom is not None, scan.command is not None) for prior, scan in priors.items()}
     assert given == {"motion": (False, False), "odometry": (True, False), "command": (False, True)}
+
+
+def paper_output(file, **more):
+    """What `presage localize` prints with preset paper, which knows only a heading of 90 deg."""
+    console = Console(file=io.StringIO(), width=200)
+    localize(job(file, estimator="paper", out=file.parent / "poses.csv", **more), console)
+    return console.file.getvalue()
+
+
+def turning_drive(**columns):
+    """Scans of a robot that turns from 90 to 117 deg; only the poses matter here."""
+    yaws = np.deg2rad(np.arange(90.0, 120.0, 3.0))
+    return {name: np.column_stack([PATH[:, :2], yaws + shift]) for name, shift in columns.items()}
+
+
+@pytest.mark.parametrize(
+    ("poses", "expected"),
+    [
+        (turning_drive(reference=0.0), "according to the file's reference the robot has another in 9 of 10 scans"),
+        (turning_drive(odom=-1.0), "according to the odometry the robot has another in 9 of 10 scans"),
+    ],
+    ids=["reference", "odometry"],
+)
+def test_other_heading_than_that_of_preset_paper(tmp_path, poses, expected):
+    text = paper_output(npz(tmp_path, **{"odom": None, **poses}))
+    assert f"warning: preset paper assumes a heading of 90 deg, but {expected}" in text
+
+
+def test_heading_of_preset_paper(tmp_path):
+    upright = np.column_stack([PATH[:, :2], np.full(10, np.pi / 2)])
+    assert "heading" not in paper_output(npz(tmp_path, odom=upright, reference=upright))
+
+
+def test_parameters_of_preset_paper(tmp_path):
+    """Section `estimator` of the settings file sets them."""
+    still = job(npz(tmp_path), estimator="paper", descent=Descent(alpha=1e-9, iterations=1))
+    rows = localize(replace(still, out=tmp_path / "still.csv"), CONSOLE)
+    assert np.ptp([row["x"] for row in rows]) < 1e-3

@@ -15,7 +15,7 @@ from rich.console import Console
 from common.errors import UserError
 from common.geometry import se2
 from common.messages.definitions import Belief, Pose
-from common.messages.topics import BELIEF, PREDICTION, SCAN, TRUTH
+from common.messages.topics import BELIEF, PREDICTION, SCAN, TRUTH, topic_of
 from presage.recordings.selection import robot_of
 from presage.replay import rerun as shell
 from presage.replay.estimator_comparison import BeliefSeries, compare
@@ -108,6 +108,33 @@ def test_interrupted_run_leaves_no_file(session, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         rerun_command(RerunOptions(session, EXACT, session.with_name("never.mcap")), None, quiet())
     assert not list(session.parent.glob("never*"))
+
+
+def test_missing_weights_name_no_temporary_file(session):
+    """The command that trains them is also right when the run has ended."""
+    why = r"presage train --world hall\.yaml .*run\.mcap contains as attachment world"
+    for preset in ("paper", "precise"):
+        with pytest.raises(UserError, match=why) as error:
+            rerun_command(RerunOptions(session, {"estimator": preset}, session.with_name("never.mcap")), None, quiet())
+        assert "presage-" not in str(error.value)
+
+
+def test_settings_that_differ_are_named(session, tmp_path):
+    first, second, console = tmp_path / "first.mcap", tmp_path / "second.mcap", quiet()
+    rerun_command(RerunOptions(session, EXACT, first), None, quiet())
+    with_config = RecordingWriter(tmp_path / "config.mcap")
+    recording = read_recording(session)
+    for name, values in recording.metadata.items():
+        with_config.metadata(name, values)
+    for name, data in recording.attachments.items():
+        with_config.attachment(name, data, "application/yaml", 0)
+    with_config.metadata("config:estimator", {"config": json.dumps({**EXACT, "world": "hall", "sigma": 0.02})})
+    for raw in recording.payloads():
+        with_config.write(topic_of(raw.key), raw.key, raw.payload, raw.published_ns, raw.logged_ns)
+    rerun_command(RerunOptions(with_config.finish(), {"sigma": 0.05, "alpha": 0.1}, second), None, console)
+    text = console.file.getvalue()
+    assert "new: precise, sigma 0.05" in text
+    assert "warning: alpha applies only to preset paper; ignored" in text
 
 
 def test_refusals(session, tmp_path, run):

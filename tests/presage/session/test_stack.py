@@ -1,4 +1,4 @@
-"""Signals that end a command."""
+"""Signals that end a command, and a session that starts slowly."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import signal
 import pytest
 
 from presage.interrupts import deferring_interrupts, interruptible
+from presage.session import stack
 
 
 @pytest.fixture
@@ -53,3 +54,15 @@ def test_interrupts_while_a_process_starts():
     except KeyboardInterrupt:
         steps.append("interrupted")
     assert steps == ["process started", "interrupted"]
+
+
+def test_slow_start_is_explained(monkeypatch, capsys):
+    monkeypatch.setattr(stack, "SLOW_START_S", 0.0)
+    answers = iter([{"estimator"}, {"estimator"}, {"estimator"}, set()])
+    monkeypatch.setattr(stack.Stack, "_missing", lambda *_: next(answers))
+    made = stack.Stack.__new__(stack.Stack)
+    made.processes = {}
+    made.wait_alive(None)
+    assert capsys.readouterr().err == (
+        "waiting for estimator: the first start compiles code, which can take half a minute\n"
+    )
