@@ -60,7 +60,8 @@ CORRELATION_LENGTH_M = 1.0  # scans from places this far apart are nearly indepe
 MAX_VISITED = 100  # positions kept, VISITED_SPACING_M apart
 VISITED_SPACING_M = 0.25
 UNSEEN_RANGE_M = 1.5  # obstacles this close are remembered when they leave the field of view
-FORGET_NS = 5_000_000_000  # for this time; dead reckoning is exact enough for it
+UNSEEN_MEMORY_NS = 5_000_000_000  # and forgotten after this time, when dead reckoning is no longer exact enough
+UNSEEN_CELL_M = 0.05  # one point is kept per cell of this size
 STALLED_NS = 3_000_000_000  # after this time without progress, the robot gives up the viewpoint
 REACHED_M = 0.1  # a viewpoint nearer than this was reached
 PROGRESS_M, PROGRESS_RAD = 0.25, 0.5  # a motion or turn by this is progress; turning to and fro by less is not
@@ -129,14 +130,15 @@ class UnseenPoints:
         from_laser = kept - scan.mount.array()[:2]
         off_centre = np.abs(se2.wrap(np.arctan2(from_laser[:, 1], from_laser[:, 0]) - field_of_view.centre))
         age = stamp_ns - self._stamps
-        remembered = (np.hypot(*kept.T) < UNSEEN_RANGE_M) & (age >= 0) & (age < FORGET_NS)
+        remembered = (np.hypot(*kept.T) < UNSEEN_RANGE_M) & (age >= 0) & (age < UNSEEN_MEMORY_NS)
         unseen = remembered & (off_centre > field_of_view.half)
         near = points[np.hypot(*points.T) < UNSEEN_RANGE_M]
         self._points = np.concatenate([kept[unseen], near])
         self._stamps = np.concatenate([self._stamps[unseen], np.full(len(near), stamp_ns)])
-        # One point per 5 cm, and of several the latest
-        _, first = np.unique(np.round(self._points[::-1] / 0.05), axis=0, return_index=True)
-        self._points, self._stamps = self._points[::-1][first], self._stamps[::-1][first]
+        order = np.argsort(-self._stamps, kind="stable")  # of several points in a cell, the latest is kept
+        cells = np.round(self._points[order] / UNSEEN_CELL_M)
+        latest = order[np.unique(cells, axis=0, return_index=True)[1]]
+        self._points, self._stamps = self._points[latest], self._stamps[latest]
         return np.concatenate([points, kept[unseen]])
 
 

@@ -37,11 +37,11 @@ LOOKAHEAD_RANGE_M = 3.0  # length of the path within which the lookahead point i
 MAX_LOOKAHEAD_CANDIDATES = 12  # points of the path that are tried, evenly spaced
 MAX_LINE_COST_RATIO = 1.02  # cost of the straight line to the lookahead point, relative to the path on the grid
 WAITING_RANGE_M = 4.0  # cost of the path to an occupied goal within which a robot chooses the place where it waits
-# Cost of a metre between that place and the goal. More than a metre along any path, so that the robot drives as near as
-# it can without a detour.
-REMAINING_COST = 2 * (1 + MAX_WALL_COST)
-# Paths around obstacles are computed up to the robot's cost without obstacles and one of these margins: the next one
-# if the robot was not reached.
+# Weight of the cost of the path that remains from there, if the obstacle were gone. As it is more than 1, the robot
+# drives as near as it can without a detour.
+REMAINING_WEIGHT = 2.0
+# The search for paths around obstacles ends at the robot's cost without obstacles plus the first margin. If that does
+# not reach the robot, it is repeated with the next.
 SEARCH_MARGINS_M = (10.0, 60.0, np.inf)
 
 
@@ -130,38 +130,43 @@ class FreeSpaceGraph:
     def cost_field_around_obstacles(self, point: Array, within: float, position: Array) -> CostField | None:
         """The `cost_field` for a robot at ``position`` (2,) m.
 
-        If obstacles occupy the point, it leads to the place where the robot should wait. Costs that exceed the robot's
-        by more than a margin may be those without obstacles, so that most of the map need not be searched.
+        If obstacles occupy the point, it leads to the place where the robot should wait. Where paths around obstacles
+        cost more than the robot's and a margin, the costs are those without obstacles, so that most of the map need not
+        be searched.
         """
         goal = self.nearest_free(point, within, map_only=True)
         start = self.nearest_free(position, self.min_clearance + 2 * self.grid.resolution)
-        end = self.nearest_free(point, within)
-        if goal is None or start is None or end is None:
+        if goal is None or start is None:
             return self.cost_field(point, within)
-        if end != goal:
-            end = self._waiting_cell(point, within, start, end)
         if self._known_paths is None or self._known_paths[0] != goal:
             self._known_paths = goal, *self._paths_to(goal, map_only=True)
         known = self._known_paths[1:]
         if not len(self._near_obstacles):
             return self._field(point, goal, *known)
-        if not np.isfinite(known[0][end]):  # beside a goal in another part of the free space
-            return self._field(point, end, *self._paths_to(end))
+        cell_cost = self._cell_cost()
+        end = (
+            goal
+            if np.isfinite(cell_cost.ravel()[goal])
+            else self._waiting_cell(point, within, start, cell_cost, known[0])
+        )
+        if end is None:
+            return None
         for margin in SEARCH_MARGINS_M:
             limit = known[0][start] + margin
-            cost, next_cell = repaired_paths(self._cell_cost(), known, self._near_obstacles, end, limit)
+            cost, next_cell = repaired_paths(cell_cost, known, self._near_obstacles, end, limit)
             if cost[start] <= limit:
                 break
         if np.isfinite(limit):
             beyond = np.isinf(cost)
             cost[beyond], next_cell[beyond] = known[0][beyond], known[1][beyond]
-        return self._field(point, end, cost, next_cell)
+        cost[np.isinf(cell_cost.ravel())] = np.inf
+        return self._field(point, end, np.maximum(cost - known[0][end], 0.0), next_cell)
 
     def _paths_to(self, cell: int, *, map_only: bool = False) -> tuple[Array, npt.NDArray[np.int32]]:
         return cheapest_paths(self._cell_cost(map_only=map_only), np.array([cell]), np.zeros(1))
 
     def _cell_cost(self, *, map_only: bool = False) -> Array:
-        """Cost (rows, columns) of a way as long as a cell's side; +inf where a cell is not free."""
+        """Cost (rows, columns) of crossing each cell along its side; +inf where a cell is not free."""
         cost, clearance = self.cost_per_metre, self.clearance
         if map_only:
             clearance = self.free.clearance
@@ -174,19 +179,24 @@ class FreeSpaceGraph:
             goal = self._centres[cell]
         return CostField(self, goal, cost.reshape(self.grid.shape), next_cell)
 
-    def _waiting_cell(self, point: Array, within: float, start: int, nearest: int) -> int:
-        """The free cell within ``within`` m of an occupied ``point`` with the least path and remaining distance to it.
+    def _waiting_cell(self, point: Array, within: float, start: int, cell_cost: Array, remaining: Array) -> int | None:
+        """The free cell within ``within`` m of an occupied ``point`` at which a robot should wait; None without one.
 
-        Without the path from the cell ``start``, the robot would drive around an obstacle that occupies its goal,
-        because the rear, which it does not see, seems free. Far from the point, it is the cell ``nearest`` to it.
+        It has the least sum of the path to it from the cell ``start`` and `REMAINING_WEIGHT` times the ``remaining``
+        (cells,) cost, that of the path on to the point without obstacles. Without the former, the robot would drive
+        around an obstacle that occupies its goal, because the rear, which it does not see, seems free. Far from the
+        point, it is the cell with the least remaining cost.
         """
         cells = self.grid.cells_near(point, within)
-        distance = np.hypot(*(self._centres[cells] - point).T)
-        limit = WAITING_RANGE_M + REMAINING_COST * float(np.hypot(*(self._centres[nearest] - point)))
-        path_cost, _ = cheapest_paths(self._cell_cost(), np.array([start]), np.zeros(1), limit)
-        cost = path_cost[cells] + REMAINING_COST * distance
-        best = int(np.argmin(np.where(distance <= within, cost, np.inf)))
-        return int(cells[best]) if cost[best] <= limit else nearest  # above the limit, costs are not known
+        near = np.hypot(*(self._centres[cells] - point).T) <= within
+        cells = cells[near & np.isfinite(cell_cost.ravel()[cells]) & np.isfinite(remaining[cells])]
+        if not len(cells):
+            return None
+        weighted = REMAINING_WEIGHT * remaining[cells]
+        limit = WAITING_RANGE_M + float(weighted.min())
+        cost = cheapest_paths(cell_cost, np.array([start]), np.zeros(1), limit)[0][cells] + weighted
+        best = int(np.argmin(cost))
+        return int(cells[best if cost[best] <= limit else np.argmin(weighted)])  # above the limit, costs are not known
 
     def clear_line(self, start: Array, ends: Array) -> tuple[Array, Array]:
         """Whether straight lines from (2,) to (N, 2) m are free, and their costs; both (N,)."""
@@ -205,7 +215,7 @@ class CostField:
     """Cost to go to one goal from everywhere."""
 
     graph: FreeSpaceGraph
-    goal: Array  # (2,) m in map, moved to the nearest place where the robot can stand
+    goal: Array  # (2,) m in map, moved to where the robot can stand, or waits if obstacles occupy the goal
     cost: Array  # (rows, columns) m to go, more near walls; +inf where the goal cannot be reached
     next_cell: npt.NDArray[np.int32]  # (cells,) flat index of the next cell on the path to the goal, or `NO_CELL`
 

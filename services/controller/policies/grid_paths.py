@@ -1,6 +1,6 @@
 """Cheapest paths on a grid with 16 neighbours, by Dijkstra's algorithm, compiled by numba.
 
-``cell_cost`` (rows, columns) is the cost of a way as long as a cell's side, +inf where a cell is not free. A move costs
+``cell_cost`` (rows, columns) is the cost of crossing a cell along its side, +inf where a cell is not free. A move costs
 its length times the mean of its two cells; the cells that it passes over must be free as well. Other arrays are flat.
 
 numba keeps the compiled code beside this file, or in NUMBA_CACHE_DIR, so it is compiled once per machine.
@@ -57,21 +57,21 @@ def repaired_paths(
     cell_cost: Array,
     known: tuple[Array, npt.NDArray[np.int32]],
     increased: Cells,
-    start: int,
+    end: int,
     limit: float,
 ) -> tuple[Array, npt.NDArray[np.int32]]:
     """The cheapest paths after the cost of some cells has increased, computed only where they differ.
 
     ``known`` are the `cheapest_paths` before, ``increased`` the cells whose cost has increased. The paths end at the
-    cell ``start``, whose cost stays as it was: another one than before if that is no longer free. Above the ``limit``,
+    cell ``end``: the former one, or another with its known cost if the former one is occupied. Above the ``limit``,
     costs may be too low, or +inf although there is a path, and paths may end early.
     """
     cost, next_cell = known[0].copy(), known[1].copy()
     affected = _paths_through(cell_cost.shape, known, increased, limit)
     cost[affected], next_cell[affected] = np.inf, NO_CELL
     cells = np.flatnonzero(affected)
-    starts = np.append(cells, start)
-    start_costs = np.append(_costs_by_others(cell_cost, cells, affected, limit, cost, next_cell), known[0][start])
+    starts = np.append(cells, end)
+    start_costs = np.append(_costs_by_others(cell_cost, cells, affected, limit, cost, next_cell), known[0][end])
     _search(cell_cost, starts, start_costs, affected, limit, cost, next_cell)
     return cost, next_cell
 

@@ -187,7 +187,9 @@ def candidate_motions(current: Array, lookahead: Array, robot: Robot) -> Array:
     bearing, distance = float(np.arctan2(lookahead[1], lookahead[0])), float(np.hypot(*lookahead))
     speeds = np.unique([*(robot.max_speed * np.array([0.08, 0.2, 0.4, 0.7, 1.0])), braking_speed(distance, robot)])
     fan = _holonomic_fan(speeds, bearing) if robot.drive == "holonomic" else _arcs(speeds, bearing, distance, robot)
-    held = np.pad(np.concatenate([np.zeros((1, 3)), current[None], fan]), ((0, 0), (0, 2)), constant_values=HOLD_S)
+    others = np.concatenate([current[None], fan])
+    others = others[others.any(axis=1)]  # standing is the same as braking
+    held = np.pad(np.concatenate([np.zeros((1, 3)), others]), ((0, 0), (0, 2)), constant_values=HOLD_S)
     stopping = [(stopping_action(current, lookahead, robot, hold), hold) for hold in SHORT_HOLDS_S]
     motions = [[*action, hold, hold] for action, hold in stopping if action is not None]
     if robot.drive == "differential":

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 HEADING_FADE_M = 0.3  # closer to the lookahead point, the cost of turning towards it fades out
 BLIND_SPEED = 0.25  # m/s into directions that the scanner does not see, for a base that may not turn; others turn first
 # The field of view must extend this far to either side of the direction of motion, because the body is wide: on a curve
-# of twice the body's radius, its inner side meets what was 60 degrees off that direction before. In a field of view too
-# narrow for that, motion is allowed in its middle third.
+# whose radius is twice the body's, its inner side passes places that were 60 degrees beside the direction of motion.
+# In a field of view too narrow for that, motion is allowed in its middle third.
 FIELD_OF_VIEW_MARGIN_RAD, FIELD_OF_VIEW_DIVISOR = np.pi / 3, 3
 # Cost in m of a change of velocity by 1 m/s, so that the choice does not alternate between motions of equal merit.
 CHANGE_COST_S = 0.02
@@ -171,11 +171,14 @@ def select_motion(
     """
     evaluator = _Evaluator(current, lookahead, surroundings, robot, belief or PoseBelief())
     sampled = evaluator.evaluate(motion_model.candidate_motions(current, lookahead, robot), braking_is_free=True)
-    refined = evaluator.evaluate(motion_model.refined_motions(sampled.motions[sampled.best], robot))
+    refined = sampled
+    if sampled.motions[sampled.best, :3].any():
+        refined = evaluator.evaluate(motion_model.refined_motions(sampled.motions[sampled.best], robot))
     chosen = sampled if sampled.least <= refined.least else refined
     hindered = float(sampled.energy.total.min()) < chosen.least - HINDERED_M * NATS_PER_METRE
     best = chosen.best
-    terms = chosen.energy.of(best, np.concatenate([sampled.allowed_energy, refined.allowed_energy]))
+    compared = [sampled.allowed_energy] if refined is sampled else [sampled.allowed_energy, refined.allowed_energy]
+    terms = chosen.energy.of(best, np.concatenate(compared))
     terms["risk"] += 2 * NATS_PER_METRE * cost_beyond  # in the mean distance during the motion and in that at its end
     return SelectedMotion(chosen.motions[best, :3], chosen.poses[best], terms, hindered=hindered)
 

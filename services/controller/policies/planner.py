@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 REPLAN_PERIOD_NS = 400_000_000  # minimum time between two plans when obstacles near the path change
 REPLAN_PERIOD_FAR_NS = 1_500_000_000  # the same when obstacles change elsewhere
 BLIND_AHEAD = "the scanner does not see ahead, where a differential base drives: mount it facing ahead"
+NO_SIGHT = "the scanner sees no farther than the robot's own radius: check range_max of the scans, and radius"
 MAX_GOAL_SHIFT_M = 2.0  # maximum distance from an occupied goal at which the robot waits until it is free
 MIN_PROGRESS_M = 0.02  # near the goal, the robot counts as stuck if it moves by less than this
 MAX_COST_TO_GOAL_M = 100.0  # larger costs are clipped, also that of a goal to which no path leads
@@ -62,8 +63,8 @@ class GeodesicPolicy:
         """
         # In a growing map this is off, because the information of a scan cannot be computed where the map is unknown.
         self.epistemic = epistemic and world is not None
-        self._robot, self.world, self.keep_heading = robot, world, keep_heading
-        self.robot = robot  # its maximum speed is less if the scanner's range is too short for it
+        self.robot, self.world, self.keep_heading = robot, world, keep_heading
+        self._unlimited_robot = robot  # the maximum speed of `robot` is less if the scanner's range is too short for it
         self.free = NO_MAP if world is None else FreeSpace.of(world)
         self.graph = FreeSpaceGraph(self.free, robot.radius)
         self.obstacles = TemporaryObstacles(self.free)
@@ -151,6 +152,7 @@ class GeodesicPolicy:
 
     def prepare(self, scan: Scan) -> None:
         """Computes, with the first scan, how informative scans are in each place; uninformative places cost more."""
+        self._limit_speed(scan)
         if not self.epistemic or self._information is not None:
             return
         self._information = ScanInformation.of(self.graph, scan, self.robot.max_speed)
@@ -161,7 +163,7 @@ class GeodesicPolicy:
         if scan is not None:
             self._field_of_view = Sweep.of(scan).sector(scan.mount.yaw)
             self._scan = scan
-            self.robot = self._robot.model_copy(update={"max_speed": self._max_speed(scan)})
+            self._limit_speed(scan)
         if belief.state != "tracking":
             return  # the pose is not reliable; obstacles found so far are kept
         self.localiser.reset()
@@ -171,10 +173,11 @@ class GeodesicPolicy:
         if (cell := self.graph.nearest_free(pose[:2], self.graph.min_clearance, map_only=True)) is not None:
             self._component = int(self.graph.component[cell])
 
-    def _max_speed(self, scan: Scan) -> float:
-        """Speed in m/s from which the robot can stop within the range in which the scanner shows obstacles."""
-        sight = min(scan.range_max, MAX_RANGE_M) - self._robot.radius - OBSTACLE_GAP_M
-        return braking_speed(sight, self._robot)
+    def _limit_speed(self, scan: Scan) -> None:
+        """Limits the speed so that the robot can stop within the range in which the scanner shows obstacles."""
+        sight = min(scan.range_max, MAX_RANGE_M) - self._unlimited_robot.radius - OBSTACLE_GAP_M
+        if (speed := braking_speed(sight, self._unlimited_robot)) != self.robot.max_speed:
+            self.robot = self._unlimited_robot.model_copy(update={"max_speed": speed})
 
     def decide(self, belief: Belief, velocity: Array, motion_until_effect: Array) -> Decision:
         """Chooses the velocity of least expected free energy; arguments as for `Policy.decide`."""
@@ -379,6 +382,8 @@ class GeodesicPolicy:
         """Status text: why the robot does not drive freely, or nothing."""
         if self.robot.drive == "differential" and not bool(surroundings.sees(0.0)):
             return BLIND_AHEAD
+        if not self.robot.max_speed:
+            return NO_SIGHT
         if self.ignores_obstacles:
             return self._no_path_text(pose, surroundings, standing=standing)
         return self._hindrance_text(pose, surroundings, standing=standing) if hindered else ""

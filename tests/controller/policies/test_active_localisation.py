@@ -51,6 +51,15 @@ def test_obstacle_that_leaves_the_field_of_view():
     assert len(points.update(8 * 10**9, -turn, empty, seen)) == 0
 
 
+def test_latest_of_unseen_points():
+    """Of several points in a cell, the one that is remembered longest is kept."""
+    seen, points = scan(0, [3.0, 2.0, 0.0], room(10, 4)), UnseenPoints()
+    points.update(0, np.zeros(3), np.array([[-0.50, 0.51]]), seen)
+    points.update(4 * 10**9, np.zeros(3), np.array([[-0.51, 0.505]]), seen)
+    points.update(4 * 10**9 + 1, np.array([0.0, 0.0, -0.5]), np.zeros((0, 2)), seen)
+    assert len(points.update(6 * 10**9, np.zeros(3), np.zeros((0, 2)), seen)) == 1
+
+
 def test_time_for_progress():
     """It counts from when the robot may drive: not while it waits or backs off. A turn by half a radian is progress."""
     timer = StallTimer()

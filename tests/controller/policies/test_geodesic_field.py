@@ -136,11 +136,34 @@ def test_where_to_wait_for_an_occupied_goal(empty):
         assert np.hypot(*(place - goal)) < nearest
 
 
+def test_robot_close_to_an_obstacle(empty):
+    """Its path leads around the obstacle, also from within the gap that motions keep."""
+    empty.set_obstacles(np.stack([np.full(41, 5.0), np.linspace(2.0, 4.0, 41)], axis=-1))
+    goal, start = np.array([8.0, 3.0]), np.array([4.72, 3.05])
+    path = empty.cost_field_around_obstacles(goal, 2.0, start).path(start)
+    assert path_length(path) == pytest.approx(path_length(empty.cost_field(goal).path(start)))
+    assert path_length(path) > 4.0
+
+
+@pytest.mark.parametrize("door", [0.0, 1.0])
+@pytest.mark.parametrize("start", [(5.0, 2.0), (8.0, 4.0)])
+def test_waiting_on_the_right_side_of_a_wall(door, start):
+    """The place to wait is near along the way without the obstacle, not as the crow flies."""
+    world = room(10, 8, box(5 - door / 2, 5, 10 - door, 0.05, "wall"))
+    graph = FreeSpaceGraph(FreeSpace.of(world), RADIUS)
+    x, y = (each.ravel() for each in np.meshgrid(np.arange(3.9, 6.1, 0.05), np.arange(4.0, 4.8, 0.05)))
+    graph.set_obstacles(np.stack([x, y], axis=-1))
+    field = graph.cost_field_around_obstacles(np.array([5.0, 4.62]), 2.0, np.array(start))
+    assert field.goal[1] < 4.7
+    assert field.reaches(np.array(start))
+    assert field.cost_from(field.goal) == 0
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_costs_around_obstacles(name):
     """Computed only where obstacles change them, the costs near the robot are those of all paths around them."""
     world, graph, rng = shipped(name), FreeSpaceGraph(free_space(name), RADIUS), np.random.default_rng(4)
-    x0, y0, x1, y1 = world.bounds
+    (x0, y0, x1, y1), compared = world.bounds, 0
     for start, goal in world.sample_free(20, rng, RADIUS + WALL_GAP_M).reshape(-1, 2, 2):
         graph.set_obstacles(rng.uniform((x0, y0), (x1, y1), (rng.integers(1, 12), 2)))
         everywhere, found = graph.cost_field(goal, 0.3), graph.cost_field_around_obstacles(goal, 0.3, start)
@@ -151,6 +174,9 @@ def test_costs_around_obstacles(name):
         np.testing.assert_allclose(found.path(start), everywhere.path(start))
         near = everywhere.cost <= robot
         np.testing.assert_allclose(found.cost[near], everywhere.cost[near], rtol=1e-9)
+        assert np.isinf(found.cost[graph.clearance < graph.min_clearance]).all()
+        compared += 1
+    assert compared >= 3
 
 
 @pytest.mark.parametrize("name", ["corridor", "office"])

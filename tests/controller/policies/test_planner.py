@@ -14,6 +14,7 @@ from common.messages.requests import PredictReply
 from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS
 from services.controller.policies.expected_free_energy import NATS_PER_METRE
+from services.controller.policies.motion_selection import Surroundings, select_motion
 from services.controller.policies.planner import GeodesicPolicy
 from services.controller.policies.straight_line import StraightLinePolicy
 from tests.common.geometry.maps import rooms
@@ -179,6 +180,17 @@ def test_published_energy():
         risks.append(decision.terms["risk"])
         assert 0 < decision.terms["probability"] < 0.2  # several motions are nearly as good
     np.testing.assert_allclose(-np.diff(risks), 2 * NATS_PER_METRE * np.array([5.0, 10.0]), rtol=0.05)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_probability_of_the_only_motion(kind):
+    """Copies of a motion do not count as other motions."""
+    angle = np.arange(0, 2 * np.pi, 0.05)
+    ring = 0.331 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    around = Surroundings(lambda p: np.full(p.shape[:-1], np.inf), ring, np.zeros(len(ring), bool), 0.0, 0.33)
+    selected = select_motion(np.zeros(3), np.array([2.0, 0.0]), around, Robot(drive=kind))
+    assert not selected.action[:2].any()
+    assert selected.terms["probability"] > (0.9 if kind == "holonomic" else 0.05)  # a differential base may turn
 
 
 @pytest.mark.parametrize("kind", KINDS)
