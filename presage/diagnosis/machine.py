@@ -34,10 +34,17 @@ def check_machine(recordings: Path) -> Iterator[Finding]:
 
 
 def _check_caches() -> Iterator[Finding]:
-    cache = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parents[2] / "services" / "estimator")
-    if problem := find_write_error(_nearest_existing(cache)):
-        advice = "the estimator compiles its code again at each start; set NUMBA_CACHE_DIR to a writable folder"
-        yield Finding("not_writable", None, f"compiled code cannot be cached in {cache}: {problem}", str(cache), advice)
+    services = Path(__file__).parents[2] / "services"
+    chosen = os.environ.get("NUMBA_CACHE_DIR")
+    for cache in [Path(chosen)] if chosen else [services / "estimator", services / "controller"]:
+        if problem := find_write_error(_nearest_existing(cache)):
+            what = f"compiled code cannot be cached in {cache}: {problem}"
+            advice = (
+                "estimator and controller compile their code again at each start; "
+                "set NUMBA_CACHE_DIR to a writable folder"
+            )
+            yield Finding("not_writable", None, what, str(cache), advice)
+            break  # the advice is the same for the other
     if SHARED_MEMORY.is_dir() and (problem := find_write_error(SHARED_MEMORY)):
         advice = "experiments on several cores fail; the services do not need it"
         yield Finding("not_writable", None, f"{SHARED_MEMORY} cannot be used: {problem}", str(SHARED_MEMORY), advice)

@@ -44,9 +44,9 @@ from presage.terminal.progress import status_line
 
 # By the stamps of the messages. A person who blocks the robot usually moves on sooner.
 PROGRESS_TIMEOUT_S = 30.0
-# Progress is a distance to the goal smaller than ever by the first, or a place away from that of the last progress by
-# the second, because the way around a wall may lead away from the goal. Backing off an obstacle is shorter.
-MIN_APPROACH_M, MIN_MOTION_M = 0.3, 1.0
+MIN_APPROACH_M = 0.3  # decrease of the least distance to the goal that counts as progress
+# A motion this far also counts, because the way around a wall may lead away from the goal; backing off is shorter.
+MIN_MOTION_M = 1.0
 # Without statuses from the controller: time until a note is printed, and until the command gives up.
 STATUS_WARNING_S, STATUS_TIMEOUT_S = 3.0, 30.0
 LOCALISATION_TIMEOUT_S = 10.0  # preset paper takes 3 s
@@ -130,8 +130,8 @@ class _Progress:
         """Whether there is progress since the last call that returned True."""
         if status.distance is None and status.state == "navigating":
             return True  # to a lift or in it, which may take long
-        # The pose of a lost robot moves although the robot may stand.
-        place = belief.pose.array()[:2] if belief is not None and belief.state != "lost" else None
+        # In other states the pose may jump while the robot stands.
+        place = belief.pose.array()[:2] if belief is not None and belief.state == "tracking" else None
         nearer = status.distance is not None and status.distance < self._least_distance - MIN_APPROACH_M
         moved = place is not None and (self._place is None or np.hypot(*(place - self._place)) > MIN_MOTION_M)
         if nearer and status.distance is not None:

@@ -37,6 +37,7 @@ class SessionSummary:
     goal_reached: bool | None  # according to the controller
     goal_refusal: str | None  # why the controller refused the goal
     goal_tolerance_m: float | None
+    goal_distance_reached_m: float | None  # from the true pose, when the controller reported it as reached
     goal_distance_m: float | None  # from the true pose, at the end
     goal_distance_believed_m: float | None
     position_error_m: float | None  # at the end
@@ -85,7 +86,7 @@ class SessionSummary:
             return self.goal_refusal.removeprefix("goal ")
         if not self.goal_reached:
             return "not reached"
-        distance, tolerance = self.goal_distance_m, self.goal_tolerance_m
+        distance, tolerance = self.goal_distance_reached_m, self.goal_tolerance_m
         return "believed reached" if distance and tolerance and distance > tolerance else "reached"
 
     def _skipped(self) -> str:
@@ -142,6 +143,7 @@ def summary_of(session: RecordedSession) -> SessionSummary:
         goal_reached=None if goal is None else reached is not None,
         goal_refusal=session.refusal(),
         goal_tolerance_m=None if goal is None else goal.tolerance,
+        goal_distance_reached_m=_distance(path[session.truth.stamps_ns == reached][-1:], goal),
         goal_distance_m=_distance(path[-1:], goal),
         goal_distance_believed_m=_distance(session.belief.poses[-1:], goal),
         position_error_m=_last(errors),

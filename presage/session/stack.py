@@ -27,7 +27,7 @@ from presage.session.ports import accepts_connections, check_port, free_port
 COLOURS = {"router": 37, "simulator": 36, "estimator": 35, "mapper": 35, "controller": 33, "recorder": 32, "viewer": 34}
 SECURITY_VARIABLES = {"PRESAGE_SECURITY", "PRESAGE_ROLE"}  # choose this process's credentials, not the children's
 SLOW_START_S = 4.0  # time without all services after which the user is told which are missing
-SECRETS = {"PRESAGE_VIEWER_TOKEN"}  # settings that are not shown
+SECRETS = {"PRESAGE_VIEWER_TOKEN"}  # settings whose values are not shown
 ALIVE_TIMEOUT_S = 60.0  # for all services to start; the estimator may have to compile
 LINE_TIMEOUT_S = 30.0  # for a line of output
 TERMINATION_TIMEOUT_S = 5.0  # between SIGTERM and SIGKILL
@@ -50,8 +50,10 @@ class ServiceProcess:
 
     @property
     def restart_command(self) -> str:
-        """Shell command that starts the same service again."""
-        variables = [f"{name}={shlex.quote(value)}" for name, value in self.settings.items() if name not in SECRETS]
+        """Shell command that starts the same service again, with ``...`` in place of secrets."""
+        variables = [
+            f"{name}={'...' if name in SECRETS else shlex.quote(value)}" for name, value in self.settings.items()
+        ]
         return " ".join([*variables, shlex.join(["python", *self.args])])
 
 

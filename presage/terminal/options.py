@@ -66,14 +66,16 @@ class CommandWithNumbers(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parses the command line. Raises UserError for an unknown option."""
         ctx.ignore_unknown_options = True
+        program = ctx.find_root().command_path
         known = {name for parameter in self.get_params(ctx) for name in (*parameter.opts, *parameter.secondary_opts)}
         for word in args:
             name = word.split("=", maxsplit=1)[0]
             if name.startswith("--") and len(name) > 2 and name not in known:
                 if name in {"--connect", "--robot"}:
-                    raise UserError(f"{name} stands before the command, as in presage {name} NAME {self.name}")
+                    command = ctx.command_path.removeprefix(program)
+                    raise UserError(f"{name} stands before the command, as in {program} {name} NAME{command}")
                 similar = similar_key(name, known)
-                hint = f"did you mean {similar}?" if similar else f"presage {self.name} --help lists all"
+                hint = f"did you mean {similar}?" if similar else f"{ctx.command_path} --help lists all"
                 raise UserError(f"{self.name} has no option {name}; {hint}")
         return super().parse_args(ctx, args)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import runpy
 import subprocess
@@ -65,6 +66,9 @@ def test_examples_of_a_page(page, ranges, tmp_path, monkeypatch):
     for block in blocks:
         exec(block, names)
         np.testing.assert_allclose(names["belief"].pose, POSE, atol=0.02)
+    if optimiser := names.get("MoreSteps"):
+        arguments = [list(inspect.signature(each.descend).parameters) for each in (optimiser, presage.Optimiser)]
+        assert arguments[0] == arguments[1]
 
 
 def test_import_is_light():

@@ -72,9 +72,12 @@ def follow(*steps) -> tuple[int, str]:
     [
         [step(k, "blocked" if k % 2 else "navigating", x=0.3 * (k % 2), reason="a door") for k in range(9)],
         [step(k, reason="a door") for k in range(9)],
-        [step(k, "lost", x=2.0 * k, belief="lost", distance=None, reason="a door") for k in range(9)],
+        *(
+            [step(k, "lost", x=2.0 * k, belief=state, distance=None, reason="a door") for k in range(9)]
+            for state in ("lost", "ambiguous", "localising")
+        ),
     ],
-    ids=["back and forth", "standing", "lost"],
+    ids=["back and forth", "standing", "lost", "ambiguous", "localising"],
 )
 def test_no_progress(steps):
     status, last = follow(*steps)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -29,7 +28,8 @@ def test_summary(recording):
         "duration_s": 10.0, "duration_stamped_s": 9.9, "localised_after_scans": 21, "localised_after_s": 2.0,
         "localised_error_m": 0.05,
         # The truth ends at 1 + 0.1 * 69 = 7.9, the belief 0.2 further.
-        "goal_reached": True, "goal_distance_m": 0.1, "goal_distance_believed_m": 0.1, "position_error_m": 0.2,
+        "goal_reached": True, "goal_distance_reached_m": 0.3, "goal_distance_m": 0.1, "goal_distance_believed_m": 0.1,
+        "position_error_m": 0.2,
         # Scans 20 to 30 at 0.05 m, 31 to 99 at 0.2 m.
         "position_error_median_m": 0.2, "position_error_max_m": 0.2, "position_error_navigating_median_m": 0.2,
         "path_m": 6.9, "straight_line_m": 7.0, "contacts": 3,
@@ -37,7 +37,7 @@ def test_summary(recording):
     assert {name: summary[name] for name in expected} == pytest.approx(expected)
     assert json.loads(json.dumps(summary)) == summary
     lines = dict(summarise(recording).lines())
-    assert (lines["goal"], lines["distance to goal"]) == ("reached", "0.100 m, believed 0.100 m")
+    assert (lines["goal"], lines["distance to goal"]) == ("believed reached", "0.100 m, believed 0.100 m")
     assert lines["skipped by services"] == "7 scan, for newer ones; undecodable 0"
     assert "incomplete" not in lines
 
@@ -137,11 +137,16 @@ def test_cancelled_goal(tmp_path):
     assert summarise(path).goal_distance_m is None
 
 
-def test_goal_reached_only_in_the_belief(recording):
-    summary = summarise(recording)
-    assert summary.goal_result() == "reached"
-    assert replace(summary, goal_distance_m=0.2).goal_result() == "believed reached"
-    assert replace(summary, goal_distance_m=None).goal_result() == "reached"
+@pytest.mark.parametrize(
+    ("x_reached", "x_end", "result"), [(8.1, 4.0, "reached"), (7.7, 8.0, "believed reached"), (None, 4.0, "reached")]
+)
+def test_goal_reached_only_in_the_belief(tmp_path, x_reached, x_end, result):
+    """Where the robot is later does not count."""
+    goal = Goal(stamp_ns=0, pose=Pose(x=8.0, y=0.0), tolerance=0.15)
+    reached = STATUS, Status(stamp_ns=1, state="reached", goal=goal.pose)
+    arrival = [] if x_reached is None else [truth(1, x_reached)]
+    path = write(tmp_path / "goal.mcap", truth(0, 1.0), (GOAL, goal), *arrival, reached, truth(2, x_end))
+    assert summarise(path).goal_result() == result
 
 
 def test_refused_goal(tmp_path):

@@ -66,3 +66,9 @@ def test_slow_start_is_explained(monkeypatch, capsys):
     assert capsys.readouterr().err == (
         "waiting for estimator: the first start compiles code, which can take half a minute\n"
     )
+
+
+def test_restart_command_has_a_placeholder_for_secrets():
+    settings = {"PRESAGE_ROBOT": "my robot", "PRESAGE_VIEWER_TOKEN": "tea"}
+    process = stack.ServiceProcess("viewer", None, None, args=["-m", "services.viewer"], settings=settings)
+    assert process.restart_command == "PRESAGE_ROBOT='my robot' PRESAGE_VIEWER_TOKEN=... python -m services.viewer"

@@ -11,7 +11,7 @@ from presage.live import commands
 
 
 def run(*words):
-    result = CliRunner().invoke(app, words)
+    result = CliRunner().invoke(app, words, prog_name="presage")
     if isinstance(result.exception, UserError):
         raise result.exception
     return result
@@ -37,6 +37,8 @@ def test_not_a_number():
         ("obstacle add crate 6 -1 --radios=0.2", "add has no option --radios; did you mean --radius?"),
         ("goal 15 1.5 --xyz", "presage goal --help lists all"),
         ("goal 15 1.5 --robot two", "--robot stands before the command, as in presage --robot NAME goal"),
+        ("obstacle add a 1 2 --foo 3", "; presage obstacle add --help lists all"),
+        ("obstacle add a 1 2 --robot two", "as in presage --robot NAME obstacle add"),
         ("goal --cancel 3 3", "--cancel cancels the current goal, whichever it is: leave out the place"),
     ],
 )
