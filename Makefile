@@ -129,7 +129,7 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-long-corridor --worlds 40 --seed 3573 --model exact --seconds 10 --cases long-corridor --estimators precise
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-wrong-map --worlds 40 --seed 3577 --model exact --seconds 10 --cases wrong-map --estimators precise
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-noisy-map --worlds 20 --seed 3575 --model exact --seconds 40 --cases noisy-map
-	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-50 --worlds 20 --seed 3415 --model exact --cases moved-50 --estimators precise,particle-filter,particle-filter-recovery
+	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-50 --worlds 20 --seed 3552 --model exact --cases moved-50 --estimators precise,particle-filter,particle-filter-recovery
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-moved-100 --worlds 40 --seed 3574 --model exact --seconds 10 --cases moved-100 --estimators precise
 	$(BIN)/presage bench integrity --out $(RESULTS)/integrity-single-scan --worlds 40 --seed 3576 --model exact --cases single-scan-moved-50 --estimators precise
 	for folder in $(RESULTS)/integrity*/; do cp $$folder/integrity.json docs/experiments/$$(basename $$folder).json || exit 1; done
