@@ -104,8 +104,8 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	$(BIN)/presage experiment --seed 3562 --out $(RESULTS) navigation --trials 30
 	$(BIN)/presage experiment --seed 3563 --out $(RESULTS) navigation --start unknown --trials 30
 	$(BIN)/presage experiment --seed 3560 --out $(RESULTS) navigation --worlds office --people 10 --trials 50
-	$(BIN)/presage experiment --seed 3502 --out $(RESULTS) navigation --worlds hall --drives holonomic --max-range 4 --beams 271 --prior odometry --slip 0.05 --limit 60 --trials 50
-	$(BIN)/presage experiment --seed 3502 --out $(RESULTS) navigation --worlds hall --drives holonomic --max-range 4 --beams 271 --prior odometry --slip 0.05 --limit 60 --trials 50 --no-epistemic
+	$(BIN)/presage experiment --seed 3551 --out $(RESULTS) navigation --worlds hall --drives holonomic --max-range 4 --beams 271 --prior odometry --slip 0.05 --limit 60 --trials 50
+	$(BIN)/presage experiment --seed 3551 --out $(RESULTS) navigation --worlds hall --drives holonomic --max-range 4 --beams 271 --prior odometry --slip 0.05 --limit 60 --trials 50 --no-epistemic
 	$(BIN)/presage experiment --seed 3549 --out $(RESULTS) navigation --worlds twins --start unknown --trials 50
 	$(BIN)/presage experiment --seed 3535 --out $(RESULTS) navigation --worlds twins --start unknown --trials 50 --drives holonomic --no-epistemic
 	$(BIN)/presage experiment --seed 3500 --out $(RESULTS) docking --trials 64

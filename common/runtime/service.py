@@ -152,8 +152,9 @@ def main(settings_class: type[S], make: Callable[[S], Service], argv: list[str] 
         service = make(settings)
         with open_bus(settings.link(), give_up=lambda: handler.stop_requested) as bus:
             if settings.connect and not wait_until(lambda: bus.linked() or handler.stop_requested, LINK_TIMEOUT_S):
-                waiting = f"nothing answers at {settings.connect} yet; waiting (--connect names another address)"
-                service.log.warning(waiting)
+                problem = f"nothing answers at {settings.connect}"
+                advice = "start a session with `presage up`, or name its address with --connect"
+                service.log.warning(problem, advice=advice)
             handler.run(service.make_loop(bus))
         service.log.info("ended")
     except UserError as error:

@@ -19,8 +19,8 @@ from services.recorder.recording import OpenRecording, warn_about_unfinished
 from services.recorder.session_description import DescriptionCollector, DescriptionReply
 from services.recorder.settings import RecorderSettings
 
-# The recorder may start before the router and the other services, but warns if this lasts longer.
-LINK_WARNING_DELAY_S, SERVICE_WARNING_DELAY_S = 3.0, 10.0
+# The recorder may start before the other services of the robot, but warns if this lasts longer.
+SERVICE_WARNING_DELAY_S = 10.0
 INBOX_CAPACITY = 20_000  # messages that wait to be written
 
 
@@ -194,7 +194,7 @@ class RecorderService(Service):
             descriptions.join()
 
     def _warn_if_nothing_arrives(self) -> None:
-        """Warns once if the router is not reached or the robot has no services, and logs when that has changed."""
+        """Warns once if the robot has no services, and logs when that has changed."""
         if not self._checks_reception:
             return
         problem, advice = self._find_reception_problem()
@@ -209,18 +209,12 @@ class RecorderService(Service):
 
     def _find_reception_problem(self) -> tuple[str, str]:
         """Why no messages arrive, and what to do; both empty if they do, or if it is too early to tell."""
-        open_for, connect = time.monotonic() - self._opened_at, self.options.link().connect
+        open_for = time.monotonic() - self._opened_at
         if self._has_messages_of_others() or (self.descriptions is not None and self.descriptions.present):
             self._checks_reception = False
             return "", ""
-        if connect and not self.loop.bus.linked():
-            if open_for < LINK_WARNING_DELAY_S:
-                return "", ""
-            return (
-                f"nothing answers at {', '.join(connect)}",
-                "start a session with `presage up`, or name its endpoint with --connect",
-            )
-        if open_for < SERVICE_WARNING_DELAY_S:
+        not_linked = self.options.connect and not self.loop.bus.linked()  # the start has warned of that
+        if not_linked or open_for < SERVICE_WARNING_DELAY_S:
             return "", ""
         return f"no service of robot {self.options.robot} is running", "start one, or name another robot with --robot"
 

@@ -118,7 +118,7 @@ IMPATIENT = """
 import sys
 from services.recorder import service
 from services.recorder.__main__ import RecorderSettings, main, build_service
-service.LINK_WARNING_DELAY_S = service.SERVICE_WARNING_DELAY_S = 0.1
+service.SERVICE_WARNING_DELAY_S = 0.1
 sys.argv[0] = "recorder"
 main(RecorderSettings, build_service)
 """

@@ -12,8 +12,8 @@ import pytest
 
 from common.bus.bus import Link, open_bus, wait_until
 from common.bus.security import read_credentials
-from common.messages.definitions import Belief, Scan, Status, Truth
-from common.messages.topics import BELIEF, CMD_VEL, SCAN, STATUS, TRUTH
+from common.messages.definitions import Belief, Map, Scan, Status, Truth
+from common.messages.topics import BELIEF, CMD_VEL, MAP, SCAN, STATUS, TRUTH
 from presage.live.latest_messages import LatestMessages
 from presage.session import credentials as secure
 from services.recorder.reader import read_recording
@@ -221,6 +221,8 @@ def test_mapping(compose):
     project.do("up", "--detach", "router", "simulator", "controller", "mapper")
     for service in ("simulator", "controller", "mapper"):
         project.becomes(service, "healthy")
+    with open_bus(Link(connect=(f"tcp/127.0.0.1:{project.router}",))) as bus:
+        assert LatestMessages(bus, MAP).wait_for(Map, lambda _: True, TIMEOUT_S), project.explain("mapper")
     project.do("run", "--rm", "--no-deps", "goal", "presage", "goal", "2.5", "0", "--wait")
     project.do("run", "--rm", "--no-deps", "goal", "presage", "save-map", "floor")
     assert (project.folder / "floor.yaml").exists()
