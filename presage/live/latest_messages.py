@@ -66,9 +66,8 @@ def session_bus(link: Link) -> Iterator[Bus]:
         try:
             yield bus
         except UserError:
-            wait_until(
-                lambda: bool(bus.robots()), CONNECT_TIMEOUT_S
-            )  # a session that was just opened may not know of any yet
+            # A session that was just opened may not know of any robot yet.
+            wait_until(lambda: bool(bus.robots()), CONNECT_TIMEOUT_S)
             if (robots := bus.robots(CONNECT_TIMEOUT_S)) and bus.robot not in robots:
                 raise UserError(
                     f"no robot {bus.robot!r} is running: choose one of {', '.join(robots)} with `presage --robot NAME`"
