@@ -446,7 +446,7 @@ class Navigator:
 def _arrival(belief: Belief, goal: Goal) -> str:
     """Status text on arrival, with the uncertainty of the position if that is larger than the tolerance."""
     reason = f"within {goal.tolerance:g} m of the goal"
-    if belief.covariance is None:  # how far the true position may be from the believed one is unknown
+    if belief.covariance is None:  # the estimator does not state how uncertain the position is
         return f"believed {reason}"
     uncertainty = 2 * float(np.sqrt(np.linalg.eigvalsh(belief.covariance[:2, :2])[-1]))  # 2 sigma
     return reason if uncertainty <= goal.tolerance else f"{reason}, but the pose is only known to {uncertainty:.2g} m"

@@ -125,13 +125,11 @@ class UnseenPoints:
 
         ``motion`` (3,) is that since the last update.
         """
-        field_of_view = Sweep.of(scan).sector(scan.mount.yaw)
-        kept = se2.rotate(-motion[2], self._points - motion[:2])
-        from_laser = kept - scan.mount.array()[:2]
-        off_centre = np.abs(se2.wrap(np.arctan2(from_laser[:, 1], from_laser[:, 0]) - field_of_view.centre))
+        kept, laser = se2.rotate(-motion[2], self._points - motion[:2]), scan.mount.array()
+        bearing = np.arctan2(*(kept - laser[:2]).T[::-1]) - laser[2]
         age = stamp_ns - self._stamps
         remembered = (np.hypot(*kept.T) < UNSEEN_RANGE_M) & (age >= 0) & (age < UNSEEN_MEMORY_NS)
-        unseen = remembered & (off_centre > field_of_view.half)
+        unseen = remembered & (Sweep.of(scan).beams_at(bearing) < 0)
         near = points[np.hypot(*points.T) < UNSEEN_RANGE_M]
         self._points = np.concatenate([kept[unseen], near])
         self._stamps = np.concatenate([self._stamps[unseen], np.full(len(near), stamp_ns)])

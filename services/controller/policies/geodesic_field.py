@@ -5,9 +5,9 @@ is the geodesic distance to the goal and a metre near a wall counts for more. Th
 everywhere, as if it were a Gaussian whose precision, lambda / d, grows as the robot approaches, so the attraction does
 not vanish on the last metres.
 
-Distances come from Dijkstra's algorithm on a grid with 16 neighbours (`grid_paths`). They are at most 2.7 %
-longer than the true ones. The robot does not follow the grid: it drives towards the lookahead point, which is the
-farthest point of the path to which a straight line is free.
+Distances come from Dijkstra's algorithm on a grid with 16 neighbours (`grid_paths`). They are at most 2.7 % longer than
+the true ones. The robot does not follow the grid: it drives towards the lookahead point, which is the farthest point of
+the path to which a straight line is free.
 """
 
 from __future__ import annotations
@@ -144,11 +144,9 @@ class FreeSpaceGraph:
         if not len(self._near_obstacles):
             return self._field(point, goal, *known)
         cell_cost = self._cell_cost()
-        end = (
-            goal
-            if np.isfinite(cell_cost.ravel()[goal])
-            else self._waiting_cell(point, within, start, cell_cost, known[0])
-        )
+        end: int | None = goal
+        if np.isinf(cell_cost.ravel()[goal]):
+            end = self._waiting_cell(point, within, start, cell_cost, known[0])
         if end is None:
             return None
         for margin in SEARCH_MARGINS_M:

@@ -100,14 +100,18 @@ def _paths_through(
         cell = stack[count]
         row, column = cell // columns, cell % columns
         for move in range(len(_MOVES)):
-            r, c = row + _MOVES[move, 0], column + _MOVES[move, 1]
-            if not (0 <= r < rows and 0 <= c < columns):
-                continue
-            other = r * columns + c
-            if next_cell[other] == cell and cost[other] <= limit and not found[other]:
+            other = _end_of_move(shape, row, column, move)
+            if other != NO_CELL and next_cell[other] == cell and cost[other] <= limit and not found[other]:
                 found[other], stack[count] = True, other
                 count += 1
     return found
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _end_of_move(shape: tuple[int, int], row: int, column: int, move: int) -> int:
+    """The cell at which a move ends, or `NO_CELL` if that is beyond the grid."""
+    r, c = row + _MOVES[move, 0], column + _MOVES[move, 1]
+    return int(r * shape[1] + c) if 0 <= r < shape[0] and 0 <= c < shape[1] else NO_CELL
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -126,18 +130,15 @@ def _costs_by_others(
 ) -> Array:
     """Cost (N,) of the path from each of the affected ``cells`` (N,) whose first move leads to one that is not.
 
-    It is +inf above the ``limit``.
+    It is +inf above the ``limit``; below, the end of that move becomes the next cell.
     """
-    rows, columns = cell_cost.shape
+    columns = cell_cost.shape[1]
     costs = np.full(len(cells), np.inf)
     for k in range(len(cells)):
         row, column = cells[k] // columns, cells[k] % columns
         for move in range(len(_MOVES)):
-            r, c = row + _MOVES[move, 0], column + _MOVES[move, 1]
-            if not (0 <= r < rows and 0 <= c < columns):
-                continue
-            other = r * columns + c
-            if affected[other] or cost[other] >= costs[k]:
+            other = _end_of_move(cell_cost.shape, row, column, move)
+            if other == NO_CELL or affected[other] or cost[other] >= costs[k]:
                 continue
             total = cost[other] + _move_cost(cell_cost, row, column, move)
             if total <= limit and total < costs[k]:
@@ -156,7 +157,7 @@ def _search(
     next_cell: npt.NDArray[np.int32],
 ) -> None:
     """Dijkstra's algorithm from the start cells through the cells ``within``, up to costs of ``limit``."""
-    rows, columns = cell_cost.shape
+    columns = cell_cost.shape[1]
     queue = [(np.float64(0.0), np.int64(0)) for _ in range(0)]
     for k in range(len(starts)):
         if start_costs[k] <= limit and start_costs[k] < cost[starts[k]]:
@@ -169,11 +170,8 @@ def _search(
             continue
         row, column = cell // columns, cell % columns
         for move in range(len(_MOVES)):
-            r, c = row + _MOVES[move, 0], column + _MOVES[move, 1]
-            if not (0 <= r < rows and 0 <= c < columns):
-                continue
-            other = r * columns + c
-            if cost[other] <= cost_here or not within[other]:
+            other = _end_of_move(cell_cost.shape, row, column, move)
+            if other == NO_CELL or cost[other] <= cost_here or not within[other]:
                 continue
             total = cost_here + _move_cost(cell_cost, row, column, move)
             if total <= limit and total < cost[other]:

@@ -171,14 +171,13 @@ def select_motion(
     """
     evaluator = _Evaluator(current, lookahead, surroundings, robot, belief or PoseBelief())
     sampled = evaluator.evaluate(motion_model.candidate_motions(current, lookahead, robot), braking_is_free=True)
-    refined = sampled
+    evaluations = [sampled]
     if sampled.motions[sampled.best, :3].any():
-        refined = evaluator.evaluate(motion_model.refined_motions(sampled.motions[sampled.best], robot))
-    chosen = sampled if sampled.least <= refined.least else refined
+        evaluations.append(evaluator.evaluate(motion_model.refined_motions(sampled.motions[sampled.best], robot)))
+    chosen = min(evaluations, key=lambda evaluation: evaluation.least)
     hindered = float(sampled.energy.total.min()) < chosen.least - HINDERED_M * NATS_PER_METRE
     best = chosen.best
-    compared = [sampled.allowed_energy] if refined is sampled else [sampled.allowed_energy, refined.allowed_energy]
-    terms = chosen.energy.of(best, np.concatenate(compared))
+    terms = chosen.energy.of(best, np.concatenate([each.allowed_energy for each in evaluations]))
     terms["risk"] += 2 * NATS_PER_METRE * cost_beyond  # in the mean distance during the motion and in that at its end
     return SelectedMotion(chosen.motions[best, :3], chosen.poses[best], terms, hindered=hindered)
 

@@ -151,7 +151,10 @@ class GeodesicPolicy:
         """Does nothing: `interrupt` discarded nothing that has to be restored."""
 
     def prepare(self, scan: Scan) -> None:
-        """Computes, with the first scan, how informative scans are in each place; uninformative places cost more."""
+        """Limits the speed to what the scanner's range allows; called with each scan.
+
+        With the first, it also computes how informative scans are in each place; uninformative places cost more.
+        """
         self._limit_speed(scan)
         if not self.epistemic or self._information is not None:
             return
@@ -163,7 +166,6 @@ class GeodesicPolicy:
         if scan is not None:
             self._field_of_view = Sweep.of(scan).sector(scan.mount.yaw)
             self._scan = scan
-            self._limit_speed(scan)
         if belief.state != "tracking":
             return  # the pose is not reliable; obstacles found so far are kept
         self.localiser.reset()

@@ -52,7 +52,7 @@ def test_obstacle_that_leaves_the_field_of_view():
 
 
 def test_latest_of_unseen_points():
-    """Of several points in a cell, the one that is remembered longest is kept."""
+    """Of several points in a cell, the latest is kept."""
     seen, points = scan(0, [3.0, 2.0, 0.0], room(10, 4)), UnseenPoints()
     points.update(0, np.zeros(3), np.array([[-0.50, 0.51]]), seen)
     points.update(4 * 10**9, np.zeros(3), np.array([[-0.51, 0.505]]), seen)

@@ -1,4 +1,4 @@
-"""Cheapest paths on a grid against scipy, and their repair against computing them anew."""
+"""Compares cheapest paths with those of scipy, and repaired paths with paths that are computed from scratch."""
 
 from __future__ import annotations
 
