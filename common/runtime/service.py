@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import TYPE_CHECKING, ClassVar, TypeVar
 
-from common.bus.bus import Bus, open_bus, wait_until
+from common.bus.bus import Bus, open_bus
 from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
 from common.log import Logger, begin_logging, logger, report_failure, set_up_logging
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from types import FrameType
 
 S = TypeVar("S", bound=ServiceSettings)
-
-LINK_TIMEOUT_S = 2.0  # a router that runs answers sooner
 
 
 class Service(ABC):
@@ -151,10 +149,6 @@ def main(settings_class: type[S], make: Callable[[S], Service], argv: list[str] 
         )
         service = make(settings)
         with open_bus(settings.link(), give_up=lambda: handler.stop_requested) as bus:
-            if settings.connect and not wait_until(lambda: bus.linked() or handler.stop_requested, LINK_TIMEOUT_S):
-                problem = f"nothing answers at {settings.connect}"
-                advice = "start a session with `presage up`, or name its address with --connect"
-                service.log.warning(problem, advice=advice)
             handler.run(service.make_loop(bus))
         service.log.info("ended")
     except UserError as error:

@@ -6,7 +6,7 @@ import json
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from common.runtime.service import Service
 
 HEALTH_PERIOD_S = 1.0
+LINK_WARNING_DELAY_S = 2.0  # a router that runs answers sooner
 RESTORE_PERIOD_S = 5.0  # after its start, a service keeps querying latched topics for this long until one answers
 MAX_REPORTED_KEYS, MAX_KEY_LENGTH = 200, 200  # in a health message
 MAX_ERROR_LENGTH = 300  # in the log line of an error that was logged in full before
@@ -49,6 +50,7 @@ class ServiceLoop:
         self._may_log = LogRateLimiter()
         self._heartbeat = Heartbeat(service.settings.heartbeat, service.name, bus.robot)
         self._stopping = False
+        self._checks_link = True  # whether to warn if nothing answers
         self.began = self._next_health = self._last_health = time.monotonic()
         self._totals_at_last_health: Counter[str] = Counter()
         self._sources = SourceSelector(SOURCE_TIMEOUT_S)
@@ -74,7 +76,7 @@ class ServiceLoop:
         try:
             while not self._stopping and not self.try_start():
                 self.inbox.get(HEALTH_PERIOD_S / 2)
-                self._heartbeat.beat({}, linked=self.bus.linked(), note="standing by", idle=True)
+                self._beat({}, note="standing by", idle=True)
             while not self._stopping:
                 self._step()
         finally:
@@ -186,11 +188,23 @@ class ServiceLoop:
             self._next_health = (now if late else self._next_health) + HEALTH_PERIOD_S
             health = self._health(now)
             self.publish(HEALTH, health)
-            self._heartbeat.beat(counts_of(health), linked=self.bus.linked(), note=health.note, idle=health.idle)
+            self._beat(counts_of(health), note=health.note, idle=health.idle)
             self._protocol_check.poll(self._config)
             if self._election is not None:
                 self._election.refresh()
             self._restore()
+
+    def _beat(self, counts: Mapping[str, Mapping[str, int]], *, note: str, idle: bool) -> None:
+        """Writes the heartbeat; warns once if nothing has answered at the address to connect to."""
+        linked, connect = self.bus.linked(), self.service.settings.connect
+        self._heartbeat.beat(counts, linked=linked, note=note, idle=idle)
+        if not connect or linked:
+            self._checks_link = False
+        elif self._checks_link and time.monotonic() - self.began > LINK_WARNING_DELAY_S:
+            self._checks_link = False
+            problem = f"nothing answers at {connect}"
+            advice = "start a session with `presage up`, or name its address with --connect"
+            self.service.log.warning(problem, advice=advice)
 
     def _accepts(self, sample: Sample) -> bool:
         """Whether a sample is from the selected source of its key; samples of a second source are ignored."""

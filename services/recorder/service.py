@@ -213,7 +213,7 @@ class RecorderService(Service):
         if self._has_messages_of_others() or (self.descriptions is not None and self.descriptions.present):
             self._checks_reception = False
             return "", ""
-        not_linked = self.options.connect and not self.loop.bus.linked()  # the start has warned of that
+        not_linked = self.options.connect and not self.loop.bus.linked()  # the loop warns of that
         if not_linked or open_for < SERVICE_WARNING_DELAY_S:
             return "", ""
         return f"no service of robot {self.options.robot} is running", "start one, or name another robot with --robot"

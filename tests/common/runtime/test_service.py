@@ -196,7 +196,7 @@ def test_without_a_router(process, free_port):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     running = process(SMALL, env={"PRESAGE_CONNECT": endpoint})
     running.wait_for("ready")
-    assert f"nothing answers at {endpoint}" in running.output
+    running.wait_for(f"nothing answers at {endpoint}")
     assert "start a session with `presage up`, or name its address with --connect" in running.output
     assert running.stop() == 0, running.output
 
