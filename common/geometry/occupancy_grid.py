@@ -19,6 +19,7 @@ import shapely
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from common.geometry.cell_distance import inner_distance, signed_distance
+from common.geometry.grid_values import values_at
 from common.geometry.se2 import rotate
 from common.limits import Angle, Coordinate
 
@@ -93,10 +94,7 @@ class OccupancyGrid(BaseModel):
     def values_at(self, points: Array) -> Cells:
         """(N,) values of the cells at points (N, 2) in m in map; UNKNOWN outside the grid."""
         column, row = np.floor(self.from_map(points) / self.resolution).astype(int).T
-        inside = (column >= 0) & (column < self.width) & (row >= 0) & (row < self.height)
-        found = np.full(len(inside), UNKNOWN, np.uint8)
-        found[inside] = self.values[row[inside], column[inside]]
-        return found
+        return values_at(self.values, row, column, np.uint8(UNKNOWN))
 
 
 @functools.lru_cache(MAX_CACHED_GRIDS)

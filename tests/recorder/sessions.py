@@ -108,10 +108,11 @@ def events() -> list[tuple[Topic, str, Stamped, int]]:
     return found
 
 
-def write(path: Path, *leave_out: Topic, world: bool = True) -> Path:
-    """The session as a recording, without some topics."""
+def write(path: Path, *leave_out: Topic, world: bool = True, metadata: dict[str, dict[str, str]] | None = None) -> Path:
+    """The session as a recording, without some topics, and with further ``metadata``."""
     writer = RecordingWriter(path)
-    writer.metadata("presage", {"robot": "robot"})
+    for name, values in {"presage": {"robot": "robot"}, **(metadata or {})}.items():
+        writer.metadata(name, values)
     if world:
         write_description(writer, "simulator", WorldReply(world=WORLD, scanner=SCANNER, robot=Robot(radius=0.3)))
     for topic, service, message, at in events():

@@ -16,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
+from common.geometry.grid_values import values_at
 from services.estimator.precise.field_tracing import mark_crossed, trace, trace_behind
 from services.estimator.shared.generative_models import Expected
-from services.estimator.shared.grid_values import values_at
 from services.estimator.shared.seen_cells import SEEN_CELL_M
 
 if TYPE_CHECKING:

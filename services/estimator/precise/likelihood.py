@@ -51,7 +51,7 @@ class Evidence:
 
     def at(self, row: int) -> Evidence:
         """Returns the evidence at one of the poses."""
-        return Evidence(*(values[row : row + 1] for values in vars(self).values()))
+        return self.part(np.array([row]))
 
     def scaled(self, factor: float) -> Evidence:
         """Returns the evidence with its derivatives, and the covariances of xi, multiplied by ``factor``."""

@@ -54,6 +54,11 @@ class MotionNoise:
     standing: float = 1e-4  # m and rad per scan: motion of a robot that stands still
     unexpected: float = 0.02  # probability (a guess) that odometry is wrong, and of a motion that nothing foretells
 
+    @property
+    def full_speed(self) -> Array:
+        """Full speed (3,) on each axis: m/s, m/s, rad/s."""
+        return np.array([self.speed, self.speed, self.turn])
+
     @classmethod
     def of_robot(cls, speed: float, turn: float, acceleration: float, turn_acceleration: float) -> MotionNoise:
         """The noise for a robot with these limits.
@@ -108,7 +113,7 @@ def predict_motion(
     in base_link. ``command`` and ``velocity`` (3,) are in m/s, m/s, rad/s in base_link; a command takes precedence over
     the velocity.
     """
-    full_speed = np.array([noise.speed, noise.speed, noise.turn]) * period
+    full_speed = noise.full_speed * period
     before = MotionCandidate(
         pose, covariance, 1.0, np.zeros((3, 3)) if pose_slip_cross_covariance is None else pose_slip_cross_covariance
     )
@@ -229,7 +234,7 @@ def widen_unobserved(
     The directions are unit vectors of x, y, yaw. The standard deviation grows in proportion to the number n of scans:
     (n + 1)² - n² = 2 n + 1.
     """
-    motion = directions.T @ directions * np.array([noise.speed, noise.speed, noise.turn]) * period
+    motion = directions.T @ directions * noise.full_speed * period
     return replace(candidate, covariance=candidate.covariance + (2 * scans + 1) * motion @ motion.T)
 
 

@@ -61,10 +61,10 @@ def acceleration_limits(noise: MotionNoise, times: Array, period: float) -> Arra
 
     In a long time before the sweep, the base cannot accelerate by more than from full speed backwards to forwards.
     """
-    speed, acceleration = np.array([noise.speed, noise.speed, noise.turn]), noise.acceleration
+    acceleration = noise.acceleration
     across = max(acceleration, noise.speed * noise.turn)
     during = np.array([acceleration, across, noise.turn_acceleration])
-    return np.array([np.minimum(during, 2 * speed / (period + float(times.min()))), during])
+    return np.array([np.minimum(during, 2 * noise.full_speed / (period + float(times.min()))), during])
 
 
 @dataclass(frozen=True)

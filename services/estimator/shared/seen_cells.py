@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numba
 import numpy as np
 
+from common.geometry.grid_values import values_at
 from common.geometry.occupancy_grid import UNKNOWN
-from services.estimator.shared.grid_values import values_at
 
 if TYPE_CHECKING:
     import numpy.typing as npt

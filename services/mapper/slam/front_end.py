@@ -65,7 +65,7 @@ VELOCITY_CHANGE_DEVIATION = np.array([1.0, 1.0, 3.0])
 VELOCITY_DEVIATION = np.array([1.0, 1.0, 1.5])
 STANDING_DEVIATION = np.array([0.002, 0.002, 0.002])  # m, m, rad: in addition to both
 MAX_VELOCITY = 3 * VELOCITY_DEVIATION  # a robot that seems to move faster was kidnapped
-# After a longer time between two scans, both in s and relative to the time before, the velocity is unknown.
+# The velocity is unknown after a period that exceeds both this time and this multiple of the period before.
 MAX_PERIOD_S, MAX_PERIOD_RATIO = 2.0, 5.0
 # Scans over which these deviations are learned, and the largest error that counts, in deviations.
 LEARNING_SCANS, MAX_LEARNED_SIGMAS = 100, 10.0
@@ -159,7 +159,7 @@ class FrontEnd:
         is the pose of base_link in odom, or None if it is unknown.
         """
         period = stamp - self.stamps[-1] if self.stamps else 0.0
-        clock_stepped = self._has_clock_stepped(period)
+        clock_stepped = self._update_period(period)
         if period < 0:
             period, self._odom = MAX_PERIOD_S, None
         motion, deviation = self._predict_motion(period, odom)
@@ -195,9 +195,13 @@ class FrontEnd:
             return self._add_suspect(scan, prior.mean)
         return self._add_unmatched(scan, prior.mean, is_key=shows_first_surfaces)
 
-    def _has_clock_stepped(self, period: float) -> bool:
-        """Whether ``period``, the time in s since the last scan, is unusual; if so, the velocity becomes unknown."""
-        if not 0 <= period <= max(MAX_PERIOD_S, MAX_PERIOD_RATIO * (self._period or period)):
+    def _update_period(self, period: float) -> bool:
+        """Stores the time in s since the last scan, or forgets the velocity if the clock stepped.
+
+        Returns whether it stepped.
+        """
+        usual = self._period
+        if period < 0 or (usual is not None and period > max(MAX_PERIOD_S, MAX_PERIOD_RATIO * usual)):
             self._velocity = None
             return True
         if self.stamps:

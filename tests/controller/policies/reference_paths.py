@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import coo_matrix
 
-STEPS = [(r, c) for r in range(-2, 3) for c in range(-2, 3) if 1 <= abs(r) + abs(c) <= 3 and max(abs(r), abs(c)) < 3]
-MOVES = [(r, c) for r, c in STEPS if np.gcd(r, c) == 1]
+MOVES = [(r, c) for r in range(-2, 3) for c in range(-2, 3) if np.gcd(r, c) == 1]
 
 
 def moves(cell_cost: np.ndarray) -> coo_matrix:

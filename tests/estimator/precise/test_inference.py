@@ -16,6 +16,7 @@ from services.estimator.precise import beam_sums, global_seeds
 from services.estimator.precise.gauss_newton import MAX_STEP, Prior
 from services.estimator.precise.global_seeds import Seeds, thin_places
 from services.estimator.precise.hypotheses import (
+    MAX_HYPOTHESES,
     SURROUNDINGS_TRANSITIONS,
     TrackedHypothesis,
     UnknownPlace,
@@ -330,6 +331,8 @@ def test_hypothesis_weights():
     assert unknown / (1 - unknown) == pytest.approx(np.exp(-2) / (1 + np.exp(-1)))
     (best,), unknown = weigh(hypotheses[1:2], 5000.0)
     assert best.weight == unknown == 1
+    places = [make_hypothesis(float(x), -0.1 * x) for x in range(MAX_HYPOTHESES + 1)]
+    assert [each.pose[0] for each in weigh(places, -2.0)[0]] == list(range(MAX_HYPOTHESES))
 
 
 def test_unobserved_directions():

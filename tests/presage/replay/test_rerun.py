@@ -15,7 +15,7 @@ from rich.console import Console
 from common.errors import UserError
 from common.geometry import se2
 from common.messages.definitions import Belief, Pose
-from common.messages.topics import BELIEF, PREDICTION, SCAN, TRUTH, topic_of
+from common.messages.topics import BELIEF, PREDICTION, SCAN, TRUTH
 from presage.recordings.selection import robot_of
 from presage.replay import rerun as shell
 from presage.replay.estimator_comparison import BeliefSeries, compare
@@ -119,19 +119,11 @@ def test_missing_weights_name_no_temporary_file(session):
         assert "presage-" not in str(error.value)
 
 
-def test_settings_that_differ_are_named(session, tmp_path):
-    first, second, console = tmp_path / "first.mcap", tmp_path / "second.mcap", quiet()
-    rerun_command(RerunOptions(session, EXACT, first), None, quiet())
-    with_config = RecordingWriter(tmp_path / "config.mcap")
-    recording = read_recording(session)
-    for name, values in recording.metadata.items():
-        with_config.metadata(name, values)
-    for name, data in recording.attachments.items():
-        with_config.attachment(name, data, "application/yaml", 0)
-    with_config.metadata("config:estimator", {"config": json.dumps({**EXACT, "world": "hall", "sigma": 0.02})})
-    for raw in recording.payloads():
-        with_config.write(topic_of(raw.key), raw.key, raw.payload, raw.published_ns, raw.logged_ns)
-    rerun_command(RerunOptions(with_config.finish(), {"sigma": 0.05, "alpha": 0.1}, second), None, console)
+def test_settings_that_differ_are_named(tmp_path):
+    console, config = quiet(), json.dumps({**EXACT, "world": "hall", "sigma": 0.02})
+    recording = made.write(tmp_path / "config.mcap", metadata={"config:estimator": {"config": config}})
+    options = RerunOptions(recording, {"sigma": 0.05, "alpha": 0.1}, tmp_path / "out.mcap")
+    rerun_command(options, None, console)
     text = console.file.getvalue()
     assert "new: precise, sigma 0.05" in text
     assert "warning: alpha applies only to preset paper; ignored" in text

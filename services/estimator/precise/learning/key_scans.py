@@ -125,10 +125,10 @@ class KeyScanCollector:
 
     def take_drive(self) -> ReferenceDrive | None:
         """Returns the verified key scans in order of time if enough of them are new since the last time, else None."""
-        keys = self._in_order()
-        new = sum(key.stamp > self._taken_until for key in keys)
-        if len(keys) < MIN_KEY_SCANS or new < max(MIN_NEW, MIN_NEW_FRACTION * len(keys)):
+        count, new = len(self.verified), sum(key.stamp > self._taken_until for key in self.verified.values())
+        if count < MIN_KEY_SCANS or new < max(MIN_NEW, MIN_NEW_FRACTION * count):
             return None
+        keys = self._in_order()
         self._taken_until = keys[-1].stamp
         return ReferenceDrive(
             np.array([key.stamp for key in keys]),

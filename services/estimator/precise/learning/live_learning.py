@@ -179,4 +179,4 @@ def _match_key_scans(model: GenerativeModel, keys: ReferenceDrive, priors: Array
     for pose, prior, ranges in zip(keys.poses, priors, keys.ranges, strict=True):
         scan = ScanLikelihood(model, likelihood, keys.mount, keys.angles, ranges.astype(float), keys.range_max)
         poses.append(scan.descend(pose[None], Prior(prior[None], information), ALIGNMENT_SCHEDULE_M)[0][0])
-    return replace(keys, poses=np.array(poses).reshape(-1, 3))
+    return replace(keys, poses=np.array(poses))

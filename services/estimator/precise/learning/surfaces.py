@@ -11,10 +11,10 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from common.errors import UserError
+from common.geometry.grid_values import are_inside, values_at
 from common.geometry.se2 import Array, compose
 from services.estimator.precise.field import DistanceField, Floats
 from services.estimator.precise.learning.beam_cells import count_crossings
-from services.estimator.shared.grid_values import values_at
 
 BEAMS_AT_ONCE = 2_000_000  # processed together, which limits memory
 MAX_CELLS = 100_000_000  # 250 000 m² in cells of 5 cm, which need 6 GB
@@ -148,7 +148,7 @@ class SurfaceCells:
         """Mask (rows, columns) of cells whose surface element is absent: most beams that meet it pass through it."""
         crossed = _pooled(self.crossings(beams))
         row, column = self._cells_at(beams.ends())
-        inside = (row >= 0) & (column >= 0) & (row < self.counts.shape[0]) & (column < self.counts.shape[1])
+        inside = are_inside(self.counts.shape, row, column)
         ended = np.zeros(self.counts.shape)
         np.add.at(ended, (row[inside], column[inside]), 1.0)
         ended = _pooled(ended)
@@ -197,7 +197,7 @@ def _distances(cells: SurfaceCells, surface: npt.NDArray[np.bool_]) -> Floats:
     for di in range(-span, span + 1):
         for dj in range(-span, span + 1):
             i, j = rows + di, columns + dj
-            inside = (i >= 0) & (j >= 0) & (i < surface.shape[0]) & (j < surface.shape[1])
+            inside = are_inside(surface.shape, i, j)
             x, y = j * cell_m - mean_x, i * cell_m - mean_y
             square = (x**2 + y**2) / cell_m**2
             w = np.where(inside & (square < ELEMENT_RADIUS_CELLS**2), np.exp(-1.5 * square) * element_weight, 0.0)
