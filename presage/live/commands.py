@@ -132,12 +132,13 @@ class _Progress:
             return True  # to a lift or in it, which may take long
         # In other states the pose may jump while the robot stands.
         place = belief.pose.array()[:2] if belief is not None and belief.state == "tracking" else None
-        nearer = status.distance is not None and status.distance < self._least_distance - MIN_APPROACH_M
+        distance = np.inf if status.distance is None else status.distance
+        nearer = distance < self._least_distance - MIN_APPROACH_M
         moved = place is not None and (self._place is None or np.hypot(*(place - self._place)) > MIN_MOTION_M)
-        if nearer and status.distance is not None:
-            self._least_distance = status.distance
-        if nearer or moved:
-            self._place = self._place if place is None else place
+        if nearer:
+            self._least_distance = distance
+        if (nearer or moved) and place is not None:
+            self._place = place
         return bool(nearer or moved)
 
 
