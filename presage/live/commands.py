@@ -306,7 +306,7 @@ def relocalise(link: Link, pose: Pose | None, console: Console, *, heading_known
     late = "" if belief.state == "tracking" else f" after {LOCALISATION_TIMEOUT_S:g} s, most probably"
     console.print(f"{belief.state}{late} at ({x:.3f}, {y:.3f}), {yaw:.1f} deg in the map", highlight=False)
     if pose and heading_known and belief.estimator == "paper":
-        console.print(f"preset paper assumes this heading, and did not use {np.rad2deg(pose.yaw):g} deg")
+        console.print(f"preset paper knows only this heading; the {np.rad2deg(pose.yaw):g} deg given were not used")
     return 0 if belief.state == "tracking" else 1
 
 
