@@ -95,13 +95,13 @@ def session_of(robot: str, connect: str = "") -> RunningSession | None:
     return next(found, None)
 
 
-def start_command(service: str, robot: str, connect: str = "") -> str:
-    """The shell command that starts a service, with the options that its session was started with if they are known.
+def start_command(service: str, robot: str, connect: str, session: RunningSession | None) -> str:
+    """The shell command that starts a service, with the options that its ``session`` was started with if it is known.
 
     Otherwise, a comment at its end says which options must be those of the session. ``connect``: endpoints, or empty
     for the default.
     """
-    if (session := session_of(robot, connect)) is not None and (command := session.start_command(service, robot)):
+    if session is not None and (command := session.start_command(service, robot)):
         return command
     if service == "router":
         return "python -m common.router"
@@ -115,7 +115,6 @@ def start_command(service: str, robot: str, connect: str = "") -> str:
     return command
 
 
-def is_left_out(service: str, robot: str, connect: str = "") -> bool:
+def is_left_out(service: str, robot: str, session: RunningSession | None) -> bool:
     """Whether the robot's session was started without the service, as with `presage up --no-viewer`."""
-    session = session_of(robot, connect)
     return session is not None and not session.start_command(service, robot)

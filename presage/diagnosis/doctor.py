@@ -33,7 +33,7 @@ def check_session(link: Link, seconds: float) -> Iterator[Finding]:
         for finding in evaluate_observation(observation, build_config_reply("doctor", "{}")):
             is_missing = finding.code == "missing" and not finding.ok
             stopped = list(find_stopped_processes(finding.where)) if is_missing else []
-            yield from stopped or [finding]  # it is to be resumed, not started again
+            yield from stopped or [finding]  # a stopped process must be resumed, not started again
     else:
         yield from observation
 

@@ -9,7 +9,7 @@ from statistics import median
 from common.messages.definitions import Health, Scan, Stamped
 from common.messages.topics import BELIEF, CMD_VEL, HEALTH, SCAN, Topic, expected_rate, topic_of
 from common.runtime.service_monitor import ServiceMonitor, ServiceStatus
-from common.runtime.session_files import is_left_out, start_command
+from common.runtime.session_files import RunningSession, is_left_out, session_of, start_command
 
 LATENCY_WINDOW = 45  # number of messages whose median latency is shown: 3 s
 MIN_RATE_SHARE = 0.8  # share of the nominal rate below which a topic counts as slow
@@ -75,17 +75,20 @@ class HealthBoard:
 
     def rows(self, now: float) -> list[ServiceRow]:
         """One row for each service: first those that every session has, then the others by name."""
-        return [self._row(service) for service in self.monitor.services(now) if not self._is_left_out(service)]
+        services = self.monitor.services(now)
+        absent = any(service.state == "absent" for service in services)
+        session = session_of(self.robot, self.connect) if absent else None
+        return [self._row(service, session) for service in services if not self._is_left_out(service, session)]
 
-    def _is_left_out(self, service: ServiceStatus) -> bool:
+    def _is_left_out(self, service: ServiceStatus, session: RunningSession | None) -> bool:
         """Whether the session was started without a service that the robot does not need."""
         never_seen = service.state == "absent" and service.since is None and not service.problem
-        return never_seen and is_left_out(service.name, self.robot, self.connect)
+        return never_seen and is_left_out(service.name, self.robot, session)
 
-    def _row(self, service: ServiceStatus) -> ServiceRow:
+    def _row(self, service: ServiceStatus, session: RunningSession | None) -> ServiceRow:
         if service.state == "absent":
             word = "gone" if service.since is not None else "missing" if service.problem else "not running"
-            start = f"start it: {start_command(service.name, self.robot, self.connect)}"
+            start = f"start it: {start_command(service.name, self.robot, self.connect, session)}"
             return ServiceRow(service, word, note=start)
         if service.state == "silent":
             return ServiceRow(service, "silent", note=service.text)

@@ -39,10 +39,7 @@ def _check_caches() -> Iterator[Finding]:
     for cache in [Path(chosen)] if chosen else [services / "estimator", services / "controller"]:
         if problem := find_write_error(_nearest_existing(cache)):
             what = f"compiled code cannot be cached in {cache}: {problem}"
-            advice = (
-                "estimator and controller compile their code again at each start; "
-                "set NUMBA_CACHE_DIR to a writable folder"
-            )
+            advice = "services compile their code again at each start; set NUMBA_CACHE_DIR to a writable folder"
             yield Finding("not_writable", None, what, str(cache), advice)
             break  # the advice is the same for the other
     if SHARED_MEMORY.is_dir() and (problem := find_write_error(SHARED_MEMORY)):

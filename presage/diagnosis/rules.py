@@ -15,7 +15,7 @@ from common.messages.topics import BELIEF, CMD_VEL, PREDICTION, SCAN, TOPICS, TR
 from common.robot.scan_geometry import Sweep
 from common.runtime.protocol_check import describe_version_differences, same_protocol
 from common.runtime.service_monitor import REPLAY, REQUIRED_SERVICES, SUBSTITUTES
-from common.runtime.session_files import is_left_out, start_command
+from common.runtime.session_files import is_left_out, session_of, start_command
 from presage.diagnosis.bus_observation import BusObservation
 from presage.diagnosis.findings import Finding
 from presage.diagnosis.health_board import MIN_RATE_SHARE
@@ -44,6 +44,7 @@ def evaluate_observation(observation: BusObservation, own_config: ConfigReply) -
 
 def _presence(observation: BusObservation) -> Iterator[Finding]:
     services = observation.monitor.services(observation.seconds)
+    session = session_of(observation.robot, observation.connect)
     others = observation.robots - {observation.robot}
     if others and all(service.state == "absent" for service in services):
         what = (
@@ -55,10 +56,10 @@ def _presence(observation: BusObservation) -> Iterator[Finding]:
         if _substitute(observation, service.name):
             continue
         if service.state == "absent":
-            advice = f"start it with: {start_command(service.name, observation.robot, observation.connect)}"
             needed = service.name in observation.monitor.missing(observation.seconds)
-            if not needed and is_left_out(service.name, observation.robot, observation.connect):
+            if not needed and is_left_out(service.name, observation.robot, session):
                 continue
+            advice = f"start it with: {start_command(service.name, observation.robot, observation.connect, session)}"
             yield Finding("missing", False if needed else None, f"{name}: not running", service.name, advice)
         elif service.state == "silent":
             advice = "see its log; resume it or restart it"

@@ -123,7 +123,7 @@ def _table(board: HealthBoard, now: float) -> Table:
     table = Table(title=f"robot {board.robot}", title_justify="left")
     for column in COLUMNS:
         left = column in LEFT_ALIGNED
-        # Commands in notes may have long words, which are else cut off.
+        # Commands in notes may have long words, which would otherwise be cut off.
         table.add_column(column, justify="left" if left else "right", no_wrap=not left, overflow="fold")
     for row in board.rows(now):
         table.add_row(*_cells(row), style="dim" if row.state == "not running" else "")

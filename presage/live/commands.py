@@ -132,12 +132,13 @@ class _Progress:
             return True  # to a lift or in it, which may take long
         # In other states the pose may jump while the robot stands.
         place = belief.pose.array()[:2] if belief is not None and belief.state == "tracking" else None
-        nearer = status.distance is not None and status.distance < self._least_distance - MIN_APPROACH_M
+        distance = np.inf if status.distance is None else status.distance
+        nearer = distance < self._least_distance - MIN_APPROACH_M
         moved = place is not None and (self._place is None or np.hypot(*(place - self._place)) > MIN_MOTION_M)
-        if nearer and status.distance is not None:
-            self._least_distance = status.distance
-        if nearer or moved:
-            self._place = self._place if place is None else place
+        if nearer:
+            self._least_distance = distance
+        if (nearer or moved) and place is not None:
+            self._place = place
         return bool(nearer or moved)
 
 
@@ -305,7 +306,7 @@ def relocalise(link: Link, pose: Pose | None, console: Console, *, heading_known
     late = "" if belief.state == "tracking" else f" after {LOCALISATION_TIMEOUT_S:g} s, most probably"
     console.print(f"{belief.state}{late} at ({x:.3f}, {y:.3f}), {yaw:.1f} deg in the map", highlight=False)
     if pose and heading_known and belief.estimator == "paper":
-        console.print(f"preset paper assumes this heading, and did not use {np.rad2deg(pose.yaw):g} deg")
+        console.print(f"preset paper knows only this heading; the {np.rad2deg(pose.yaw):g} deg given were not used")
     return 0 if belief.state == "tracking" else 1
 
 

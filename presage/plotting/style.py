@@ -124,5 +124,9 @@ def legend_below(figure: Figure, *panels: Axes) -> None:
 def log_metres(axes: Axes, axis: str = "y") -> None:
     """Makes an axis logarithmic with labels such as 0.01 instead of 10^-2."""
     axes.set(**{f"{axis}scale": "log"})
-    plain = FuncFormatter(lambda value, _: f"{value:g}")
-    (axes.yaxis if axis == "y" else axes.xaxis).set_major_formatter(plain)
+    (axes.yaxis if axis == "y" else axes.xaxis).set_major_formatter(FuncFormatter(_tick))
+
+
+def _tick(value: float, _: int | None) -> str:
+    """A number without an exponent, such as 0.00001."""
+    return np.format_float_positional(value, precision=6, fractional=False, trim="-")

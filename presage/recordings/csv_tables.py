@@ -127,8 +127,9 @@ class _TopicLayout:
 
     def __init__(self, topic: Topic) -> None:
         self.name, self.columns = topic.name, columns_of(topic.message)
-        kinds = [(name, kind) for name, kind, _ in fields_of(topic.message)]
-        self.meanings = comments(topic.message)  # of the fields
+        fields = list(fields_of(topic.message))
+        kinds = [(name, kind) for name, kind, _ in fields]
+        self.meanings = {name: meaning for name, _, meaning in fields}
         fixed = {column.name.split(".")[0] for column in self.columns}
         self.arrays = [name for name, kind in kinds if isinstance(kind, Binary) and name not in fixed]
         self.lists = {name: columns_of(get_args(kind)[0]) for name, kind in kinds if get_origin(kind) is list}

@@ -11,7 +11,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle as Disc
 from matplotlib.patches import Polygon as Patch
-from matplotlib.ticker import FuncFormatter
 from matplotlib.transforms import ScaledTranslation
 from rich.console import Console
 
@@ -23,7 +22,7 @@ from common.robot.ranges import is_surface
 from common.runtime import safety
 from common.versions import commit
 from presage.plotting.maps import draw_walls
-from presage.plotting.style import save_figure
+from presage.plotting.style import log_metres, save_figure
 from presage.recordings.recorded_session import RecordedSession, load_session
 from presage.recordings.session_summary import print_summary, summarise, summary_of
 from presage.terminal.output import check_file, write_json
@@ -33,7 +32,7 @@ TRUTH, BELIEF, MEASURED, GOAL = "#000000", "#D55E00", "#0072B2", "#009E73"
 WALL, FURNITURE, INK = "#8C8C8C", "#C8C8C8", "#555555"
 FORMATS = (".png", ".pdf", ".svg")
 MAX_TIES = 200  # lines between belief and truth
-MIN_LOG_VALUE = 1e-5  # m, smallest error on the logarithmic axis
+MIN_ERROR_M = 1e-5  # m, smallest error on the logarithmic axis
 
 
 def draw_session(path: Path, png: Path, *, title: str | None = None) -> None:
@@ -100,11 +99,6 @@ def _headline(session: RecordedSession) -> str:
 
 def _length(metres: float) -> str:
     return f"{metres * 1e3:.1f} mm" if metres < 0.1 else f"{metres:.2f} m"
-
-
-def _tick(value: float, _: int | None) -> str:
-    """The label of a power of ten, such as 0.00001."""
-    return np.format_float_positional(value, precision=1, fractional=False, trim="-")
 
 
 def _missing(axes: Axes, what: str) -> None:
@@ -249,19 +243,19 @@ def _draw_errors(axes: Axes, session: RecordedSession) -> None:
         _missing(axes, "truth beside beliefs")
         return
     time = session.belief.stamps_ns * 1e-9
-    axes.semilogy(time[known], np.maximum(errors[known], MIN_LOG_VALUE), color=BELIEF, lw=1.4, label="position error")
+    log_metres(axes)
+    axes.plot(time[known], np.maximum(errors[known], MIN_ERROR_M), color=BELIEF, lw=1.4, label="position error")
     if goal is not None:
         stamps = session.truth.stamps_ns
         distance = np.hypot(*(session.truth.poses - goal.pose.array())[:, :2].T)
         navigating = stamps >= session.goal_times_ns[-1]
-        shown = np.maximum(distance[navigating], MIN_LOG_VALUE)
-        axes.semilogy(stamps[navigating] * 1e-9, shown, color=GOAL, lw=1.4, label="distance to goal")
+        shown = np.maximum(distance[navigating], MIN_ERROR_M)
+        axes.plot(stamps[navigating] * 1e-9, shown, color=GOAL, lw=1.4, label="distance to goal")
     _mark_moments(axes, session)
     _style_axes(axes, "d", "position error and distance to goal")
     low, high = axes.get_ylim()
     if high < 2 * low:  # the curves are almost constant: avoid an axis that shows rounding errors
         axes.set_ylim(low / 2, 2 * high)
-    axes.yaxis.set_major_formatter(FuncFormatter(_tick))
     axes.grid(visible=True, which="minor", color="#EEEEEE", linewidth=0.4)
     axes.set(xlabel="time (s)", ylabel="distance (m)")
     axes.legend(fontsize=8.5, frameon=False, labelspacing=0.2)

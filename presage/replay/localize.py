@@ -7,7 +7,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import ExitStack, closing, contextmanager, nullcontext
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TextIO, get_args
@@ -139,11 +139,9 @@ def run_estimator(
 ) -> Iterator[TimedBelief]:
     """Yields the belief after each scan, from ``start`` (3,) or (2,), or from an unknown pose.
 
-    With ``independent_scans``, every later scan starts from it again.
+    With ``independent_scans``, every later scan starts from it again. Call `check_scans` before.
     """
     for k, scan in enumerate(scans):
-        if k == 0:
-            estimator.check(scan)
         must_restart = independent_scans if k > 0 else start is not None
         if must_restart:
             estimator.restart(start)
@@ -167,7 +165,14 @@ def prepare_estimator(estimator_options: EstimatorOptions, console: Console) -> 
         )
 
 
-def heading_warning(estimator: Estimator, scans: Scans) -> str:
+def check_scans(estimator: Estimator, scans: Scans, console: Console) -> None:
+    """Raises UserError if the estimator cannot process the scans, and warns if their poses will be wrong."""
+    estimator.check(scans[0])
+    if warning := _heading_warning(estimator, scans):
+        console.print(warning, highlight=False, soft_wrap=True)
+
+
+def _heading_warning(estimator: Estimator, scans: Scans) -> str:
     """A warning if the robot has another heading than the one that the estimator assumes; "" if it has not.
 
     Uses the truth; without it the odometry, with a first heading that is assumed to be right.
@@ -214,9 +219,7 @@ def localize(options: LocalizeOptions, console: Console) -> list[dict[str, Any]]
     if scans.stamps is None and options.out is not None and options.out.suffix == ".tum":
         raise UserError(f"{options.file}: its scans have no stamps, which a trajectory needs: choose .csv or .json")
     start, count = _start(options, scans), len(scans)
-    estimator.check(scans[0])
-    if warning := heading_warning(estimator, selected):
-        console.print(warning, highlight=False, soft_wrap=True)
+    check_scans(estimator, selected, console)
     rows: list[dict[str, Any]] = []
     try:
         found = run_estimator(estimator, scans, independent_scans=options.mode == "single", start=start)
@@ -309,10 +312,7 @@ def _output(options: LocalizeOptions, count: int) -> Iterator[Callable[[dict[str
                     poses = np.array([[row["x"], row["y"], row["yaw"]] for row in rows]).reshape(-1, 3)
                     write_tum(out, np.array([row["stamp"] for row in rows]), poses, options.frame)
         return
-    with ExitStack() as stack:
-        stream: TextIO = sys.stdout
-        if options.out is not None:
-            stream = stack.enter_context(_closing_named(options.out))
+    with nullcontext(sys.stdout) if options.out is None else _closing_named(options.out) as stream:
         writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
         writer.writeheader()
 

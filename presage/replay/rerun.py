@@ -29,14 +29,15 @@ from common.messages.definitions import Belief, Prediction, Scan, Stamped
 from common.messages.topics import BELIEF, PREDICTION, SCAN, Topic, topic_of
 from common.messages.wire import DecodeError
 from common.versions import versions
+from presage.estimator import Estimator
 from presage.logs.scan_files import Scans, read_scans
 from presage.recordings.selection import robot_of
 from presage.replay.estimator_comparison import BeliefSeries, compare, comparison_table, draw_comparison
-from presage.replay.localize import TimedBelief, heading_warning, prepare_estimator, run_estimator
+from presage.replay.localize import TimedBelief, check_scans, prepare_estimator, run_estimator
 from presage.replay.recorded_settings import estimator_settings, recorded_settings, settings_with
 from presage.terminal.output import check_file, provenance, write_json
 from presage.terminal.progress import progress
-from services.estimator.factory import EstimatorOptions, check_options
+from services.estimator.factory import EstimatorOptions, check_start
 from services.estimator.service import belief_message, estimator_options, prediction_message
 from services.estimator.settings import EstimatorSettings, ignored_settings
 from services.recorder.files.writer import RecordingWriter
@@ -81,13 +82,13 @@ def rerun_command(options: RerunOptions, json_file: Path | None, console: Consol
         for beside in (".png", ".pdf", ".csv"):
             check_file(out.with_suffix(beside), "--out")
         chosen = estimator_options(settings)
-        if "world" not in options.chosen:
-            chosen = _with_recorded_world(chosen, recording)
-        estimator, all_scans = prepare_estimator(chosen, console), read_scans(options.file)
+        if "world" in options.chosen:
+            estimator = prepare_estimator(chosen, console)
+        else:
+            estimator = _prepare_for_recorded_world(chosen, recording, console)
+        all_scans = read_scans(options.file)
+        check_scans(estimator, all_scans, console)
         scans = all_scans.with_prior(settings.prior)
-        estimator.check(scans[0])
-        if warning := heading_warning(estimator, all_scans):
-            console.print(warning, highlight=False, soft_wrap=True)
         localised = run_estimator(estimator, scans, start=chosen.initial_pose)
         with closing(progress(localised, "localising", len(scans), console)) as shown:
             old, new = write_recording(recording, robot, settings, scans, shown, out)
@@ -118,14 +119,16 @@ def settings_of(recording: Recording, chosen: dict[str, Any], folder: Path, cons
     return settings_with(EstimatorSettings, values)
 
 
-def _with_recorded_world(chosen: EstimatorOptions, recording: Recording) -> EstimatorOptions:
-    """The same options with the loaded world, so that messages do not name its file in the temporary folder.
+def _prepare_for_recorded_world(chosen: EstimatorOptions, recording: Recording, console: Console) -> Estimator:
+    """The chosen estimator for the recorded world; messages do not name the file of that in the temporary folder.
 
     Raises UserError if weights are missing.
     """
-    chosen = replace(chosen, world=chosen.loaded_world)
+    world = chosen.loaded_world
+    chosen = replace(chosen, world=world)
     try:
-        check_options(chosen, chosen.loaded_world)
+        check_start(chosen.initial_pose, world)
+        return prepare_estimator(chosen, console)
     except UserError as error:
         if chosen.world_argument in known_worlds():
             raise
@@ -134,7 +137,6 @@ def _with_recorded_world(chosen: EstimatorOptions, recording: Recording) -> Esti
             f"{error} ({chosen.world_argument} is the session's world, which {recording.path} contains as attachment "
             f"{attached})"
         ) from None
-    return chosen
 
 
 def changes_text(recording: Recording, settings: EstimatorSettings, chosen: Collection[str]) -> str:

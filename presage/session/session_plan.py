@@ -59,18 +59,20 @@ def plan_session(
     simulator_settings = load_settings(SimulatorSettings, simulator_args)
     estimator_settings = load_settings(EstimatorSettings, estimator_args)
     # Estimator paper localises at one heading only, which its controller keeps.
-    if estimator_settings.estimator == "paper" and not mapping:
-        if load_settings(ControllerSettings, controller_args).drive != "holonomic":
-            raise UserError(
-                "estimator paper needs a robot that moves without turning: set drive to holonomic, or choose another "
-                "estimator"
-            )
+    fixed_heading = estimator_settings.estimator == "paper" and not mapping
+    if fixed_heading:
         controller_args += arguments(preset="paper")
     if mapping:
         simulator_args += arguments(hide_world=True)
     if simulator_settings.pace == "lockstep":
         controller_args += arguments(belief_timeout=LOCKSTEP_BELIEF_TIMEOUT_S)
-    load_settings(ControllerSettings, controller_args).check()
+    controller_settings = load_settings(ControllerSettings, controller_args)
+    if fixed_heading and controller_settings.drive != "holonomic":
+        raise UserError(
+            "estimator paper needs a robot that moves without turning: set drive to holonomic, or choose another "
+            "estimator"
+        )
+    controller_settings.check()
     loaded_world = load_world(estimator_settings.world)
     if simulated:
         simulator_settings.build_scanner()

@@ -66,12 +66,14 @@ class CommandWithNumbers(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parses the command line. Raises UserError for an unknown option."""
         ctx.ignore_unknown_options = True
-        program = ctx.find_root().command_path
+        root = ctx.find_root()
+        program = root.command_path
+        before = {name for parameter in root.command.params if not parameter.is_flag for name in parameter.opts}
         known = {name for parameter in self.get_params(ctx) for name in (*parameter.opts, *parameter.secondary_opts)}
         for word in args:
             name = word.split("=", maxsplit=1)[0]
             if name.startswith("--") and len(name) > 2 and name not in known:
-                if name in {"--connect", "--robot"}:
+                if name in before:
                     command = ctx.command_path.removeprefix(program)
                     raise UserError(f"{name} stands before the command, as in {program} {name} NAME{command}")
                 similar = similar_key(name, known)

@@ -45,7 +45,7 @@ from common.messages.topics import (
     Query,
     Topic,
 )
-from common.runtime.session_files import start_command
+from common.runtime.session_files import session_of, start_command
 from services.viewer import visitor_requests as requests
 from services.viewer.state.roster import Roster
 
@@ -119,7 +119,7 @@ class RobotControl:
 
     def _check_running(self, robot: str, service: str) -> None:
         if service not in self._roster.services(robot):
-            start = start_command(service, robot, self._connect)
+            start = start_command(service, robot, self._connect, session_of(robot, self._connect))
             raise UserError(f"the {service} is not running; start it with: {start}")
 
     def _check_controller(self, robot: str, topic: Topic) -> None:

@@ -22,7 +22,7 @@ from common.messages.topics import MAP, SCAN, Topic
 from common.messages.wire import DecodeError
 from common.runtime.service import Service
 from common.runtime.service_monitor import ServiceMonitor
-from common.runtime.session_files import start_command
+from common.runtime.session_files import session_of, start_command
 from common.versions import versions
 from services.viewer.control import RobotControl, RobotLookup
 from services.viewer.playback import Playback
@@ -247,10 +247,13 @@ class ViewerService(Service):
         now, linked, monitor = time.monotonic(), self.loop.bus.linked(), followed.monitor
         monitor.set_alive(self.roster.services(robot), now)
         missing = [*([] if linked else ["router"]), *monitor.missing(now)]
+        session = session_of(robot, self._connect) if missing else None
         message = {
             "type": "services",
             "services": rows_of(monitor, now),
-            "missing": [{"name": name, "start": start_command(name, robot, self._connect)} for name in missing],
+            "missing": [
+                {"name": name, "start": start_command(name, robot, self._connect, session)} for name in missing
+            ],
             "linked": linked,
         }
         return json.dumps(message)

@@ -135,7 +135,7 @@ def test_up_with_page_and_dead_service(up):
     running.wait_for("estimator ended with status -9")
     assert "python -m services.estimator" in running.output
     (session,) = running_sessions()
-    command = start_command("estimator", session.robots[0], session.endpoint)
+    command = start_command("estimator", session.robots[0], session.endpoint, session)
     assert f"again with: {command}" in running.output
     assert "PRESAGE_VIEWER_PORT=0" in command
     assert command.endswith("python -m services.estimator --world=corridor")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from common.bus.bus import DEFAULT_ENDPOINT
-from common.runtime.session_files import is_left_out, session_file, start_command
+from common.runtime.session_files import is_left_out, session_file, session_of, start_command
 
 ELSEWHERE = "tcp/127.0.0.1:7001"
 COMMANDS = {
@@ -13,6 +13,10 @@ COMMANDS = {
     "estimator": "python -m services.estimator --world=office --estimator=particle-filter",
     "two/simulator": "python -m services.simulator --robot two --world=office",
 }
+
+
+def command_of(service, robot, connect=""):
+    return start_command(service, robot, connect, session_of(robot, connect))
 
 
 @pytest.mark.parametrize(
@@ -24,17 +28,18 @@ COMMANDS = {
     ],
 )
 def test_start_commands_without_a_session(service, robot, connect, command):
-    assert start_command(service, robot, connect) == command
-    assert not is_left_out(service, robot, connect)
+    assert command_of(service, robot, connect) == command
+    assert not is_left_out(service, robot, session_of(robot, connect))
 
 
 def test_start_commands_of_a_session():
     with session_file(ELSEWHERE, ["one", "two"], None, COMMANDS):
-        assert start_command("estimator", "two", ELSEWHERE) == COMMANDS["estimator"]  # one for both robots
-        assert start_command("simulator", "one", ELSEWHERE) == COMMANDS["simulator"]
-        assert start_command("simulator", "two", ELSEWHERE) == COMMANDS["two/simulator"]
+        assert command_of("estimator", "two", ELSEWHERE) == COMMANDS["estimator"]  # one for both robots
+        assert command_of("simulator", "one", ELSEWHERE) == COMMANDS["simulator"]
+        assert command_of("simulator", "two", ELSEWHERE) == COMMANDS["two/simulator"]
         other = [("simulator", "one", ""), ("simulator", "three", ELSEWHERE), ("mapper", "one", ELSEWHERE)]
-        assert not {start_command(*each) for each in other} & set(COMMANDS.values())
-        assert [is_left_out(name, "one", ELSEWHERE) for name in ("viewer", "estimator")] == [True, False]
+        assert not {command_of(*each) for each in other} & set(COMMANDS.values())
+        session = session_of("one", ELSEWHERE)
+        assert [is_left_out(name, "one", session) for name in ("viewer", "estimator")] == [True, False]
     with session_file(DEFAULT_ENDPOINT, ["one"], None, COMMANDS):
-        assert start_command("simulator", "one") == COMMANDS["simulator"]
+        assert command_of("simulator", "one") == COMMANDS["simulator"]

@@ -13,4 +13,4 @@ def test_unwritable_caches_of_compiled_code(unwritable, tmp_path, monkeypatch):
     monkeypatch.setattr(machine, "find_write_error", lambda path: "read-only" if path.name in unwritable else "")
     (problem,) = [each for each in machine.check_machine(tmp_path) if each.ok is None]
     assert "compiled code cannot be cached in" in problem.what
-    assert problem.advice.startswith("estimator and controller compile their code again at each start")
+    assert problem.advice.startswith("services compile their code again at each start")

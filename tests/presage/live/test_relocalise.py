@@ -58,7 +58,7 @@ def test_heading_that_is_not_used(bus, link):
     estimator.join()
     assert console.file.getvalue().splitlines()[1:] == [
         "tracking at (3.000, 1.500), 90.0 deg in the map",
-        "preset paper assumes this heading, and did not use 0 deg",
+        "preset paper knows only this heading; the 0 deg given were not used",
     ]
 
 
