@@ -120,7 +120,7 @@ def _follow(messages: LatestMessages, goal: Goal, console: Console) -> int:
 
 
 class _Progress:
-    """Finds out whether the robot gets nearer to its goal, or elsewhere."""
+    """Detects whether the robot comes nearer to its goal, or has moved far."""
 
     def __init__(self) -> None:
         self._least_distance = np.inf
