@@ -141,6 +141,22 @@ def turn_rate(angle: float, robot: Robot, hold: float = STEP_S) -> float:
     return float(np.sign(angle) * min(robot.max_turn, rate))
 
 
+def turn_rate_while_moving(
+    lookahead: Array, speed: Array | float, robot: Robot, forward: float = 0.0, hold: float = HOLD_S
+) -> Array:
+    """Turn rates (...,) rad/s of a holonomic base that moves at ``speed`` (...,) m/s.
+
+    The side at bearing ``forward`` rad in base_link is turned towards the lookahead point (2,) m, unless that is near
+    and lies ahead. Held for ``hold`` s and then braked, the turn ends there. A fast base turns slowly, because its
+    velocity in base_link must rotate back to stay constant in map, which takes acceleration.
+    """
+    bearing = float(se2.wrap(np.arctan2(lookahead[1], lookahead[0]) - forward))
+    if np.hypot(*lookahead) < NEAR_LOOKAHEAD_M and abs(bearing) < np.pi / 3:
+        return np.zeros(np.shape(speed))
+    max_turn = TURN_ACCELERATION_SHARE * robot.acceleration / np.maximum(speed, 1e-3)
+    return np.asarray(np.clip(turn_rate(bearing, robot, hold), -max_turn, max_turn))
+
+
 def turn_to_lookahead(
     current: Array,
     action: Array,
@@ -153,19 +169,14 @@ def turn_to_lookahead(
 ) -> Array:
     """Adds a turn to the action (3,) of a holonomic base, so that the scanner faces the direction of motion.
 
-    The side at bearing ``forward`` rad in base_link is turned towards the lookahead point (2,) m, unless that is near
-    and lies ahead. ``current`` (3,) is the present velocity, and ``period`` s the time until the next command. Returns
-    the action unchanged for a differential base, and if ``may_turn`` is False.
+    The turn is `turn_rate_while_moving`. ``current`` (3,) is the present velocity, and ``period`` s the time until the
+    next command. Returns the action unchanged for a differential base, and if ``may_turn`` is False.
     """
     if robot.drive != "holonomic" or not may_turn:
         return np.array(action)
-    bearing = float(se2.wrap(np.arctan2(lookahead[1], lookahead[0]) - forward))
-    near_and_ahead = np.hypot(*lookahead) < NEAR_LOOKAHEAD_M and abs(bearing) < np.pi / 3
-    # While the base turns, its velocity in base_link must rotate back to stay constant in map; that takes acceleration.
     brakes = not action.any()
     speed = float(np.hypot(*(current if brakes else action)[:2]))
-    max_turn = TURN_ACCELERATION_SHARE * robot.acceleration / max(speed, 1e-3)
-    turn = 0.0 if near_and_ahead else float(np.clip(turn_rate(bearing, robot, period), -max_turn, max_turn))
+    turn = float(turn_rate_while_moving(lookahead, speed, robot, forward, period))
     if not brakes:
         return np.array([*se2.rotate(-turn * period / 2, action[:2]), turn])
     # Braking alone would take all the acceleration, and the base would drift off the line on which it is to stop. In a

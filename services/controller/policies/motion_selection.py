@@ -51,11 +51,15 @@ class Surroundings:
         """Whether the scanner sees all that the body can meet on the way into ``bearings`` (...,) rad; (...,) bool."""
         if self.field_of_view.half >= np.pi:
             return np.ones(np.shape(bearings), bool)
+        return self.turn_until_seen(bearings) <= 1e-9
+
+    def turn_until_seen(self, bearings: Array | float) -> Array:
+        """Angle (...,) rad by which the base must turn before it `sees` the way into ``bearings`` (...,) rad."""
         off_centre = np.abs(se2.wrap(bearings - self.field_of_view.centre))
         max_off_centre = max(
             self.field_of_view.half - FIELD_OF_VIEW_MARGIN_RAD, self.field_of_view.half / FIELD_OF_VIEW_DIVISOR
         )
-        return np.asarray(off_centre <= max_off_centre + 1e-9)
+        return np.asarray(np.maximum(off_centre - max_off_centre, 0.0))
 
     @property
     def forward(self) -> float:
@@ -218,7 +222,7 @@ class _Evaluator:
         With ``braking_is_free``, motion 0, which brakes, is never excluded, even if an obstacle may approach meanwhile.
         """
         motions = _visible_motions(motions, self.surroundings)
-        poses, times, standing_after = motion_model.rollouts(self.current, motions, self.robot)
+        poses, times, standing_after = motion_model.rollouts(self.current, self._with_turn(motions), self.robot)
         deviation = np.sqrt(self.belief.variance / 2)
         gaps = self.surroundings.gaps(poses, times, standing_after, WALL_COST_RANGE_M + 2 * deviation)
         free = np.all(gaps >= self._min_gap, axis=1)
@@ -229,13 +233,23 @@ class _Evaluator:
         energy = ExpectedFreeEnergy(NATS_PER_METRE * metres, ambiguity, information, np.zeros(len(motions)))
         return _Evaluation(motions, poses, energy, np.where(free, energy.total, np.inf))
 
+    def _with_turn(self, motions: Array) -> Array:
+        """The motions (N, 5) with the turn that `motion_model.turn_to_lookahead` adds for a holonomic base."""
+        if self.robot.drive == "differential" or not self.surroundings.may_turn:
+            return motions
+        speed = np.hypot(motions[:, 0], motions[:, 1])
+        speed = np.where(speed > 0, speed, np.hypot(*self.current[:2]))
+        turn = motion_model.turn_rate_while_moving(self.lookahead, speed, self.robot, self.surroundings.forward)
+        return np.column_stack([motions[:, :2], turn, motions[:, 3:]])
+
     def _risk_metres(self, motions: Array, poses: Array, gaps: Array, deviation: float) -> Array:
         """Risk (N,) in m to go, with the ``deviation`` m of the belief's position.
 
         It is the sum of the mean distance to go during the motion, the distance to go at its end, additional metres if
         its narrowest gap is small, and the cost of the change of velocity.
         """
-        distance = efe.expected_distance(remaining_distance(poses, self.lookahead, self.robot), self.belief.variance)
+        distance = remaining_distance(poses, self.lookahead, self.robot, self.surroundings)
+        distance = efe.expected_distance(distance, self.belief.variance)
         closeness = efe.expected_square(1 - gaps.min(axis=1) / WALL_COST_RANGE_M, deviation / WALL_COST_RANGE_M)
         effort = CHANGE_COST_S * np.hypot(*(motions[:, :2] - self.current[:2]).T)
         near_obstacles = MAX_WALL_COST * closeness * path_lengths(poses)
@@ -247,16 +261,21 @@ def path_lengths(poses: Array) -> Array:
     return np.asarray(np.hypot(*np.diff(poses[..., :2], axis=1).T).sum(axis=0))
 
 
-def remaining_distance(poses: Array, lookahead: Array, robot: Robot) -> Array:
-    """Distance (...,) m from poses (..., 3) to the lookahead point.
+def remaining_distance(poses: Array, lookahead: Array, robot: Robot, surroundings: Surroundings) -> Array:
+    """Distance (...,) m from poses (..., 3) to the lookahead point, all in the present base_link.
 
-    For a differential base it includes the distance that could be driven in the time that the turn takes.
+    It includes the distance that could be driven during the turn that must come first: of a differential base, until
+    the lookahead point lies ahead, of a holonomic one, until the scanner sees the way there.
     """
     offset = lookahead - poses[..., :2]
     distance = np.hypot(offset[..., 0], offset[..., 1])
-    if robot.drive == "holonomic":
+    bearing = se2.wrap(np.arctan2(offset[..., 1], offset[..., 0]) - poses[..., 2])
+    if robot.drive == "differential":
+        turn = np.abs(bearing)
+    elif surroundings.may_turn:
+        turn = surroundings.turn_until_seen(bearing)
+    else:
         return np.asarray(distance)
-    turn = np.abs(se2.wrap(np.arctan2(offset[..., 1], offset[..., 0]) - poses[..., 2]))
     return np.asarray(distance + turn * robot.max_speed / robot.max_turn * np.minimum(1.0, distance / HEADING_FADE_M))
 
 

@@ -81,7 +81,7 @@ def test_distance_after_selection(robot, x, y, v, w):
     current, goal = np.array([v, 0.0, w]), np.array([x, y])
     selected = select_motion(current, goal, around(), robot)
     poses, _, _ = rollouts(current, np.array([[0, 0, 0, HOLD_S, HOLD_S]]), robot)
-    to_go, if_braking = (remaining_distance(each, goal, robot) for each in (selected.poses, poses[0]))
+    to_go, if_braking = (remaining_distance(each, goal, robot, around()) for each in (selected.poses, poses[0]))
     assert to_go.mean() + to_go[-1] <= if_braking.mean() + if_braking[-1] + 0.02 * np.hypot(*current[:2]) + 1e-9
     assert np.hypot(*selected.action[:2]) <= robot.max_speed + 1e-9
     assert abs(selected.action[2]) <= robot.max_turn + 1e-9
@@ -130,6 +130,24 @@ def test_unseen_directions():
     assert abs(turn_to_lookahead(np.zeros(3), action, behind, ROBOT, may_turn=True)[2]) > 1.0
     kept = select_motion(np.zeros(3), behind, around(field_of_view=view, may_turn=False), ROBOT).action
     assert 0 < np.hypot(*kept[:2]) <= 0.25 + 1e-9
+
+
+@pytest.mark.parametrize("bearing", np.deg2rad([100, 135, 180]))
+def test_holonomic_base_turns_before_it_drives_to_what_it_does_not_see(bearing):
+    """If it drove at once, it would turn slowly, and go a long way round."""
+    goal, view = 2.5 * np.array([np.cos(bearing), np.sin(bearing)]), Sector(0.0, np.deg2rad(135))
+    pose, velocity, path = np.zeros(3), np.zeros(3), [np.zeros(2)]
+    while np.hypot(*(goal - pose[:2])) > 0.05 and len(path) < 200:
+        lookahead = se2.rotate(-pose[2], goal - pose[:2])
+        action = select_motion(velocity, lookahead, around(field_of_view=view), ROBOT).action
+        velocity = safety.ramp(
+            velocity, turn_to_lookahead(velocity, action, lookahead, ROBOT, may_turn=True), ROBOT, PERIOD
+        )
+        pose = se2.compose(pose, velocity * PERIOD)
+        path.append(pose[:2])
+    assert np.hypot(*np.diff(path, axis=0).T).sum() < 1.1 * 2.5
+    least = 2.5 / ROBOT.max_speed + ROBOT.max_speed / ROBOT.acceleration
+    assert len(path) * PERIOD < least + 2.0  # s, for the turn
 
 
 @pytest.mark.parametrize("period", [0.025, 1 / 15, 0.1, 0.2])
