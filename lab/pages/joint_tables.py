@@ -11,13 +11,17 @@ from lab.peers.experiment import table_with_others
 from lab.real_logs.drive import GLOBAL, KIDNAPPED, LASER, ODOMETRY
 from lab.real_logs.experiment import wrong_share_of_tracking
 
-PRESETS = {"precise": "presage", "particle-filter": "particle filter, tuned"}
 # Labels in README, and the tasks of `presage experiment real` and of `presage bench accuracy`
 REAL_TASKS = {
     "with odometry": ODOMETRY,
     "laser alone": LASER,
     "unknown start": GLOBAL,
     "kidnapped": KIDNAPPED,
+}
+REAL_FILTERS = {
+    "particle-filter": "tuned",
+    "particle-filter-scan-matching": "scan matching",
+    "amcl-defaults": "AMCL's defaults",
 }
 TASKS = {
     "unknown start, 20 scans": "standing, 20 scans",
@@ -30,26 +34,34 @@ MOVED_FILTERS = {"start kept": "particle-filter", "recovery": "particle-filter-r
 
 
 def real_logs(folder: Path) -> str:
-    """A real log, for each estimator: the second half localised with the first, and the reverse.
+    """A real log, for presage and the best particle filter: the second half in a map of the first, and the reverse.
 
-    Each cell: scans with a correct pose, or starts found; and the wrong ones among the scans in state `tracking`.
+    Each cell: scans with a correct pose, or starts found; scans in state `tracking`; and the wrong ones among these.
     """
-    lines, longest = [], [0.0] * len(PRESETS)
+    lines, longest_own, longest_best = [], 0.0, 0.0
     for half, name in (("second half", "real-fr079"), ("first half", "real-fr079_exchanged")):
-        summary = read(folder / f"{name}.json")["summary"].values()
-        rows_of = {(row["task"], row["estimator"]): row for row in summary}
+        rows = list(read(folder / f"{name}.json")["summary"].values())
         for label, task in REAL_TASKS.items():
-            rows = [rows_of[task, preset] for preset in PRESETS]
-            lines.append([f"{half}: {label}", *map(_correct_and_wrong, rows)])
-            longest = [max(each, row["longest_wrong_s"]) for each, row in zip(longest, rows, strict=True)]
-    lines.append(["longest wrong `tracking`", *(f"{each:.1f} s" for each in longest)])
-    return markdown(["", *PRESETS.values()], lines)
+            (own,) = (row for row in rows if row["task"] == task and row["estimator"] == "precise")
+            filters = [row for row in rows if row["task"] == task and not row["estimator"].startswith("precise")]
+            best = max(filters, key=_correct_count)
+            variant = REAL_FILTERS[best["estimator"]]
+            lines.append([f"{half}: {label}", _real_cell(own), f"{variant}: {_real_cell(best)}"])
+            longest_own = max(longest_own, own["longest_wrong_s"])
+            longest_best = max(longest_best, best["longest_wrong_s"])
+    lines.append(["longest wrong `tracking`", f"{longest_own:.1f} s", f"{longest_best:.1f} s"])
+    return markdown(["", "presage", "best particle filter"], lines)
 
 
-def _correct_and_wrong(row: dict[str, Any]) -> str:
+def _correct_count(row: dict[str, Any]) -> int:
+    """The number of scans with a correct pose, or of starts found."""
+    return int(row["correct"] if row["trials"] == 1 else row["found"])
+
+
+def _real_cell(row: dict[str, Any]) -> str:
     correct = f"{row['correct'] / row['scans']:.1%}" if row["trials"] == 1 else f"{row['found']} of {row['trials']}"
     wrong = wrong_share_of_tracking(row)
-    return f"{correct}; –" if wrong is None else f"{correct}; {wrong:.1%}"
+    return f"{correct}; {row['tracking'] / row['scans']:.0%}, {'–' if wrong is None else f'{wrong:.1%}'}"
 
 
 def simulation(folder: Path) -> str:
