@@ -67,7 +67,7 @@ STANDING_DEVIATION = np.array([0.002, 0.002, 0.002])  # m, m, rad: in addition t
 MAX_VELOCITY = 3 * VELOCITY_DEVIATION  # a robot that seems to move faster was kidnapped
 # The velocity is unknown after a period that exceeds both this time and this multiple of the period before.
 MAX_PERIOD_S, MAX_PERIOD_RATIO = 2.0, 5.0
-# Scans over which these deviations are learned, and the largest error that counts, in deviations.
+# A factor on the deviations of the motion is learned over this many scans, from errors of at most so many deviations.
 LEARNING_SCANS, MAX_LEARNED_SIGMAS = 100, 10.0
 # Errors of a registration that do not average out, for each key scan: moving things, the surfaces' roughness.
 REGISTRATION_DEVIATION = np.array([0.005, 0.005, 0.002])
@@ -160,11 +160,12 @@ class FrontEnd:
         """
         period = stamp - self.stamps[-1] if self.stamps else 0.0
         clock_stepped = self._update_period(period)
-        if period < 0:
+        if period < 0:  # the real time since the last scan is unknown, and odometry may have been reset
             period, self._odom = MAX_PERIOD_S, None
         motion, deviation = self._predict_motion(period, odom)
         scan = self._correct(ranges, motion, period)
-        used_odometry, self._odom = self._odom is not None and odom is not None, odom
+        used_odometry = self._odom is not None and odom is not None
+        self._odom = odom
         self.stamps.append(stamp)
         if len(self.stamps) == 1:
             return self._begin_piece(np.zeros(3), scan)
@@ -189,7 +190,7 @@ class FrontEnd:
                 self._update_recent_contradiction(contradiction)
             return self._add_matched(scan, found, prior, deviation, period, begins_piece=begins_piece)
         self.unmatched += 1
-        if used_odometry:
+        if used_odometry:  # without it, the old velocity is still the best prediction
             self._velocity = None
         if suspect:
             return self._add_suspect(scan, prior.mean)
