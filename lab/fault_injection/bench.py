@@ -36,8 +36,8 @@ def bench_chaos(
     json_file: Path | None,
     console: Console,
     *,
-    one_host: bool = False,
-    quiet: bool = True,
+    one_host: bool,
+    quiet: bool,
 ) -> int:
     """Injects the faults, prints the table and writes it to ``json_file`` if given.
 

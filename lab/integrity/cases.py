@@ -109,8 +109,8 @@ class IntegrityTrial:
     separate: bool  # every scan is a trial of its own, from an unknown start
 
 
-def make_trial(case: IntegrityCase, seed: int, seconds: float | None = None) -> IntegrityTrial:
-    """The trial of a case in the world of a seed; ``seconds`` defaults to the case's."""
+def make_trial(case: IntegrityCase, seed: int, seconds: float | None) -> IntegrityTrial:
+    """The trial of a case in the world of a seed; with ``seconds`` None, its length is the case's own."""
     rng = np.random.default_rng([seed, zlib.crc32(case.name.encode())])
     stated = scanner_of(case)
     scanner = _real_scanner(case, stated)
