@@ -28,6 +28,7 @@ from common.robot.motion_distortion import beam_times
 from lab.accuracy.compared_estimators import COMPARED_ESTIMATORS, EstimatorSetup
 from lab.accuracy.scenes import Scene
 from lab.accuracy.tasks import is_at
+from lab.statistics import root_mean_square
 from presage.terminal.output import check_file, provenance, write_json
 from services.estimator.factory import ScannerGeometry
 from services.estimator.shared.interface import Observation
@@ -169,9 +170,9 @@ def _errors_of(errors: Array) -> dict[str, Any]:
     return {
         "of": len(errors),
         "position_median_m": float(np.median(position)),
-        "position_rms_m": float(np.sqrt(np.mean(position**2))),
+        "position_rms_m": root_mean_square(position),
         "position_p95_m": float(np.quantile(position, 0.95)),
-        "heading_rms_rad": float(np.sqrt(np.mean(errors[:, 2] ** 2))),
+        "heading_rms_rad": root_mean_square(errors[:, 2]),
     }
 
 

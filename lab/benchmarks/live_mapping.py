@@ -19,6 +19,7 @@ from common.messages.definitions import Belief, Drive, Health, Map, Truth, Twist
 from common.messages.topics import BELIEF, DRIVE, HEALTH, MAP, TRUTH
 from lab.accuracy.scenes import Scene
 from lab.benchmarks.mapping import trajectory_errors
+from lab.statistics import root_mean_square
 from presage.live.latest_messages import LatestMessages
 from presage.session.running_sessions import link_of
 
@@ -80,7 +81,7 @@ def main() -> None:
         position, heading = trajectory_errors(*drive_path(bus, path))
         print(
             f"{len(position)} beliefs in {time.monotonic() - began:.0f} s: "
-            f"{np.sqrt((position**2).mean()) * 1e3:.1f} mm RMS, at most {position.max() * 1e3:.0f} mm; "
+            f"{root_mean_square(position) * 1e3:.1f} mm RMS, at most {position.max() * 1e3:.0f} mm; "
             f"{np.rad2deg(heading).mean():.3f} degrees in the mean"
         )
         messages = LatestMessages(bus, MAP, HEALTH)

@@ -33,6 +33,7 @@ from lab.experiments.trials import run_trials
 from lab.integrity.buildings import Building, Room, random_place
 from lab.integrity.cases import BEAMS
 from lab.integrity.changes import MAX_PLACES
+from lab.statistics import root_mean_square
 from presage.learning.map_of_log import MapOptions, map_command
 from presage.logs.log import Reading
 from presage.terminal.output import check_file, make_folder, provenance, write_json
@@ -163,7 +164,7 @@ def _map_drive(path: Array, options: MapOptions) -> dict[str, Any]:
     errors = np.hypot(*(trajectory[:, 1:3] - path[numbers, :2]).T)
     return {
         "drive_s": PERIOD_S * len(path),
-        "trajectory_rms_m": float(np.sqrt((errors**2).mean())),
+        "trajectory_rms_m": root_mean_square(errors),
         "update_s": taken,
         "map_bytes": options.out.with_suffix(".pgm").stat().st_size,
         "model_bytes": weights.path_of(options.out.parent, options.out.stem).stat().st_size,

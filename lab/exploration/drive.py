@@ -18,6 +18,7 @@ from common.messages.definitions import Belief, Goal, Map, Odom, Pose, Scan, Twi
 from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS
 from lab.benchmarks.mapping import trajectory_errors
+from lab.statistics import root_mean_square
 from services.controller.growing_map import PlanningMap
 from services.controller.navigator import Navigator
 from services.controller.policies.exploration import ExplorationState, NoPath, Viewpoint
@@ -147,7 +148,7 @@ def measure(run: ExplorationRun, world: World, robot: Robot) -> dict[str, Any]:
         "held_back_scans": run.held_back,
         "lost_scans": run.unmatched,
         "seconds": len(truths) / SCANNERS["tim571"].rate,
-        "belief_rms_m": float(np.sqrt((errors**2).mean())),
+        "belief_rms_m": root_mean_square(errors),
         "choices": len(run.choice_ms),
         "choice_ms_median": float(np.median(run.choice_ms)) if run.choice_ms else 0.0,
         "choice_ms_max": float(np.max(run.choice_ms)) if run.choice_ms else 0.0,

@@ -45,6 +45,7 @@ from lab.real_logs.scoring import (
     longest_wrong_s,
     scans_until_found,
 )
+from lab.statistics import root_mean_square
 from presage.learning.train_drive import TrainDriveOptions as Training
 from presage.learning.train_drive import card_of
 from services.estimator.precise.learning import weights
@@ -239,9 +240,9 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "trials": len(rows),
         "scans": len(error),
         "error_median_m": float(np.median(error)),
-        "error_rms_m": float(np.sqrt(np.mean(error**2))),
+        "error_rms_m": root_mean_square(error),
         "error_95_m": float(np.quantile(error, 0.95)),
-        "correct_error_rms_m": float(np.sqrt(np.mean(error[correct] ** 2))) if correct.any() else None,
+        "correct_error_rms_m": root_mean_square(error[correct]) if correct.any() else None,
         "yaw_error_median_rad": float(np.median(yaw)),
         "correct": int(correct.sum()),
         "tracking": int(tracking.sum()),
