@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import platform
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +26,7 @@ from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS, Scanner
 from presage.session.running_sessions import credentials_for
 from presage.session.stack import Stack
-from presage.terminal.output import check_file, provenance, write_json
+from presage.terminal.output import check_file, machine, provenance, write_json
 
 # The echo process uses the keys of a separate robot: it receives any bytes on `odom` and returns them on `truth`.
 ECHO_ROBOT, ECHO = "echo", "simulator"
@@ -119,7 +118,7 @@ def _measure(
         "scans": scans,
         "rate_hz": rate,
         "unanswered": lost,
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "machine": machine(),
         **provenance(seed=0),
     }
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import platform
 import threading
 import time
 from dataclasses import dataclass, field
@@ -26,7 +24,7 @@ from common.errors import UserError
 from common.messages.topics import CMD_VEL, SCAN
 from presage.session.ports import free_port
 from presage.session.stack import Stack
-from presage.terminal.output import check_file, provenance, write_json
+from presage.terminal.output import check_file, machine, provenance, write_json
 
 WARM_UP_S = 3.0  # at the start of every round, left out of the statistics
 TIMEOUT_S = 60.0
@@ -170,7 +168,7 @@ def _report(without: ViewerCost, viewed: ViewerCost, seconds: float, rounds: int
         "seconds": seconds,
         "rounds": rounds,
         "beams": beams,
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "machine": machine(),
         **provenance(),
     }
 

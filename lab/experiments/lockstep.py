@@ -72,6 +72,16 @@ class RunTrace:
         """Believed poses (N, 3) at the same scans."""
         return np.array([belief.pose.array() for belief in self.beliefs])
 
+    @property
+    def last_status(self) -> Status | None:
+        """The controller's last status; None if it sent none."""
+        return self.statuses[max(self.statuses)] if self.statuses else None
+
+    @property
+    def seconds(self) -> float:
+        """Time in s from the first scan until the run ended or was aborted."""
+        return (self.truths[-1].stamp_ns if self.ended_ns is None else self.ended_ns) * 1e-9
+
     def has(self, stamp_ns: int) -> bool:
         """Whether the truth, the belief and the status of that scan have been received."""
         kept_stamps = (
