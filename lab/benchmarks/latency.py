@@ -108,6 +108,8 @@ def _measure(
             loop_ms += [(middle - began) * 1e3] if answered else []
             raw_ms += [(end - middle) * 1e3] if echoed else []
         time.sleep(max(0.0, 1 / rate - (time.perf_counter() - began)))
+    if not loop_ms or not raw_ms:
+        raise UserError(f"no scan was answered within {TIMEOUT_S:g} s: is this machine busy?")
     return {
         "scan_to_command_median_ms": float(np.median(loop_ms)),
         "scan_to_command_p99_ms": float(np.percentile(loop_ms, 99)),
