@@ -114,10 +114,8 @@ class Scene:
         while len(poses) < seconds * self.scanner.rate:
             if np.hypot(*(target - pose[:2])) < 0.1 or self.rng.random() < 0.005:
                 target = self._random_visible_place(room, pose[:2])
-                wanted_speed, wanted_turn = (
-                    self.rng.uniform(0.2, speed),
-                    self.rng.uniform(-MAX_TURN_RATE, MAX_TURN_RATE),
-                )
+                wanted_speed = self.rng.uniform(0.2, speed)
+                wanted_turn = self.rng.uniform(-MAX_TURN_RATE, MAX_TURN_RATE)
                 if at_full_speed:
                     wanted_speed, wanted_turn = speed, float(np.copysign(MAX_TURN_RATE, wanted_turn))
             towards = target - pose[:2]

@@ -52,7 +52,7 @@ class IntegrityCase:
     sigma: float = 1.0  # the scanner's real noise, relative to what it states
     mount_yaw_deg: float = 0.0  # of the real scanner, relative to what it states
     range_max: float = TIM571.range_max  # m
-    single_scans: int = 0  # instead of a drive; each from an unknown pose
+    single_scans: int = 0  # number of scans instead of a drive, each from an unknown pose
 
     @property
     def map_is_correct(self) -> bool:

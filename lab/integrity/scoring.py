@@ -1,4 +1,4 @@
-"""Whether an estimator was right about itself: scores of scans, of trials and of cases."""
+"""Compares what an estimator reported with the truth: scores of scans, of trials and of cases."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ from common.robot.robot import Robot
 from lab.experiments.lockstep import RunTrace
 from lab.experiments.start_and_goal import least_time
 from lab.navigation.shortest_path import NavigationTask, length
-from services.simulator.people import PERSON_RADIUS_M as PERSON_RADIUS
+from services.simulator.people import PERSON_RADIUS_M
 
 MIN_MOVING_SPEED = 0.01  # m/s
 MAX_REACHED_DISTANCE = GOAL_TOLERANCE_M  # m; if the robot stands farther from the goal, a reported arrival is wrong
@@ -127,7 +127,7 @@ def _clearance_to_people(trace: RunTrace, robot: Robot) -> float | None:
     distances = [
         np.hypot(*(truth.people - truth.pose.array()[:2]).T).min() for truth in trace.truths if len(truth.people)
     ]
-    return float(min(distances)) - robot.radius - PERSON_RADIUS if distances else None
+    return float(min(distances)) - robot.radius - PERSON_RADIUS_M if distances else None
 
 
 def _localisation(trace: RunTrace) -> dict[str, Any]:

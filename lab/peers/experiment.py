@@ -41,10 +41,8 @@ TASKS = {
 # The maps: given as polygons or as an occupancy grid, or a field learned from that grid or from scans with known poses.
 POLYGONS, CELLS, FIELD, POSED = "polygons", "5 cm map", "learned from 5 cm map", "learned from posed scans"
 START_DEVIATION = np.array([0.2, 0.2, 0.1])  # m, m, rad, of the given start of a drive
-CONVERGED_M, LAST_SCANS = (
-    0.2,
-    10,
-)  # limit of the median error, and the number of scans at the end of a trial that it is of
+LAST_SCANS = 10  # of a trial; their median error decides whether it has converged
+CONVERGED_M = 0.2  # limit of this median error
 SETTLED_SCANS = 50  # of a drive, before its errors count
 
 

@@ -46,8 +46,7 @@ from lab.real_logs.scoring import (
     scans_until_found,
 )
 from lab.statistics import root_mean_square
-from presage.learning.train_drive import TrainDriveOptions as Training
-from presage.learning.train_drive import card_of
+from presage.learning.train_drive import TrainDriveOptions, card_of
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.precise.learning.drive_learning import learn_drive
@@ -172,7 +171,7 @@ def _train_and_tune(
             bar.update(task, description=title, completed=done)
 
         first = stretch.drive.part(np.arange(half))
-        training = Training(job.log, share=0.5, recipe=Recipe(resolution=0.05, seed=job.seed))
+        training = TrainDriveOptions(job.log, share=0.5, recipe=Recipe(resolution=0.05, seed=job.seed))
         learned = learn_drive(first, training.recipe, None, report)
         card = card_of(training, world, first, learned, 0.0)
         weights.save(path, learned.model, learned.places, card)
