@@ -37,7 +37,7 @@ CELL_M = 0.05
 FALSE_WALL_M = 0.15  # an occupied cell farther than this in front of all surfaces is no surface
 PEOPLE_PER_M2 = 0.08
 
-Kidnapping = Callable[[Scene, Array], Array]  # returns the pose (3,) to which the robot is carried after a path (N, 3)
+ChoosePlace = Callable[[Scene, Array], Array]  # returns the pose (3,) to which the robot is carried after a path (N, 3)
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class MappingFault:
     """What could deceive the mapper in a drive."""
 
     world: Literal["office", "symmetric", "twins"] = "office"
-    kidnapping: Kidnapping | None = None  # in the middle of the drive
+    kidnapping: ChoosePlace | None = None  # in the middle of the drive
     crowd: bool = False
 
 

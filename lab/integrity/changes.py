@@ -16,7 +16,7 @@ from common.geometry.ray_casting import cast_rays
 from common.geometry.se2 import Array
 from common.geometry.shapes import Box, Circle, Obstacle
 from common.geometry.world import World
-from lab.accuracy.furniture import Floor, FurniturePiece
+from lab.accuracy.furniture import FloorSpace, FurniturePiece
 from lab.accuracy.scenes import ROBOT, Scene
 from lab.integrity.buildings import Building, Room, random_piece, random_place
 from services.simulator.people import People
@@ -68,7 +68,7 @@ def remove_furniture(building: Building, share: float, rng: np.random.Generator)
     return building.furnished([piece for piece in building.furniture if rng.random() >= share])
 
 
-def _put_anywhere(floor: Floor, pieces: Iterable[FurniturePiece]) -> None:
+def _put_anywhere(floor: FloorSpace, pieces: Iterable[FurniturePiece]) -> None:
     """Puts down the first piece for which there is room."""
     any(floor.put(piece) for piece in pieces)
 
