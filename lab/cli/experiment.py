@@ -140,7 +140,7 @@ def similar_objects(
     context: typer.Context,
     trials: Trials = 30,
 ) -> None:
-    """Worlds with similar objects or two identical rooms: places found, wrong claims, and ambiguity kept.
+    """Worlds with similar objects or two identical rooms: places found, places reported wrongly, both rooms kept.
 
     First trains the estimators in three worlds, which takes several minutes however few the trials are.
 

@@ -136,12 +136,8 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
     people = any(row["min_clearance_to_people_m"] is not None for row in summary.values())
     uncertain = any(row["median_longest_untracked_s"] > 0 for row in summary.values())
     contact = any(row["trials_with_contact_moving"] or row["trials_with_contact_standing"] for row in summary.values())
-    left_out = {
-        *([] if contact else ["contacts moving; standing"]),
-        *([] if uncertain else ["longest untracked (s)"]),
-        *([] if people else ["to people (m)"]),
-    }
-    heads = [head for head in COLUMNS if head not in left_out]
+    shown = {"contacts moving; standing": contact, "longest untracked (s)": uncertain, "to people (m)": people}
+    heads = [head for head in COLUMNS if shown.get(head, True)]
     rows = [[name, *(COLUMNS[head](row) for head in heads)] for name, row in summary.items()]
     bad = [
         f"- {name}, trial {each['trial']}, {each['outcome']}: {each['why']}"

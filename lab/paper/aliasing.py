@@ -119,7 +119,7 @@ def _estimator_factory(job: AliasingJob) -> Callable[[int], PoseEstimator]:
 
 
 def _row(pose: Array, posteriors: Sequence[Posterior], *, twins: bool) -> dict[str, Any]:
-    """Results at one place: error and wrong claim after every scan.
+    """Results at one place: the error, and whether the state was wrongly `tracking`, after every scan.
 
     With ``twins`` also whether the last belief contains both of the two indistinguishable places.
     """
