@@ -251,8 +251,8 @@ def test_short_log(folder, tmp_path):
 
 
 def test_map_of_another_place(folder, tmp_path):
-    job = real.RealLogJob(folder / "drive.npz", "office", (0.0, 0.0, 0.0))
     elsewhere = World(name="elsewhere", boundary=[(50, 50), (60, 50), (60, 60), (50, 60)])
     (tmp_path / "elsewhere.yaml").write_text(save_world(elsewhere), encoding="utf-8")
+    job = real.RealLogJob(folder / "drive.npz", str(tmp_path / "elsewhere.yaml"), (0.0, 0.0, 0.0))
     with pytest.raises(UserError, match=r"only 0% of the reference poses .* in free space"):
-        real.run(replace(job, map=str(tmp_path / "elsewhere.yaml")), tmp_path, 1, Console(quiet=True))
+        real.run(job, tmp_path, 1, Console(quiet=True))
