@@ -35,9 +35,9 @@ def position(covariance: Array) -> Array:
     return np.sqrt(covariance[..., 0, 0] + covariance[..., 1, 1])
 
 
-def single(scene: Scene, poses: Array, scans: int = 1) -> Array:
-    """(N, 3, 3) bound on the pose covariance after ``scans`` scans of a standing robot, without prior knowledge."""
-    return np.asarray(np.linalg.inv(information(scene, poses) * scans), np.float64)
+def single(scene: Scene, poses: Array) -> Array:
+    """(N, 3, 3) bound on the pose covariance after one scan, without prior knowledge."""
+    return np.asarray(np.linalg.inv(information(scene, poses)), np.float64)
 
 
 def heading_known(covariance: Array) -> Array:

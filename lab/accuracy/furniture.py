@@ -73,7 +73,7 @@ class FurniturePiece:
         return self.obstacles[0].shape() if self.shape == "disc" else shapely.Polygon(self.box.corners())
 
 
-class Floor:
+class FloorSpace:
     """The floor of a building. Pieces are put down only where the robot can still reach every free place."""
 
     def __init__(self, walls: World, keep_free: shapely.Geometry) -> None:

@@ -1,7 +1,7 @@
-"""A network instead of the distance field, for `bench decoders`.
+"""A network that predicts scans, which `presage bench decoders` compares with the distance field.
 
 Position features, fully connected layers, two heads for every direction: expected range and log scale, trained together
-by the Laplace negative log-likelihood |o - mu| exp(-b) + b. `presage bench decoders` compares it with the field.
+by the Laplace negative log-likelihood |o - mu| exp(-b) + b.
 """
 
 from __future__ import annotations

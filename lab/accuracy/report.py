@@ -167,7 +167,7 @@ def _cells(row: dict[str, Any]) -> list[str]:
         _found(row),
         str(row["tracking_but_wrong"]),
         _number(row["position_error_median_m"], 1e3),
-        f"{_number(row['position_error_rms_m'], 1e3)}{_interval(row.get('position_error_rms_95_m'))}",
+        f"{_number(row['position_error_rms_m'], 1e3)}{_interval(row['position_error_rms_95_m'])}",
         _number(row["nees_mean"]),
         _number(row["update_ms_median"], 1, 1),
     ]

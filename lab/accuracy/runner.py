@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,7 +10,6 @@ from rich.console import Console
 from rich.progress import track
 
 from common.geometry import se2
-from common.geometry.se2 import Array
 from common.geometry.world import World, load_world
 from common.robot.robot import Robot
 from common.robot.scanner import Scanner
@@ -65,15 +63,15 @@ def run(job: AccuracyJob) -> dict[tuple[str, str], tasks.TaskOutcome]:
     outcomes: dict[str, tasks.TaskOutcome] = {}
     for number, task in enumerate((tasks.standing, tasks.blocked, tasks.kidnapped, tasks.furnished)):
         if task.__name__ in job.tasks:
-            outcomes |= task(estimator, _scene(job, world, number), job.trials, _no_progress)
+            outcomes |= task(estimator, _scene(job, world, number), job.trials)
     for number, name in enumerate(("tracking", "odometry")):
         if name in job.tasks:
             scene = _scene(job, world, 10 + number)
-            outcomes |= tasks.tracking(estimator, scene, job.seconds, _no_progress, odometry=name == "odometry")
+            outcomes |= tasks.tracking(estimator, scene, job.seconds, odometry=name == "odometry")
     by_world = {(job.world, task): outcome for task, outcome in outcomes.items()}
     if "twins" in job.tasks:
         scene = _scene(job, TWINS, 20)
-        outcomes = tasks.twins(_estimator(job, TWINS), scene, job.trials, _no_progress)
+        outcomes = tasks.twins(_estimator(job, TWINS), scene, job.trials)
         by_world |= {(TWINS.name, task): outcome for task, outcome in outcomes.items()}
     return by_world
 
@@ -85,10 +83,6 @@ def _estimator(job: AccuracyJob, world: World) -> PoseEstimator:
     if world is TWINS and compared.learns:
         learned = quick_field(TWINS, geometry, np.random.default_rng(job.seed), limited=True)
     return compared.make(EstimatorSetup(world, geometry, job.seed, learned))
-
-
-def _no_progress(poses: Iterable[Array]) -> Iterator[Array]:
-    return iter(poses)
 
 
 def _scene(job: AccuracyJob, world: World, number: int) -> Scene:

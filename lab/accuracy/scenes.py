@@ -20,7 +20,7 @@ from services.estimator.shared.interface import Observation
 ROBOT = Robot()
 TIM571 = SCANNERS["tim571"]
 GLASS_SHARE = 0.25  # of unknown furniture
-MAX_TURN_RATE = 1.0  # rad/s, on the paths
+MAX_SPEED, MAX_TURN_RATE = 1.0, 1.0  # m/s, rad/s, on the paths
 
 
 @dataclass
@@ -97,13 +97,11 @@ class Scene:
             nearest[hidden], silent[hidden] = seen[hidden], self.rng.random() < GLASS_SHARE
         return np.where(silent, np.inf, nearest)
 
-    def path(
-        self, seconds: float, speed: float = 1.0, start: Array | None = None, *, at_full_speed: bool = False
-    ) -> Array:
+    def path(self, seconds: float, start: Array | None = None, *, at_full_speed: bool = False) -> Array:
         """Poses (N, 3), one per scan, of a drive between random places along free straight lines.
 
-        The drive begins at rest at ``start`` (3,), or at a random pose. Speeds are up to ``speed`` m/s and 1 rad/s, or
-        just these ``at_full_speed``, and accelerations are within the robot's limits.
+        The drive begins at rest at ``start`` (3,), or at a random pose. Speeds are up to `MAX_SPEED` and
+        `MAX_TURN_RATE`, or just these ``at_full_speed``, and accelerations are within the robot's limits.
         """
         dt = 1 / self.scanner.rate
         room = shapely.buffer(self.world.free_space, -ROBOT.radius)
@@ -114,12 +112,10 @@ class Scene:
         while len(poses) < seconds * self.scanner.rate:
             if np.hypot(*(target - pose[:2])) < 0.1 or self.rng.random() < 0.005:
                 target = self._random_visible_place(room, pose[:2])
-                wanted_speed, wanted_turn = (
-                    self.rng.uniform(0.2, speed),
-                    self.rng.uniform(-MAX_TURN_RATE, MAX_TURN_RATE),
-                )
+                wanted_speed = self.rng.uniform(0.2, MAX_SPEED)
+                wanted_turn = self.rng.uniform(-MAX_TURN_RATE, MAX_TURN_RATE)
                 if at_full_speed:
-                    wanted_speed, wanted_turn = speed, float(np.copysign(MAX_TURN_RATE, wanted_turn))
+                    wanted_speed, wanted_turn = MAX_SPEED, float(np.copysign(MAX_TURN_RATE, wanted_turn))
             towards = target - pose[:2]
             distance = float(np.hypot(*towards))
             wanted = towards / max(distance, 1e-9) * min(wanted_speed, np.sqrt(2 * 0.5 * distance))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,7 +20,6 @@ STANDING_SCANS = 20
 # From this scan on, a belief must contain both of two identical rooms. Before, an estimator may still be searching.
 TWINS_REQUIRED_FROM_SCAN = 20
 DEPENDENT_SCANS = 75  # of one path; estimates farther apart are taken as independent
-ProgressWrapper = Callable[[Iterable[Array]], Iterator[Array]]
 
 
 def is_at(believed: Array, pose: Array) -> bool:
@@ -93,12 +92,12 @@ def _timed_update(estimator: PoseEstimator, observation: Observation, outcome: T
     return posterior
 
 
-def standing(estimator: PoseEstimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, TaskOutcome]:
+def standing(estimator: PoseEstimator, scene: Scene, trials: int) -> dict[str, TaskOutcome]:
     """Global localisation of a standing robot, without odometry: after one scan and after twenty."""
     one, many = TaskOutcome(), TaskOutcome()
     poses = scene.poses(trials)
     limits = bound.position(bound.single(scene, poses))
-    for pose, clean, limit in zip(progress(poses), scene.clean(poses), limits, strict=True):
+    for pose, clean, limit in zip(poses, scene.clean(poses), limits, strict=True):
         _stand(estimator, scene, pose, clean, (one, many), limit)
     return {"from nothing, 1 scan": one, "standing, 20 scans": many}
 
@@ -124,36 +123,34 @@ def _stand(
     many.add(posterior, pose, None if limit is None else limit / np.sqrt(STANDING_SCANS))
 
 
-def blocked(estimator: PoseEstimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, TaskOutcome]:
+def blocked(estimator: PoseEstimator, scene: Scene, trials: int) -> dict[str, TaskOutcome]:
     """Global localisation with 30 % of the beams shortened by unknown obstacles: after one scan and after twenty.
 
     The obstacles are drawn once per trial.
     """
     one, many = TaskOutcome(), TaskOutcome()
     poses = scene.poses(trials)
-    for pose, clean in zip(progress(poses), scene.clean(poses), strict=True):
+    for pose, clean in zip(poses, scene.clean(poses), strict=True):
         _stand(estimator, scene, pose, scene.blocked(clean, 0.3), (one, many))
     return {"30 % blocked, 1 scan": one, "30 % blocked, 20 scans": many}
 
 
-def furnished(estimator: PoseEstimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, TaskOutcome]:
+def furnished(estimator: PoseEstimator, scene: Scene, trials: int) -> dict[str, TaskOutcome]:
     """Global localisation with 30 % of the beams changed by furniture and glass that the map lacks."""
     one, many = TaskOutcome(), TaskOutcome()
-    for pose in progress(scene.poses(trials)):
+    for pose in scene.poses(trials):
         _stand(estimator, scene, pose, scene.furnished(pose, 0.3), (one, many))
     return {"30 % furniture, 1 scan": one, "30 % furniture, 20 scans": many}
 
 
-def tracking(
-    estimator: PoseEstimator, scene: Scene, seconds: float, progress: ProgressWrapper, *, odometry: bool
-) -> dict[str, TaskOutcome]:
+def tracking(estimator: PoseEstimator, scene: Scene, seconds: float, *, odometry: bool) -> dict[str, TaskOutcome]:
     """Tracking along a path from a known start, with the simulator's odometry or without."""
     outcome, path = TaskOutcome(independent=False), scene.path(seconds)
     # Without odometry the motion is unknown, so the bound is that of each scan alone.
     limits = bound.recursive(scene, path, OdometryNoise()) if odometry else bound.single(scene, path)
     odometer = Odometer(OdometryNoise(), scene.rng)
     estimator.restart(path[0], np.diag([0.01, 0.01, 0.01]))
-    for k, pose in enumerate(progress(path)):
+    for k, pose in enumerate(path):
         if k:
             odometer.move(path[k - 1], pose)
         observation = scene.observe(
@@ -163,12 +160,12 @@ def tracking(
     return {"tracking, odometry" if odometry else "tracking, no odometry": outcome}
 
 
-def kidnapped(estimator: PoseEstimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, TaskOutcome]:
+def kidnapped(estimator: PoseEstimator, scene: Scene, trials: int) -> dict[str, TaskOutcome]:
     """Teleports of a standing robot every 20 scans: whether it is found after one, three and twenty scans."""
     after = {1: TaskOutcome(), 3: TaskOutcome(), 20: TaskOutcome()}
     poses, stamp = scene.poses(trials + 1), 0
     estimator.restart()
-    for number, (pose, clean) in enumerate(zip(progress(poses), scene.clean(poses), strict=True)):
+    for number, (pose, clean) in enumerate(zip(poses, scene.clean(poses), strict=True)):
         for k in range(1, STANDING_SCANS + 1):
             stamp += 1
             posterior = _timed_update(estimator, scene.observe(clean, stamp / scene.scanner.rate))
@@ -182,7 +179,7 @@ def holds_both(posterior: Posterior, pose: Array) -> bool:
     return all(any(is_at(h.pose, place) for h in posterior.hypotheses) for place in (pose, twin_of(pose)))
 
 
-def twins(estimator: PoseEstimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, TaskOutcome]:
+def twins(estimator: PoseEstimator, scene: Scene, trials: int) -> dict[str, TaskOutcome]:
     """A path out of one of two identical rooms: both kept while ambiguous, and the right one believed at the end.
 
     "Both kept" counts trials in which every belief from the 20th scan until the first scan that distinguishes the rooms
@@ -190,7 +187,7 @@ def twins(estimator: PoseEstimator, scene: Scene, trials: int, progress: Progres
     `tracking` at the wrong place during that time.
     """
     kept, right = TaskOutcome(), TaskOutcome()
-    for _ in progress(np.arange(float(trials))):
+    for _ in range(trials):
         path, same = twin_path(scene)
         estimator.restart()
         both, wrong = True, False

@@ -118,9 +118,7 @@ def learn_at_true_poses(scene: Scene) -> FieldModel:
     return FieldModel(learn_field(Beams.of(poses, mount, angles, ranges), Recipe(0.05)))
 
 
-def make_estimator(
-    options: EstimatorOptions, scanner: Scanner, version: ModelVersion | None = None
-) -> PreciseEstimator:
+def make_estimator(options: EstimatorOptions, scanner: Scanner, version: ModelVersion | None) -> PreciseEstimator:
     """An estimator without a start pose, with a ``version`` of its model if given."""
     estimator = prepare_factory(options)(ScannerGeometry.of(scanner))
     assert isinstance(estimator, PreciseEstimator)  # noqa: S101 - for the type checker

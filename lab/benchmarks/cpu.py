@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import platform
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -23,7 +21,7 @@ from lab.benchmarks.viewer import ROBOT, TIMEOUT_S, FrameCounter
 from presage.live.latest_messages import LatestMessages
 from presage.session.ports import free_port
 from presage.session.stack import Stack
-from presage.terminal.output import check_file, provenance, write_json
+from presage.terminal.output import check_file, machine, provenance, write_json
 
 ON_THE_ROBOT = ("router", "estimator", "controller", "recorder")
 SERVICES = (*ON_THE_ROBOT, "simulator", "viewer")
@@ -103,7 +101,7 @@ def bench_cpu(seconds: float, beams: int, json_file: Path | None, console: Conso
     result |= {
         "seconds": seconds,
         "beams": beams,
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "machine": machine(),
         **provenance(),
     }
     write_json(json_file, result)

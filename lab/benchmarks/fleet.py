@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import platform
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -19,7 +18,7 @@ from common.geometry.world import load_world
 from lab.benchmarks.fleet_load import AnswerStatistics, FleetLoad
 from lab.benchmarks.fleet_table import DEPLOYMENTS, ONE_PROCESS, show
 from presage.session.stack import Stack
-from presage.terminal.output import check_file, provenance, write_json
+from presage.terminal.output import check_file, machine, provenance, write_json
 
 STARTUP_TIMEOUT_S = 120.0
 # Before a measurement, scans at a low rate let the estimators localise; repeated until all robots track.
@@ -243,7 +242,7 @@ def bench_fleet(estimators: str, plan: FleetPlan, json_file: Path | None, consol
             "rows": rows,
             "ratio_one_process_to_one_each": ratios,
             "load_average_1min": load_average,
-            "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+            "machine": machine(),
             **provenance(plan.seed),
         },
     )

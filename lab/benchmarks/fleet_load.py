@@ -139,11 +139,9 @@ class FleetLoad:
 
     def _window(self, count: int, sent: dict[tuple[str, int], int]) -> AnswerStatistics:
         """Matches the received answers to the scans in ``sent``, waiting up to `ANSWER_TIMEOUT_S` for the last ones."""
-        deadline, latency, states = (
-            time.monotonic() + ANSWER_TIMEOUT_S,
-            dict[tuple[str, int], float](),
-            dict[str, str](),
-        )
+        deadline = time.monotonic() + ANSWER_TIMEOUT_S
+        latency: dict[tuple[str, int], float] = {}  # ms
+        states: dict[str, str] = {}  # of each robot's last belief
         while len(latency) < len(sent) and (left := deadline - time.monotonic()) > 0:
             sample = self._inbox.get(left)
             if not isinstance(sample, Sample):

@@ -10,7 +10,8 @@ from rich.table import Table
 if TYPE_CHECKING:
     from lab.benchmarks.fleet import FleetPlan
 
-ONE_PROCESS, ONE_EACH = DEPLOYMENTS = ("one process", "one each")
+ONE_PROCESS = "one process"
+DEPLOYMENTS = (ONE_PROCESS, "one each")
 LARGE_FLEET = 1000  # robots, for the extrapolation
 CORE_LOAD = 0.7  # share of a core that one would plan to use
 MAX_OTHER_LOAD = 0.05  # share of the core that other processes may use without a warning

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import platform
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +26,7 @@ from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS, Scanner
 from presage.session.running_sessions import credentials_for
 from presage.session.stack import Stack
-from presage.terminal.output import check_file, provenance, write_json
+from presage.terminal.output import check_file, machine, provenance, write_json
 
 # The echo process uses the keys of a separate robot: it receives any bytes on `odom` and returns them on `truth`.
 ECHO_ROBOT, ECHO = "echo", "simulator"
@@ -109,6 +108,8 @@ def _measure(
             loop_ms += [(middle - began) * 1e3] if answered else []
             raw_ms += [(end - middle) * 1e3] if echoed else []
         time.sleep(max(0.0, 1 / rate - (time.perf_counter() - began)))
+    if not loop_ms or not raw_ms:
+        raise UserError(f"no scan was answered within {TIMEOUT_S:g} s: is this machine busy?")
     return {
         "scan_to_command_median_ms": float(np.median(loop_ms)),
         "scan_to_command_p99_ms": float(np.percentile(loop_ms, 99)),
@@ -119,7 +120,7 @@ def _measure(
         "scans": scans,
         "rate_hz": rate,
         "unanswered": lost,
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "machine": machine(),
         **provenance(seed=0),
     }
 

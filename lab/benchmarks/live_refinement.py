@@ -22,6 +22,7 @@ from lab.benchmarks.refinement import DRIVE_SEED, ROUGH_SEED, TEST_SECONDS, TEST
 from lab.experiments.results import markdown, millimetres
 from lab.integrity.cases import BEAMS, START_DEVIATION
 from lab.integrity.maps import noisy_grid
+from lab.statistics import root_mean_square
 from presage.terminal.output import check_file, provenance, write_json
 from services.estimator.factory import EstimatorOptions
 from services.estimator.precise.estimator import PreciseEstimator
@@ -108,7 +109,7 @@ def errors_of_test_drive(
     errors, aligned = (np.hypot(*(poses - path)[:, :2].T) for poses in (found, fitted(found, path)))
     return {
         "position_median_m": float(np.median(errors)),
-        "position_rms_m": float(np.sqrt((errors**2).mean())),
+        "position_rms_m": root_mean_square(errors),
         "position_max_m": float(errors.max()),
         "aligned_median_m": float(np.median(aligned)),
     }

@@ -17,6 +17,7 @@ from common.errors import UserError
 from common.geometry import se2
 from common.geometry.se2 import Array
 from lab.integrity.cases import CASES, make_trial
+from lab.statistics import root_mean_square
 from presage.learning.map_of_log import raw_drive
 from presage.logs.scan_files import read_scans
 from presage.terminal.output import check_file, provenance, write_json
@@ -127,7 +128,7 @@ def _rows(name: str, drive: RawDrive, errors: Callable[[Array], Errors], console
                 "drive": name,
                 "odometry": odometry,
                 **dict(zip(COLUMNS, map(float, values), strict=True)),
-                "position_rms_m": float(np.sqrt((position**2).mean())),
+                "position_rms_m": root_mean_square(position),
                 "closures": len(built.closures),
                 "lost": built.unmatched,
                 "placed": float(placed),

@@ -26,6 +26,7 @@ from lab.experiments.results import markdown, millimetres, number
 from lab.integrity.buildings import make_building
 from lab.integrity.cases import BEAMS
 from lab.integrity.changes import KidnappingPlaces, crowd
+from lab.statistics import root_mean_square
 from presage.terminal.output import check_file, provenance, write_json
 from services.mapper.slam.drive import Laser, RawDrive
 from services.mapper.slam.grid import grid_of_scans
@@ -36,7 +37,7 @@ CELL_M = 0.05
 FALSE_WALL_M = 0.15  # an occupied cell farther than this in front of all surfaces is no surface
 PEOPLE_PER_M2 = 0.08
 
-Kidnapping = Callable[[Scene, Array], Array]  # returns the pose (3,) to which the robot is carried after a path (N, 3)
+ChoosePlace = Callable[[Scene, Array], Array]  # returns the pose (3,) to which the robot is carried after a path (N, 3)
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class MappingFault:
     """What could deceive the mapper in a drive."""
 
     world: Literal["office", "symmetric", "twins"] = "office"
-    kidnapping: Kidnapping | None = None  # in the middle of the drive
+    kidnapping: ChoosePlace | None = None  # in the middle of the drive
     crowd: bool = False
 
 
@@ -167,7 +168,7 @@ def map_drive(disturbed: DisturbedDrive, odometry: bool) -> dict[str, Any]:
     return {
         "placed": float(known.mean()),
         "wrong_place": float(np.count_nonzero(~right) / len(built.poses)),
-        "position_rms_m": float(np.sqrt((errors**2).mean())),  # of scans that are not at a wrong place
+        "position_rms_m": root_mean_square(errors),  # of scans that are not at a wrong place
         "position_max_m": float(errors.max()),
         "false_walls": false_walls(placed, drive.ranges[known], drive.laser, disturbed.world),
         "closures": len(built.closures),

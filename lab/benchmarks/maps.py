@@ -27,6 +27,7 @@ from services.simulator.people import People
 from services.simulator.simulation import Simulation, SimulationSetup
 
 SCANS = 100
+CELL_M = 0.05
 ROOM_WIDTH_M, DOOR_WIDTH_M = 6.0, 1.2
 
 
@@ -90,11 +91,11 @@ def _step_and_scan(simulation: Simulation) -> None:
         simulation.observe()
 
 
-def rooms(size: int, seed: int = 0, cell: float = 0.05) -> Cells:
-    """A random grid (size, size) of square rooms with doors and boxes, surrounded by unknown cells; ``cell`` in m."""
+def rooms(size: int, seed: int = 0) -> Cells:
+    """A random grid (size, size) of square rooms with doors and boxes, surrounded by unknown cells."""
     rng = np.random.default_rng(seed)
     values = np.full((size, size), UNKNOWN, np.uint8)
-    edge, room, door = size // 50, round(ROOM_WIDTH_M / cell), round(DOOR_WIDTH_M / cell)
+    edge, room, door = size // 50, round(ROOM_WIDTH_M / CELL_M), round(DOOR_WIDTH_M / CELL_M)
     lines = range(edge, size - edge + 1, room)
     last = lines[-1]
     values[edge:last, edge:last] = FREE

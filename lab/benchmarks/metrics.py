@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import platform
 import time
 import urllib.request
 from collections import Counter
@@ -24,7 +22,7 @@ from common.runtime.metrics import LoopCounts, ServiceMetrics
 from lab.benchmarks.cpu import cpu_seconds
 from presage.session.ports import free_port
 from presage.session.stack import Stack
-from presage.terminal.output import check_file, provenance, write_json
+from presage.terminal.output import check_file, machine, provenance, write_json
 
 SERVICES = ("simulator", "estimator", "controller")
 WARM_UP_S = 3.0  # before the first round
@@ -109,7 +107,7 @@ def bench_metrics(seconds: float, rounds: int, json_file: Path | None, console: 
         "observation_us": observation_us(),
         "seconds": seconds,
         "rounds": rounds,
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "machine": machine(),
         **provenance(),
     }
     console.print(

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from common.bus.bus import Bus, open_bus
+from common.bus.bus import Bus, Link, open_bus
 from common.errors import UserError
 from common.messages.definitions import Health, Scan
 from common.messages.topics import HEALTH, TOPICS, Topic
@@ -44,9 +44,14 @@ class RecorderLoad:
     beams: int = 811  # per message; each is a scan of random ranges, 3.4 kB that hardly compress
 
     @property
+    def per_topic(self) -> int:
+        """Number of messages on each topic."""
+        return int(self.rate * self.seconds) // len(LOAD_TOPICS)
+
+    @property
     def count(self) -> int:
-        """Total number of messages."""
-        return int(self.rate * self.seconds)
+        """Number of messages on all topics."""
+        return self.per_topic * len(LOAD_TOPICS)
 
 
 def publish_main() -> None:
@@ -58,16 +63,12 @@ def publish_main() -> None:
         Scan(stamp_ns=0, angle_min=0, angle_increment=0.01, range_min=0, range_max=25, ranges=r).model_dump()
         for r in ranges
     ]
-    from common.bus.bus import Link
-
     with open_bus(Link(robot=ROBOT, connect=(os.environ["PRESAGE_CONNECT"],))) as bus:
         for topic in LOAD_TOPICS:
             if not bus.wait_matching(topic, 20):
                 raise SystemExit(f"no subscriber to {topic.name} within 20 s")
         sums, late = _send(bus, load, bodies)
-        sent = {
-            topic.key(ROBOT): {"count": load.count // len(LOAD_TOPICS), "crc": sums[topic]} for topic in LOAD_TOPICS
-        }
+        sent = {topic.key(ROBOT): {"count": load.per_topic, "crc": sums[topic]} for topic in LOAD_TOPICS}
         Path(job["result"]).write_text(json.dumps({"sent": sent, "late_s": late}), encoding="utf-8")
         while True:  # keep the session open until the recorder has received everything; the parent ends this process
             time.sleep(60)
@@ -76,7 +77,7 @@ def publish_main() -> None:
 def _send(bus: Bus, load: RecorderLoad, bodies: list[dict[str, Any]]) -> tuple[dict[Topic, int], float]:
     """Sends the load. Returns each topic's checksum over its payloads in order, and the last message's delay in s."""
     sums, began = dict.fromkeys(LOAD_TOPICS, 0), time.monotonic()
-    for number in range(load.count // len(LOAD_TOPICS) * len(LOAD_TOPICS)):
+    for number in range(load.count):
         due = began + number / load.rate
         if due - time.monotonic() > SEND_INTERVAL_S:
             time.sleep(SEND_INTERVAL_S)
@@ -116,7 +117,7 @@ def _observe(
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("recording", total=load.count)
         received = 0
-        while received < load.count // len(LOAD_TOPICS) * len(LOAD_TOPICS):
+        while received < load.count:
             stack.check()
             if time.monotonic() - began > 60 + 4 * load.seconds:
                 raise UserError(f"only {received} of {load.count} messages arrived: is this machine busy?")
@@ -166,7 +167,7 @@ def bench_recorder(load: RecorderLoad, out: Path | None, json_file: Path | None,
     Returns exit status 1 if a message was lost or altered, or if a limit was exceeded.
     """
     check_file(json_file, "--json")
-    if load.count < len(LOAD_TOPICS):
+    if not load.count:
         raise UserError(
             f"--seconds {load.seconds:g} at --rate {load.rate:g} give less than one message per topic: increase either"
         )

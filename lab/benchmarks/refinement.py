@@ -22,6 +22,7 @@ from lab.experiments.trials import run_trials
 from lab.integrity.buildings import Building
 from lab.integrity.cases import BEAMS, START_DEVIATION
 from lab.integrity.maps import noisy_grid
+from lab.statistics import root_mean_square
 from presage.learning.map_of_log import MapOptions, map_command
 from presage.learning.train_drive import TrainDriveOptions, train_from_drive
 from presage.logs.log import Reading
@@ -95,7 +96,7 @@ def refine_and_test(job: RefinementJob) -> dict[str, Any]:
             "start": start,
             "seconds": taken,
             "placed": len(placed) / len(poses),
-            "trajectory_rms_m": float(np.sqrt((aligned**2).mean())),
+            "trajectory_rms_m": root_mean_square(aligned),
             "frame_error_m": None if rough is None else float(np.hypot(*(placed - truths)[:, :2].mean(axis=0))),
             "rough": None if rough is None else check.rough(rough),
             "after": check.learned(weights.path_of(out, made.stem), load_world(str(made)), frame),
@@ -129,13 +130,13 @@ class ModelTest:
         walls = wall_errors(model, se2.compose(se2.inverse(frame), self.poses), self.drive, frame)
         return {
             "position_median_m": float(np.median(errors)),
-            "position_rms_m": float(np.sqrt((errors**2).mean())),
+            "position_rms_m": root_mean_square(errors),
             "position_max_m": float(errors.max()),
             "position_in_frame_median_m": float(np.median(in_frame)),  # the map's frame taken for that of the world
-            "position_in_frame_rms_m": float(np.sqrt((in_frame**2).mean())),
+            "position_in_frame_rms_m": root_mean_square(in_frame),
             "tracking": float(tracking.mean()),
             "walls_median_m": float(np.median(walls)),
-            "walls_rms_m": float(np.sqrt((walls**2).mean())),
+            "walls_rms_m": root_mean_square(walls),
         }
 
     def _localise(self, options: EstimatorOptions, frame: Array) -> tuple[Array, Array]:

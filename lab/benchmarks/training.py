@@ -31,7 +31,7 @@ QUANTITIES = {
 class TrainingJob:
     """One training of one of the shipped models."""
 
-    model: str  # name of its card, corridor-precise
+    model: str  # name of its card, such as corridor-precise
     seed: int
     samples: int  # training scans
     out: str  # folder

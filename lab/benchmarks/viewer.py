@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import platform
 import threading
 import time
 from dataclasses import dataclass, field
@@ -26,7 +24,7 @@ from common.errors import UserError
 from common.messages.topics import CMD_VEL, SCAN
 from presage.session.ports import free_port
 from presage.session.stack import Stack
-from presage.terminal.output import check_file, provenance, write_json
+from presage.terminal.output import check_file, machine, provenance, write_json
 
 WARM_UP_S = 3.0  # at the start of every round, left out of the statistics
 TIMEOUT_S = 60.0
@@ -89,7 +87,11 @@ def measure(seconds: float, rounds: int, beams: int, console: Console) -> dict[s
             stack.wait_alive(bus)
             _first_command(bus, stack)
             for number in track(range(2 * rounds), "without, with", console=console, transient=True):
-                (_with_viewer if number % 2 else _without)(bus, stack, seconds, viewed if number % 2 else without)
+                if number % 2:
+                    _measure_with_viewer(bus, stack, seconds, viewed)
+                else:
+                    time.sleep(WARM_UP_S)
+                    _measure_latency(bus, stack, seconds, without)
     return _report(without, viewed, seconds, rounds, beams)
 
 
@@ -103,12 +105,7 @@ def _first_command(bus: Bus, stack: Stack) -> None:
             raise UserError(f"the controller sent no velocity command within {TIMEOUT_S:g} s")
 
 
-def _without(bus: Bus, stack: Stack, seconds: float, cost: ViewerCost) -> None:
-    time.sleep(WARM_UP_S)
-    _measure_latency(bus, stack, seconds, cost)
-
-
-def _with_viewer(bus: Bus, stack: Stack, seconds: float, cost: ViewerCost) -> None:
+def _measure_with_viewer(bus: Bus, stack: Stack, seconds: float, cost: ViewerCost) -> None:
     port = free_port()
     stack.start("viewer", "--port", str(port))
     stack.wait_alive(bus)
@@ -170,7 +167,7 @@ def _report(without: ViewerCost, viewed: ViewerCost, seconds: float, rounds: int
         "seconds": seconds,
         "rounds": rounds,
         "beams": beams,
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "machine": machine(),
         **provenance(),
     }
 

@@ -30,9 +30,10 @@ from lab.benchmarks.building_drives import (
 )
 from lab.experiments.results import markdown
 from lab.experiments.trials import run_trials
-from lab.integrity.buildings import Building, Room, random_place
+from lab.integrity.buildings import Building, Room
 from lab.integrity.cases import BEAMS
-from lab.integrity.changes import MAX_PLACES
+from lab.integrity.changes import move_pieces
+from lab.statistics import root_mean_square
 from presage.learning.map_of_log import MapOptions, map_command
 from presage.logs.log import Reading
 from presage.terminal.output import check_file, make_folder, provenance, write_json
@@ -140,17 +141,8 @@ def _visit(
 
 def move_furniture_in(building: Building, rooms: list[Room], rng: np.random.Generator) -> Building:
     """The building after all furniture of some rooms was moved to other places of these rooms, if there was room."""
-    moves = [any(contains(room, np.array(piece.pose[:2])[None])[0] for room in rooms) for piece in building.furniture]
-    floor, part = building.floor(), replace(building, rooms=tuple(rooms))
-    for piece, moved in zip(building.furniture, moves, strict=True):
-        if not moved:
-            floor.put(piece)
-    for piece, moved in zip(building.furniture, moves, strict=True):
-        if moved:
-            for _ in range(MAX_PLACES):
-                if floor.put(random_place(part, piece, rng)):
-                    break
-    return building.furnished(floor.pieces)
+    places = np.array([piece.pose[:2] for piece in building.furniture]).reshape(-1, 2)
+    return move_pieces(building, np.any([contains(room, places) for room in rooms], axis=0), rooms, rng)
 
 
 def _map_drive(path: Array, options: MapOptions) -> dict[str, Any]:
@@ -163,7 +155,7 @@ def _map_drive(path: Array, options: MapOptions) -> dict[str, Any]:
     errors = np.hypot(*(trajectory[:, 1:3] - path[numbers, :2]).T)
     return {
         "drive_s": PERIOD_S * len(path),
-        "trajectory_rms_m": float(np.sqrt((errors**2).mean())),
+        "trajectory_rms_m": root_mean_square(errors),
         "update_s": taken,
         "map_bytes": options.out.with_suffix(".pgm").stat().st_size,
         "model_bytes": weights.path_of(options.out.parent, options.out.stem).stat().st_size,

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from common.robot.scanner import SCANNERS
-from lab.cli.options import Trials, worker_count
+from lab.cli.options import Trials, mount_pose, worker_count
 from presage.terminal.options import Json, MountText, WorldName, console
 
 app = typer.Typer(help="Benchmarks. Each compares with a baseline or a limit in the same run.", no_args_is_help=True)
 
 BEAMS = 622  # as in the paper
 Seconds = Annotated[float, typer.Option(min=0.1, help="Duration of one measurement, s.")]
-Rounds = Annotated[int, typer.Option(min=1, help="Number of rounds with and without what is measured.")]
+Rounds = Annotated[int, typer.Option(min=1, help="Number of rounds, each with and without what is measured.")]
 GeneratedFolder = Annotated[
     Path | None, typer.Option("--out", "-o", help="Folder in which to keep the generated files.")
 ]
@@ -133,7 +133,7 @@ def bench_mapping_faults(
 @app.command("training")
 def bench_training(
     models: Annotated[
-        str, typer.Option(help="Comma-separated models, corridor-precise. Defaults to all shipped.")
+        str, typer.Option(help="Comma-separated models, such as corridor-precise. Defaults to all that are shipped.")
     ] = "",
     seeds: Annotated[int, typer.Option(min=1, help="Number of trainings of each model, with seeds from 1 on.")] = 5,
     samples: Annotated[
@@ -240,7 +240,9 @@ def bench_accuracy(
         float, typer.Option(min=0.05, help="Duration of the tracked path of each seed, at the scanner's rate.")
     ] = 2.0,
     seed: Seed = 1,
-    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds, from --seed on; the rows are over all.")] = 1,
+    seeds: Annotated[
+        int, typer.Option(min=1, help="Number of seeds, from --seed on; each row covers all of them.")
+    ] = 1,
     json_file: Json = None,
     figure: Annotated[Path | None, typer.Option(help="File for a figure: PNG, SVG or PDF.")] = None,
     markdown: Annotated[bool, typer.Option("--markdown", help="Print a short Markdown table, as in README.")] = False,
@@ -286,7 +288,7 @@ def bench_distortion(
     seed: Seed = 1,
     json_file: Json = None,
 ) -> None:
-    """Error at 1 m/s and 1 rad/s if beams are measured one after another, over that with instantaneous scans.
+    """Errors at 1 m/s and 1 rad/s if beams are measured one after another, relative to instantaneous scans.
 
     Example: `presage bench distortion --worlds office --drives 2 --json distortion.json`.
     """
@@ -305,7 +307,7 @@ def bench_integrity(
         str, typer.Option(help="Comma-separated: precise, particle-filter, particle-filter-recovery, amcl-defaults.")
     ] = "precise,particle-filter",
     model: Annotated[
-        str, typer.Option(help="Of precise: learned (30 s for each map), or exact for a quick run.")
+        str, typer.Option(help="Model of precise: learned (30 s for each map), or exact for a quick run.")
     ] = "learned",
     seconds: Annotated[
         float | None, typer.Option(min=0.1, help="Length of a drive. Defaults to 120 s for moved-*, 60 s otherwise.")
@@ -316,7 +318,7 @@ def bench_integrity(
     ] = "",
     mount: MountText = "",
 ) -> None:
-    """Whether estimators are right about themselves in generated buildings that differ from their maps.
+    """How often estimators report a wrong pose as right, in generated buildings that differ from their maps.
 
     Each trial is one case in one building. After Ctrl-C the same command continues, unless the code has changed. Prints
     a table for each estimator, and writes integrity.md, .json, .trials.jsonl and a reliability diagram.
@@ -325,14 +327,13 @@ def bench_integrity(
     `presage bench integrity --worlds 5 --cases moved-50,wrong-map --model exact --estimators precise --out quick`;
     `presage bench integrity --logs uwb.npz,fr079.npz --mount 0,0,0 --out results`.
     """
-    from common.geometry.pose_text import parse_pose
     from lab.integrity.cases import CASES
     from lab.integrity.logs import cases_of
     from lab.integrity.report import bench_integrity as run
     from lab.integrity.runner import IntegrityPlan
 
     names = tuple(cases.split(",")) if cases else tuple(CASES)
-    laser_pose: Any = tuple(parse_pose(mount, "--mount").tolist()) if mount else None
+    laser_pose = mount_pose(mount)
     of_logs = [case for log in logs.split(",") if log for case in cases_of(log, laser_pose)]
     plan = IntegrityPlan(worlds, seed, names, tuple(estimators.split(",")), model, seconds, tuple(of_logs))
     run(plan, out, worker_count(), console)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from common.errors import UserError
 from lab.cli.navigation import dock, explore, navigate
-from lab.cli.options import Alpha, Estimators, ExperimentSeed, Out, Trials, show, worker_count
+from lab.cli.options import Alpha, Estimators, ExperimentSeed, Out, Trials, mount_pose, show, worker_count
 from presage.terminal.options import GroupWithOptions, console
 from presage.terminal.output import make_folder
 
@@ -41,13 +41,13 @@ def e1(
     `presage experiment e1 --estimators "paper,precise" --iterations 200`.
     """
     from lab.experiments.estimators import PAPER_DESCENT, parse_estimators
-    from lab.paper import e1_localisation as localisation
+    from lab.paper import e1_localisation
 
     seed, out = context.obj
-    job = localisation.LocalisationJob(0, seed, iterations)
+    job = e1_localisation.LocalisationJob(0, seed, iterations)
     job = replace(job, descent=replace(PAPER_DESCENT, alpha=alpha)) if alpha is not None else job
     job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
-    show(localisation, lambda: localisation.run(job, trials, out, worker_count(), console), out)
+    show(e1_localisation, lambda: e1_localisation.run(job, trials, out, worker_count(), console), out)
 
 
 @app.command("e2")
@@ -61,12 +61,12 @@ def e2(
     Examples: `presage experiment e2 --trials 2`; `presage experiment e2 --estimators precise`.
     """
     from lab.experiments.estimators import parse_estimators
-    from lab.paper import e2_crossing as crossing
+    from lab.paper import e2_crossing
 
     seed, out = context.obj
-    job = crossing.CrossingJob(0, seed)
+    job = e2_crossing.CrossingJob(0, seed)
     job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
-    show(crossing, lambda: crossing.run(job, trials, out, worker_count(), console), out)
+    show(e2_crossing, lambda: e2_crossing.run(job, trials, out, worker_count(), console), out)
 
 
 @app.command("e3")
@@ -84,16 +84,16 @@ def e3(
     `presage experiment --out any e3 --any --trials 20 --estimators precise`.
     """
     from lab.experiments.estimators import parse_estimators
-    from lab.paper import e3_navigation as navigation
+    from lab.paper import e3_navigation
 
     seed, out = context.obj
-    job = navigation.PaperNavigationJob(0, seed, free=free)
+    job = e3_navigation.PaperNavigationJob(0, seed, free=free)
     job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
-    show(navigation, lambda: navigation.run(job, trials, out, worker_count(), console), out)
+    show(e3_navigation, lambda: e3_navigation.run(job, trials, out, worker_count(), console), out)
 
 
 @app.command("alpha")
-def alpha_sweep(
+def step_size_of_perception(
     context: typer.Context,
     trials: Trials = 25,
 ) -> None:
@@ -101,27 +101,24 @@ def alpha_sweep(
 
     Example: `presage experiment alpha --trials 10`.
     """
-    from lab.paper import alpha_sweep as step_size
-    from lab.paper import e1_localisation as localisation
+    from lab.paper import alpha_sweep, e1_localisation
 
     seed, out = context.obj
-    show(
-        step_size,
-        lambda: step_size.run(localisation.LocalisationJob(0, seed, 50), trials, out, worker_count(), console),
-        out,
-    )
+    job = e1_localisation.LocalisationJob(0, seed, 50)
+    show(alpha_sweep, lambda: alpha_sweep.run(job, trials, out, worker_count(), console), out)
 
 
 @app.command("steps")
-def step_sizes(context: typer.Context, trials: Trials = 10) -> None:
+def step_sizes_of_action(context: typer.Context, trials: Trials = 10) -> None:
     """E3 with a range of step sizes β and γ, also with the paper's teleports: which give the paper's 12.5 iterations.
 
     Example: `presage experiment steps --trials 2`.
     """
-    from lab.paper import step_sizes as stepping
+    from lab.paper import step_sizes
 
     seed, out = context.obj
-    show(stepping, lambda: stepping.run(stepping.StepSizeJob(0, seed), trials, out, worker_count(), console), out)
+    job = step_sizes.StepSizeJob(0, seed)
+    show(step_sizes, lambda: step_sizes.run(job, trials, out, worker_count(), console), out)
 
 
 @app.command("samples")
@@ -143,7 +140,7 @@ def similar_objects(
     context: typer.Context,
     trials: Trials = 30,
 ) -> None:
-    """Worlds with similar objects or two identical rooms: places found, wrong claims, and ambiguity kept.
+    """Worlds with similar objects or two identical rooms: places found, places reported wrongly, both rooms kept.
 
     First trains the estimators in three worlds, which takes several minutes however few the trials are.
 
@@ -195,15 +192,13 @@ def real_drive(
     `presage experiment real --log drive.npz --mount 0,0,0 --world first_half.yaml --quick`;
     `presage experiment --out mine real --log fr079.mcap --world fr079.yaml --name fr079 --every 50`.
     """
-    from common.geometry.pose_text import parse_pose
-    from lab.real_logs import experiment as real
+    from lab.real_logs import experiment
 
     seed, out = context.obj
     if not re.fullmatch(r"[\w.-]*", name):
         raise UserError(f"--name {name!r}: use only letters, digits, '.', '_' and '-', as it becomes a file name")
-    laser_pose: Any = tuple(parse_pose(mount, "--mount").tolist()) if mount else None
-    job = real.RealLogJob(log, world, laser_pose, every, quick, seed, name, exchange)
-    show(real, lambda: real.run(job, out, worker_count(), console), out)
+    job = experiment.RealLogJob(log, world, mount_pose(mount), every, quick, seed, name, exchange)
+    show(experiment, lambda: experiment.run(job, out, worker_count(), console), out)
 
 
 @app.command("peers")

@@ -34,8 +34,18 @@ Alpha = Annotated[
 ]
 
 
+def mount_pose(text: str) -> tuple[float, float, float] | None:
+    """Pose of the laser in base_link (m, m, rad) in the option --mount; None if the text is empty."""
+    from common.geometry.pose_text import parse_pose
+
+    if not text:
+        return None
+    x, y, yaw = parse_pose(text, "--mount").tolist()
+    return x, y, yaw
+
+
 def worker_count(extra: int = 0) -> int:
-    """Number of worker processes: PRESAGE_WORKERS, by default one for each core and ``extra`` ones."""
+    """Number of worker processes: PRESAGE_WORKERS. Defaults to one for each core, and ``extra`` ones."""
     return int(os.environ.get("PRESAGE_WORKERS") or (os.cpu_count() or 1) + extra)
 
 

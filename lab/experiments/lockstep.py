@@ -45,7 +45,6 @@ class LockstepRun:
     controller: tuple[str, ...] = ("--preset", "paper")  # command-line arguments of the controller
     simulator: tuple[str, ...] = ()  # command-line arguments of the simulator
     sweep: bool = False  # whether motion distorts the scans, as by default in the simulator
-    start_known: bool = True  # whether the estimator is given the true start
     # Whether the run ends when the controller reports that the goal is reached or refused; otherwise it ends when the
     # robot truly is near the goal.
     ends_with_status: bool = False
@@ -72,6 +71,16 @@ class RunTrace:
     def believed(self) -> Array:
         """Believed poses (N, 3) at the same scans."""
         return np.array([belief.pose.array() for belief in self.beliefs])
+
+    @property
+    def last_status(self) -> Status | None:
+        """The controller's last status; None if it sent none."""
+        return self.statuses[max(self.statuses)] if self.statuses else None
+
+    @property
+    def seconds(self) -> float:
+        """Time in s from the first scan until the run ended or was aborted."""
+        return (self.truths[-1].stamp_ns if self.ended_ns is None else self.ended_ns) * 1e-9
 
     def has(self, stamp_ns: int) -> bool:
         """Whether the truth, the belief and the status of that scan have been received."""
@@ -121,9 +130,8 @@ def run(params: LockstepRun, stack: Stack) -> RunTrace:
     pose, world, seed = f"{x!r},{y!r},{yaw!r}", ("--world", params.world), ("--seed", str(params.seed))
     with open_bus(stack.link()) as bus:
         messages = LatestMessages(bus, TRUTH, BELIEF, STATUS, *((HEALTH,) if params.ends_with_status else ()))
-        start_pose = ("--initial-pose", pose) if params.start_known else ()
         stack.start("controller", *world, *params.controller, "--belief-timeout", "60")
-        stack.start("estimator", *world, *seed, *start_pose, *params.estimator)
+        stack.start("estimator", *world, *seed, "--initial-pose", pose, *params.estimator)
         stack.start(
             "simulator",
             *world,

@@ -61,8 +61,10 @@ def read(path: Path) -> dict[str, Any]:
     try:
         return dict(json.loads(path.read_text(encoding="utf-8")))
     except FileNotFoundError:
+        name = path.stem.split("-")[0]
         raise UserError(
-            f"{path}: no such result; create it with: presage experiment {path.stem.split('-')[0]} (see its --help)"
+            f"{path}: no such result; create it with `presage experiment {name}` or `presage bench {name}` (the target "
+            "`tables` of the Makefile has the command of each result)"
         ) from None
     except ValueError as error:
         raise UserError(f"{path}: not a result of `presage experiment` ({error})") from None

@@ -18,6 +18,7 @@ from common.messages.definitions import Belief, Goal, Map, Odom, Pose, Scan, Twi
 from common.robot.robot import Robot
 from common.robot.scanner import SCANNERS
 from lab.benchmarks.mapping import trajectory_errors
+from lab.statistics import root_mean_square
 from services.controller.growing_map import PlanningMap
 from services.controller.navigator import Navigator
 from services.controller.policies.exploration import ExplorationState, NoPath, Viewpoint
@@ -39,14 +40,13 @@ class ExplorationRun:
 
     truths: list[Array] = field(default_factory=list)  # (3,) true pose at each scan
     beliefs: list[Array] = field(default_factory=list)  # (3,) believed pose at each scan, in map
-    contacts: list[Array] = field(default_factory=list)  # (3,) true poses with a contact
+    contact_scans: int = 0  # scans at which the robot touched something
     held_back: int = 0  # scans at which the obstacle stop held the robot
     unmatched: int = 0  # scans that did not match the map
     phase: str = "exploring"
     reason: str = ""  # of the last status
     map: Map | None = None
     choice_ms: list[float] = field(default_factory=list)  # duration of each choice of a viewpoint
-    targets: list[Array] = field(default_factory=list)  # (3,) in map, the viewpoints that were chosen
 
 
 class RobotWithMapper:
@@ -104,8 +104,6 @@ class RobotWithMapper:
         began = time.perf_counter()
         viewpoint = self._choose(exploration_state)
         self.run.choice_ms.append(1e3 * (time.perf_counter() - began))
-        if isinstance(viewpoint, Viewpoint):
-            self.run.targets.append(viewpoint.pose)
         self._navigator.use_viewpoint(viewpoint, exploration_state)
 
 
@@ -120,7 +118,7 @@ def explore(
         while simulation.stamp_ns < limit_s * 1e9 and last_scans < LAST_SCANS:
             odom, truth, scan = simulation.observe()
             run.truths.append(truth.pose.array())
-            run.contacts += [truth.pose.array()] if truth.contact else []
+            run.contact_scans += truth.contact
             run.held_back += truth.stopped
             twist = explorer.step(odom, scan)
             last_scans += explorer.finished
@@ -146,11 +144,11 @@ def measure(run: ExplorationRun, world: World, robot: Robot) -> dict[str, Any]:
         "reachable_m2": float(shapely.area(area)),
         "path_m": float(np.hypot(*np.diff(truths[:, :2], axis=0).T).sum()),
         "return_error_m": float(np.hypot(*(truths[-1] - truths[0])[:2])),
-        "contact_scans": len(run.contacts),
+        "contact_scans": run.contact_scans,
         "held_back_scans": run.held_back,
         "lost_scans": run.unmatched,
         "seconds": len(truths) / SCANNERS["tim571"].rate,
-        "belief_rms_m": float(np.sqrt((errors**2).mean())),
+        "belief_rms_m": root_mean_square(errors),
         "choices": len(run.choice_ms),
         "choice_ms_median": float(np.median(run.choice_ms)) if run.choice_ms else 0.0,
         "choice_ms_max": float(np.max(run.choice_ms)) if run.choice_ms else 0.0,

@@ -15,11 +15,14 @@ from rich.console import Console
 
 from common.errors import UserError
 from common.versions import commit, versions
+from lab.experiments.results import markdown
 from lab.fault_injection.faults import FAULTS, Fault
 from lab.fault_injection.hosts import Network, enter_own_namespaces, namespaces_unavailable_reason
 from lab.fault_injection.measure import MAX_RECOVERY_TIME_S, MAX_STOP_TIME_S, FaultOutcome, measure
 from lab.fault_injection.system import System
 from presage.terminal.output import check_file, write_json
+
+HEADS = ("fault", "detected (s)", "stopped (s)", "restarted (s)", "recovered (s)", "lowest speed (m/s)", "as expected")
 
 
 def select_faults(names: Sequence[str]) -> list[Fault]:
@@ -36,8 +39,8 @@ def bench_chaos(
     json_file: Path | None,
     console: Console,
     *,
-    one_host: bool = False,
-    quiet: bool = True,
+    one_host: bool,
+    quiet: bool,
 ) -> int:
     """Injects the faults, prints the table and writes it to ``json_file`` if given.
 
@@ -55,7 +58,7 @@ def bench_chaos(
         with console.status("starting the system"):
             system = stack.enter_context(System(folder, network, environment, quiet=quiet))
         outcomes, skipped = _inject(faults, repeats, system, one_host_reason, console)
-    print(faults_table(outcomes))
+    print(markdown(HEADS, fault_rows(outcomes)))
     data = {
         "command": "presage bench chaos",
         "arguments": {"faults": list(names), "repeats": repeats},
@@ -96,9 +99,6 @@ def _inject(
     return outcomes, skipped
 
 
-HEAD = ("fault", "detected (s)", "stopped (s)", "restarted (s)", "recovered (s)", "lowest speed (m/s)", "as expected")
-
-
 def fault_rows(outcomes: Sequence[FaultOutcome]) -> list[tuple[str, ...]]:
     """Rows of the table: for each fault the worst of its repeats."""
     table_rows = []
@@ -115,9 +115,3 @@ def fault_rows(outcomes: Sequence[FaultOutcome]) -> list[tuple[str, ...]]:
         times = [worst(what) for what in ("detected_s", "stopped_s", "start_s", "again_s")]
         table_rows.append((name, *times, speed, f"{as_expected}/{len(rows)}"))
     return table_rows
-
-
-def faults_table(outcomes: Sequence[FaultOutcome]) -> str:
-    """The table as Markdown."""
-    lines = [HEAD, ("---",) * len(HEAD), *fault_rows(outcomes)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

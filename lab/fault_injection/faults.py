@@ -97,13 +97,12 @@ def _degrade_link(system: System) -> None:
     system.network.degrade("robot", delay_ms=50, jitter_ms=20, loss=0.1)
 
 
-def _set_clock_ahead(system: System) -> None:
-    # The restarted estimator runs with a clock that is a minute ahead.
+def _kill_and_set_clock_ahead(system: System) -> None:
     system.kill("estimator")
     system.extra["estimator"] = {"LD_PRELOAD": _faketime(), "FAKETIME": "+60s", "DONT_FAKE_MONOTONIC": "1"}
 
 
-def _reset_clock(system: System) -> None:
+def _restart_with_wrong_clock(system: System) -> None:
     system.restart("estimator")
 
 
@@ -208,8 +207,8 @@ FAULTS: tuple[Fault, ...] = (
     Fault(
         "clock a minute ahead",
         "the estimator is killed and restarted with a wrong clock",
-        _set_clock_ahead,
-        _reset_clock,
+        _kill_and_set_clock_ahead,
+        _restart_with_wrong_clock,
         "stops",
         services=("estimator",),
         restarts_process=True,

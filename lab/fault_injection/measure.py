@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -87,11 +88,12 @@ def _measure_recovery(system: System, fault: Fault, returned: float, outcome: Fa
     outcome.again_s = None if row is None else row["t"] - returned
 
 
-def _is_working(service: str) -> Any:
+def _is_working(service: str) -> Callable[[Row], bool]:
+    """Returns a predicate: whether an event is a health message of the service, or shows that it returned."""
     return lambda row: (row["what"] == "health" and row["service"] == service) or is_back(service)(row)
 
 
-def _wait_for(timeline: Timeline, since: float, wanted: Any, timeout: float) -> Row | None:
+def _wait_for(timeline: Timeline, since: float, wanted: Callable[[Row], bool], timeout: float) -> Row | None:
     try:
         return timeline.wait(since, wanted, timeout, "")
     except UserError:

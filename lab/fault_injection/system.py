@@ -48,7 +48,7 @@ class System(Stack):
     ) -> None:
         """Recordings and logs are written into ``folder``."""
         super().__init__(ROBOT, free_port(), quiet=quiet, environment=environment)
-        self.folder, self.network, self.beams = folder, network, beams
+        self.folder, self.network = folder, network
         self.timeline = Timeline()
         self.goal = 0  # number of goals sent so far
         self.extra: dict[str, dict[str, str]] = {}  # additional environment variables by process

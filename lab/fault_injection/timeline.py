@@ -29,11 +29,11 @@ class Timeline:
             self.rows.append(row)
             self._changed.notify_all()
 
-    def first(self, since: float, wanted: Callable[[Row], bool], until: float = float("inf")) -> Row | None:
-        """The first event at or after ``since`` (s) and before ``until`` for which ``wanted`` is true, if any."""
+    def first(self, since: float, wanted: Callable[[Row], bool]) -> Row | None:
+        """The first event at or after ``since`` (s) for which ``wanted`` is true, if any."""
         with self._lock:
             rows = list(self.rows)
-        return next((row for row in rows if since <= row["t"] < until and wanted(row)), None)
+        return next((row for row in rows if row["t"] >= since and wanted(row)), None)
 
     def wait(self, since: float, wanted: Callable[[Row], bool], timeout: float, what: str) -> Row:
         """Waits for the first event at or after ``since`` (s) for which ``wanted`` is true, and returns it.

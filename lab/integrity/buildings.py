@@ -15,7 +15,7 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.shapes import Box, Obstacle
 from common.geometry.world import World
-from lab.accuracy.furniture import CATALOGUE, Floor, FurniturePiece, Point, Shape
+from lab.accuracy.furniture import CATALOGUE, FloorSpace, FurniturePiece, Point, Shape
 
 Kind = Literal["office", "symmetric", "corridor"]
 
@@ -75,10 +75,10 @@ class Building:
         obstacles = [*self.walls, *(part for piece in self.furniture for part in piece.obstacles), *extra]
         return World(name=self.name, boundary=list(self.boundary), obstacles=obstacles)
 
-    def floor(self) -> Floor:
+    def floor(self) -> FloorSpace:
         """The floor without furniture."""
         doors = shapely.union_all([room.door_area() for room in self.rooms])
-        return Floor(World(name=self.name, boundary=list(self.boundary), obstacles=list(self.walls)), doors)
+        return FloorSpace(World(name=self.name, boundary=list(self.boundary), obstacles=list(self.walls)), doors)
 
     def furnished(self, pieces: Sequence[FurniturePiece]) -> Building:
         """The same walls with other furniture."""
@@ -258,7 +258,7 @@ def _item(rng: np.random.Generator, catalogue: Sequence[tuple[Shape, Point, Poin
 
 
 def _furnish(
-    floor: Floor, room: Room, items: Sequence[TemplateItem], rng: np.random.Generator, deviation: float
+    floor: FloorSpace, room: Room, items: Sequence[TemplateItem], rng: np.random.Generator, deviation: float
 ) -> None:
     """Puts down those items for which there is room, with ``deviation`` times the usual differences between rooms."""
     for item in items:

@@ -52,7 +52,7 @@ class IntegrityCase:
     sigma: float = 1.0  # the scanner's real noise, relative to what it states
     mount_yaw_deg: float = 0.0  # of the real scanner, relative to what it states
     range_max: float = TIM571.range_max  # m
-    single_scans: int = 0  # instead of a drive; each from an unknown pose
+    single_scans: int = 0  # number of scans instead of a drive, each from an unknown pose
 
     @property
     def map_is_correct(self) -> bool:
@@ -109,8 +109,8 @@ class IntegrityTrial:
     separate: bool  # every scan is a trial of its own, from an unknown start
 
 
-def make_trial(case: IntegrityCase, seed: int, seconds: float | None = None) -> IntegrityTrial:
-    """The trial of a case in the world of a seed; ``seconds`` defaults to the case's."""
+def make_trial(case: IntegrityCase, seed: int, seconds: float | None) -> IntegrityTrial:
+    """The trial of a case in the world of a seed; with ``seconds`` None, its length is the case's own."""
     rng = np.random.default_rng([seed, zlib.crc32(case.name.encode())])
     stated = scanner_of(case)
     scanner = _real_scanner(case, stated)

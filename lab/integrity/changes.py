@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import Literal
 
@@ -15,9 +16,9 @@ from common.geometry.ray_casting import cast_rays
 from common.geometry.se2 import Array
 from common.geometry.shapes import Box, Circle, Obstacle
 from common.geometry.world import World
-from lab.accuracy.furniture import Floor, FurniturePiece
+from lab.accuracy.furniture import FloorSpace, FurniturePiece
 from lab.accuracy.scenes import ROBOT, Scene
-from lab.integrity.buildings import Building, random_piece, random_place
+from lab.integrity.buildings import Building, Room, random_piece, random_place
 from services.simulator.people import People
 
 Kidnapping = Literal["anywhere", "similar", "nearby"]
@@ -35,14 +36,20 @@ MIN_SIMILAR_M = 2.0  # from a place to a similar one
 
 def move_furniture(building: Building, share: float, rng: np.random.Generator) -> Building:
     """Each piece is moved to another free place with probability ``share``."""
-    moves = rng.random(len(building.furniture)) < share
-    floor = building.floor()
+    return move_pieces(building, rng.random(len(building.furniture)) < share, building.rooms, rng)
+
+
+def move_pieces(
+    building: Building, moves: npt.NDArray[np.bool_], rooms: Sequence[Room], rng: np.random.Generator
+) -> Building:
+    """The pieces in the mask ``moves`` (F,) are moved to free places in ``rooms``; those without one are left out."""
+    within, floor = replace(building, rooms=tuple(rooms)), building.floor()
     for piece, moved in zip(building.furniture, moves, strict=True):
         if not moved:
             floor.put(piece)
     for piece, moved in zip(building.furniture, moves, strict=True):
         if moved:
-            _put_anywhere(floor, (random_place(building, piece, rng) for _ in range(MAX_PLACES)))
+            _put_anywhere(floor, (random_place(within, piece, rng) for _ in range(MAX_PLACES)))
     return building.furnished(floor.pieces)
 
 
@@ -61,7 +68,7 @@ def remove_furniture(building: Building, share: float, rng: np.random.Generator)
     return building.furnished([piece for piece in building.furniture if rng.random() >= share])
 
 
-def _put_anywhere(floor: Floor, pieces: Iterable[FurniturePiece]) -> None:
+def _put_anywhere(floor: FloorSpace, pieces: Iterable[FurniturePiece]) -> None:
     """Puts down the first piece for which there is room."""
     any(floor.put(piece) for piece in pieces)
 

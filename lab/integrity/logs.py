@@ -13,8 +13,8 @@ from common.geometry import se2
 from lab.experiments.trials import run_key
 from lab.integrity.cases import IntegrityTrial
 from lab.integrity.maps import grid_of
-from lab.real_logs.drive import START_COVARIANCE, drive_at
-from presage.learning.train_drive import TrainDriveOptions, card_of, scanner_of, split
+from lab.real_logs.drive import START_COVARIANCE, drive_at, training_scans
+from presage.learning.train_drive import TrainDriveOptions, card_of, scanner_of
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.precise.learning.drive_learning import learn_drive
@@ -50,9 +50,8 @@ class LogCase:
 
     def halves(self) -> tuple[ReferenceDrive, ReferenceDrive]:
         """The half from which the map is made, and the half that is localised."""
-        size = len(split(drive_at(self.log, self.mount, exchanged=False))[1 if self.exchanged else 0].ranges)
         drive = drive_at(self.log, self.mount, exchanged=self.exchanged)
-        numbers = np.arange(len(drive.ranges))
+        size, numbers = training_scans(self.log, self.mount, exchanged=self.exchanged), np.arange(len(drive.ranges))
         return drive.part(numbers < size), drive.part(numbers >= size)
 
 

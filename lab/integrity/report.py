@@ -65,7 +65,8 @@ def table(scores: dict[str, dict[str, Any]]) -> str:
     With more than two estimators, it would be too wide: then only the first has all columns of `HEADS`.
     """
     cases = list(dict.fromkeys(case for by_case in scores.values() for case in by_case))
-    cases = cases[:1] if set(cases[1:]) <= {"all", "all with a correct map"} else cases  # the same trials again
+    if set(cases[1:]) <= {"all", "all with a correct map"}:
+        cases = cases[:1]  # with a single case, the others are the same trials again
     columns = dict.fromkeys(scores, len(HEADS))
     if len(scores) > 2:
         columns |= dict.fromkeys([*scores][1:], SHORT_COLUMNS)

@@ -1,4 +1,4 @@
-"""Whether an estimator was right about itself: scores of scans, of trials and of cases."""
+"""Compares what an estimator reported with the truth: scores of scans, of trials and of cases."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy.typing as npt
 from common.geometry import se2
 from common.geometry.se2 import Array
 from lab.accuracy.tasks import FOUND_DISTANCE, FOUND_YAW
-from lab.statistics import bootstrap_interval, longest_duration, squared_mahalanobis, wilson_interval
+from lab.statistics import bootstrap_interval, longest_duration, root_mean_square, squared_mahalanobis, wilson_interval
 from services.estimator.shared.interface import Posterior
 
 Mask = npt.NDArray[np.bool_]
@@ -135,7 +135,7 @@ def score_case(trials: Sequence[dict[str, Any]], scans: Estimates) -> dict[str, 
         "nees_xy_median": _median(scans.nees[scans.tracking, 0]),
         "nees": _mean(scans.nees[scans.tracking, 1]),
         "error_median_m": _median(distance),
-        "error_rms_m": float(np.sqrt(np.mean(distance**2))) if len(distance) else None,
+        "error_rms_m": root_mean_square(distance) if len(distance) else None,
         "recovered": share(
             sum(trial["recovered"] for trial in trials), len(of_kidnappings), independent=_differ(of_kidnappings)
         ),

@@ -111,20 +111,19 @@ def measure(trace: RunTrace, goal: Goal) -> dict[str, Any]:
     pose, target = trace.path()[-1], goal.pose.array()
     along, across = (float(each) for each in se2.rotate(-(goal.approach or 0.0), pose[:2] - target[:2]))
     position, heading = float(np.hypot(along, across)), abs(float(se2.wrap(pose[2] - target[2])))
-    last = trace.statuses[max(trace.statuses)] if trace.statuses else None
+    last = trace.last_status
     reached = not trace.failure and last is not None and last.state == "reached"
+    last_status = f"{last.state}: {last.reason}" if last is not None else "no status"
     counters = trace.health.counters if trace.health is not None else {}
     return {
         "reached": reached,
         "docked": bool(reached and position <= TOLERANCE_M and heading <= YAW_TOLERANCE_RAD),
-        "why": ""
-        if reached
-        else trace.failure or (f"{last.state}: {last.reason}" if last is not None else "no status"),
+        "why": "" if reached else trace.failure or last_status,
         "along_m": along,
         "across_m": across,
         "position_m": position,
         "heading_deg": float(np.rad2deg(heading)),
-        "seconds": (trace.truths[-1].stamp_ns if trace.ended_ns is None else trace.ended_ns) * 1e-9,
+        "seconds": trace.seconds,
         "contacts": sum(truth.contact for truth in trace.truths),
         "step_mean_ms": counters["step_us"] / counters["steps"] * 1e-3 if counters.get("steps") else None,
     }
@@ -150,7 +149,7 @@ PERCENTILES = {"median": 50, "p95": 95, "max": 100}
 
 
 def run(job: DockingJob, trials: int, out: Path, workers: int, console: Console) -> results.Result:
-    """Runs ``trials`` drives with each drive type, in both worlds by turns.
+    """Runs ``trials`` drives with each drive type, half of them in each of the two worlds.
 
     Writes docking.json, .csv, .trials.jsonl, .pdf and .png into ``out``.
     """
@@ -190,7 +189,7 @@ def _figure(by_drive: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
 
 
 def table(summary: Mapping[str, Mapping[str, Any]]) -> str:
-    """The Markdown table of docs/navigation.md. Triples are median; 95 %; maximum."""
+    """The Markdown table of docs/navigation.md. Triples are median, 95th percentile and maximum."""
     heads = ["drive", "within 3 mm and 0.5°", "95 % interval", "position (mm)", "heading (°)", "time (s)", "contacts"]
     rows = [
         [

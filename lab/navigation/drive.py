@@ -28,7 +28,7 @@ from common.robot.robot import Robot
 from lab.experiments.lockstep import RunTrace
 from lab.experiments.start_and_goal import least_time
 from lab.navigation.shortest_path import NavigationTask, length
-from services.simulator.people import PERSON_RADIUS_M as PERSON_RADIUS
+from services.simulator.people import PERSON_RADIUS_M
 
 MIN_MOVING_SPEED = 0.01  # m/s
 MAX_REACHED_DISTANCE = GOAL_TOLERANCE_M  # m; if the robot stands farther from the goal, a reported arrival is wrong
@@ -45,7 +45,7 @@ LOCALISATION = (
 
 def measure(trace: RunTrace, task: NavigationTask, world: World, robot: Robot) -> dict[str, Any]:
     """Statistics of a drive as a row of the results; None where a value is unknown."""
-    path, seconds = trace.path(), _seconds(trace)
+    path, seconds = trace.path(), trace.seconds
     distance_left = float(np.hypot(*(path[-1, :2] - np.array(task.goal))))
     shortest, driven = length(np.array(task.shortest)), length(path)
     least = least_time(shortest, robot, GOAL_TOLERANCE_M, stop=True)
@@ -75,12 +75,8 @@ def measure(trace: RunTrace, task: NavigationTask, world: World, robot: Robot) -
     }
 
 
-def _seconds(trace: RunTrace) -> float:
-    return (trace.truths[-1].stamp_ns if trace.ended_ns is None else trace.ended_ns) * 1e-9
-
-
 def _outcome(trace: RunTrace, distance_left: float) -> str:
-    last = trace.statuses[max(trace.statuses)] if trace.statuses else None
+    last = trace.last_status
     if trace.failure:
         return "failed"
     if last is not None and last.state == "reached":
@@ -92,9 +88,9 @@ def _failure_reason(trace: RunTrace, outcome: str, distance_left: float) -> str:
     """Why the goal was not reached, in one line; empty if it was reached."""
     if outcome == "reached":
         return ""
-    last = trace.statuses[max(trace.statuses)] if trace.statuses else None
+    last = trace.last_status
     last_status = f"; at last {last.state}: {last.reason}" if last is not None else ""
-    return trace.failure or f"{distance_left:.2f} m from the goal after {_seconds(trace):.1f} s{last_status}"
+    return trace.failure or f"{distance_left:.2f} m from the goal after {trace.seconds:.1f} s{last_status}"
 
 
 def _contacts(trace: RunTrace) -> dict[str, Any]:
@@ -131,7 +127,7 @@ def _clearance_to_people(trace: RunTrace, robot: Robot) -> float | None:
     distances = [
         np.hypot(*(truth.people - truth.pose.array()[:2]).T).min() for truth in trace.truths if len(truth.people)
     ]
-    return float(min(distances)) - robot.radius - PERSON_RADIUS if distances else None
+    return float(min(distances)) - robot.radius - PERSON_RADIUS_M if distances else None
 
 
 def _localisation(trace: RunTrace) -> dict[str, Any]:
@@ -149,7 +145,7 @@ def _localisation(trace: RunTrace) -> dict[str, Any]:
     error = np.hypot(*(trace.believed()[first:count] - trace.path()[first:count])[:, :2].T)
     return {
         "tracking_s": trace.truths[first].stamp_ns * 1e-9,
-        "untracked_s": float(np.mean(~tracking[first:])) * (_seconds(trace) - trace.truths[first].stamp_ns * 1e-9),
+        "untracked_s": float(np.mean(~tracking[first:])) * (trace.seconds - trace.truths[first].stamp_ns * 1e-9),
         "longest_untracked_s": longest_untracked_s,
         "error_median_m": float(np.median(error)),
         "error_max_m": float(error.max()),

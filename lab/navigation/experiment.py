@@ -146,7 +146,6 @@ def result_name(job: NavigationJob, worlds: Sequence[str], drives: Sequence[str]
         *([] if tuple(drives) == DRIVES else drives),
         *(["unknown"] if job.start == "unknown" else []),
         *([f"people{job.people}"] if job.people else []),
-        *([f"{job.people_speed:g}mps"] if job.people and job.people_speed != NavigationJob.people_speed else []),
         *([job.estimator] if job.estimator != NavigationJob.estimator else []),
         *([job.prior] if job.prior != NavigationJob.prior else []),
         *([] if job.epistemic else ["no-epistemic"]),

@@ -134,16 +134,10 @@ COLUMNS: dict[str, Callable[[dict[str, Any]], str]] = {  # of the table, after t
 def table(summary: dict[str, dict[str, Any]]) -> str:
     """The Markdown table of docs/navigation.md. Pairs are median; maximum. Brackets are a 95 % interval."""
     people = any(row["min_clearance_to_people_m"] is not None for row in summary.values())
-    uncertain = any((row.get("median_longest_untracked_s") or 0) > 0 for row in summary.values())
-    measured_left = all("median_left_m" in row for row in summary.values())  # not in results before November 2026
+    uncertain = any(row["median_longest_untracked_s"] > 0 for row in summary.values())
     contact = any(row["trials_with_contact_moving"] or row["trials_with_contact_standing"] for row in summary.values())
-    left_out = {
-        *([] if contact else ["contacts moving; standing"]),
-        *([] if measured_left else ["distance left (mm)"]),
-        *([] if uncertain else ["longest untracked (s)"]),
-        *([] if people else ["to people (m)"]),
-    }
-    heads = [head for head in COLUMNS if head not in left_out]
+    shown = {"contacts moving; standing": contact, "longest untracked (s)": uncertain, "to people (m)": people}
+    heads = [head for head in COLUMNS if shown.get(head, True)]
     rows = [[name, *(COLUMNS[head](row) for head in heads)] for name, row in summary.items()]
     bad = [
         f"- {name}, trial {each['trial']}, {each['outcome']}: {each['why']}"
@@ -155,7 +149,7 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
 
 
 def _median_and_max(row: Mapping[str, Any], quantity: str, digits: int = 3) -> str:
-    return "; ".join(number(row.get(f"{statistic}_{quantity}"), digits) for statistic in ("median", "max"))
+    return "; ".join(number(row[f"{statistic}_{quantity}"], digits) for statistic in ("median", "max"))
 
 
 def _percent(interval: Sequence[float]) -> str:

@@ -119,7 +119,7 @@ def _estimator_factory(job: AliasingJob) -> Callable[[int], PoseEstimator]:
 
 
 def _row(pose: Array, posteriors: Sequence[Posterior], *, twins: bool) -> dict[str, Any]:
-    """Results at one place: error and wrong claim after every scan.
+    """Results at one place: the error, and whether the state was wrongly `tracking`, after every scan.
 
     With ``twins`` also whether the last belief contains both of the two indistinguishable places.
     """
@@ -160,6 +160,11 @@ def summarise(row: dict[str, Any]) -> dict[str, Any]:
         statistics["both_kept"] = sum(place["both_kept"] for place in places)
         statistics["at_either_within_0.2_m"] = int((either < CLOSE_DISTANCE).sum())
     return statistics
+
+
+def _moments(statistics: dict[str, Any]) -> list[int]:
+    """The numbers of scans after which these statistics of one estimator were evaluated."""
+    return [k for k in MOMENTS if f"within_0.2_m_after_{k}" in statistics]
 
 
 def run(
@@ -225,15 +230,10 @@ def _map(axes: Axes, world: World, places: Sequence[dict[str, Any]]) -> None:
 def _bars(axes: Axes, summary: dict[str, dict[str, Any]]) -> None:
     """Draws bars of the shares of places, in groups of one bar per estimator."""
     one = next(iter(summary.values()))
-    groups = [
-        (f"after {k}\nscan{'s' * (k != '1')}", name)
-        for name in one
-        if name.startswith("within")
-        for k in [name.rsplit("_", 1)[1]]
-    ]
+    moments = _moments(one)
+    groups = [(f"after {k}\nscan{'s' * (k != 1)}", f"within_0.2_m_after_{k}") for k in moments]
     good = len(groups)
-    last = max(int(name.rsplit("_", 1)[1]) for name in one if name.startswith("within"))
-    groups.append((f"`tracking`, but\n> {FOUND_DISTANCE} m off", f"tracking_but_wrong_after_{last}"))
+    groups.append((f"`tracking`, but\n> {FOUND_DISTANCE} m off", f"tracking_but_wrong_after_{moments[-1]}"))
     if "both_kept" in one:
         groups.append(("both places\nkept", "both_kept"))
     positions, width = np.arange(len(groups)) + 0.35 * (np.arange(len(groups)) >= good), 0.8 / len(summary)
@@ -254,8 +254,8 @@ def _bars(axes: Axes, summary: dict[str, dict[str, Any]]) -> None:
 
 def table(summary: dict[str, dict[str, Any]]) -> str:
     """The Markdown table of docs/experiments.md."""
-    moments = [name for name in next(iter(summary.values())) if name.startswith("within")]
-    scans = "; ".join(name.rsplit("_", 1)[1] for name in moments)
+    moments = _moments(next(iter(summary.values())))
+    scans = "; ".join(map(str, moments))
     heads = (
         "world",
         "estimator",
@@ -266,12 +266,12 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
     )
     rows = []
     for row in summary.values():
-        wrong = next(value for name, value in reversed(row.items()) if name.startswith("tracking_but_wrong_after"))
+        wrong = row[f"tracking_but_wrong_after_{moments[-1]}"]
         rows.append(
             [
                 row["world"],
                 row["estimator"],
-                "; ".join(f"{row[name]}/{row['places']}" for name in moments),
+                "; ".join(f"{row[f'within_0.2_m_after_{k}']}/{row['places']}" for k in moments),
                 results.number(row["final_error_median_m"], 4),
                 f"{wrong}; {row['tracking_but_wrong_ever']}",
                 f"{row['both_kept']}/{row['places']}" if "both_kept" in row else "",

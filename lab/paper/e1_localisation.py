@@ -29,6 +29,7 @@ from lab.experiments.estimators import (
     uses_odometry,
 )
 from lab.experiments.trials import run_trials
+from lab.statistics import root_mean_square
 from presage.plotting import style as drawing
 from services.estimator.paper.perception import Descent
 
@@ -88,7 +89,7 @@ def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
         "final_error_std_m": float(last.std()),
         "final_error_median_m": float(np.median(last)),
         "final_error_max_m": float(last.max()),
-        "final_error_rms_m": float(np.sqrt(np.mean(last**2))),
+        "final_error_rms_m": root_mean_square(last),
         "final_rms_over_bound": float(np.sqrt(np.mean(last**2) / np.mean(bound.position(limit) ** 2))),
         "final_median_over_bound": float(np.median(last)) / bound.median_error(limit),
         "found_within_0.5_m": int((last < FOUND_DISTANCE).sum()),
@@ -115,7 +116,7 @@ def run(job: LocalisationJob, trials: int, out: Path, workers: int, console: Con
         curves[f"{name} median m"] = np.median([row["error_m"][name] for row in rows], axis=0).tolist()
     for text, known in (("", False), (", heading known", True)):
         one = bounds(rows, known)
-        rms, median = float(np.sqrt(np.mean(bound.position(one) ** 2))), bound.median_error(one)
+        rms, median = root_mean_square(bound.position(one)), bound.median_error(one)
         for what, value in (("RMS", rms), ("median", median)):
             curves[f"bound{text} {what} m"] = [value / float(np.sqrt(k)) for k in range(1, job.iterations + 1)]
     parameters = asdict(job) | {"trials": trials, "bound_end_m": curves["bound RMS m"][-1]}

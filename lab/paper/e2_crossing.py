@@ -32,6 +32,7 @@ from lab.experiments.estimators import (
     uses_odometry,
 )
 from lab.experiments.trials import run_trials
+from lab.statistics import root_mean_square
 from presage.plotting import style as drawing
 from services.estimator.paper.perception import Descent
 from services.simulator.odometry import Odometer, OdometryNoise
@@ -110,7 +111,7 @@ def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
         "error_mean_m": float(error.mean()),
         "error_std_m": float(error.std()),
         "error_median_m": float(np.median(error)),
-        "error_rms_m": float(np.sqrt(np.mean(error**2))),
+        "error_rms_m": root_mean_square(error),
         "error_max_m": float(error.max()),
         "bound": bound_of(name),
         "rms_over_bound": float(np.sqrt(np.mean(error**2) / np.mean(limit**2))),
@@ -132,7 +133,7 @@ def run(job: CrossingJob, trials: int, out: Path, workers: int, console: Console
     for name in BOUND_NAMES:
         limits = [row["bound_m"][name] for row in rows]
         curves[f"bound, {name} RMS m"] = _rms(limits)
-        parameters[f"bound, {name}, rms_m"] = float(np.sqrt(np.mean(np.square(limits))))
+        parameters[f"bound, {name}, rms_m"] = root_mean_square(np.array(limits))
     result = results.Result(
         "e2",
         "E2: crossing the map by small teleports",

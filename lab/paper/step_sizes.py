@@ -96,8 +96,8 @@ def trial(job: StepSizeJob) -> dict[str, Any]:
     """Runs one journey. Returns its number of iterations, and in the velocity loop its time over the minimum."""
     world = job.field.scene(0).world
     ends = draw_start_and_goal(world, np.random.default_rng((job.seed, navigation.EXPERIMENT_ID, job.index)), Robot())
-    row = {"setting": job.setting.name, "straight_m": ends.straight}
-    return row | (_run_displacement if job.setting.loop == "displacement" else _run_velocity)(job, world, ends)
+    drive = _run_displacement if job.setting.loop == "displacement" else _run_velocity
+    return {"setting": job.setting.name, "straight_m": ends.straight, **drive(job, world, ends)}
 
 
 @functools.lru_cache(maxsize=2)

@@ -14,12 +14,16 @@ from rich.console import Console
 from common.versions import checkout_state
 from lab.experiments import results
 from lab.pages import tables_page as page
-from lab.paper import aliasing, prediction, samples
-from lab.paper import alpha_sweep as step_size
-from lab.paper import e1_localisation as localisation
-from lab.paper import e2_crossing as crossing
-from lab.paper import e3_navigation as navigation
-from lab.paper import step_sizes as stepping
+from lab.paper import (
+    aliasing,
+    alpha_sweep,
+    e1_localisation,
+    e2_crossing,
+    e3_navigation,
+    prediction,
+    samples,
+    step_sizes,
+)
 
 Run = Callable[[], results.Result]
 
@@ -38,18 +42,20 @@ def run_all(trials: int, seed: int, out: Path, workers: int, console: Console) -
         subfolder.mkdir(exist_ok=True)
         return subfolder
 
+    e1_job = e1_localisation.LocalisationJob(0, seed, 50)
+    e3_job = e3_navigation.PaperNavigationJob(0, seed)
     # Two variants: the paper's estimator with enough iterations to converge, and journeys without a free straight line.
-    converged = localisation.LocalisationJob(0, seed, 200, ("paper",))
-    any_pair = navigation.PaperNavigationJob(0, seed, limit=450, free=False, estimators=("precise",))
+    converged = e1_localisation.LocalisationJob(0, seed, 200, ("paper",))
+    any_pair = e3_navigation.PaperNavigationJob(0, seed, limit=450, free=False, estimators=("precise",))
     runs: dict[str, Run] = {
-        "e1": lambda: localisation.run(localisation.LocalisationJob(0, seed, 50), limited(100), out, workers, console),
-        "converged/e1": lambda: localisation.run(converged, limited(100), folder("converged"), workers, console),
-        "e2": lambda: crossing.run(crossing.CrossingJob(0, seed), limited(12), out, workers, console),
+        "e1": lambda: e1_localisation.run(e1_job, limited(100), out, workers, console),
+        "converged/e1": lambda: e1_localisation.run(converged, limited(100), folder("converged"), workers, console),
+        "e2": lambda: e2_crossing.run(e2_crossing.CrossingJob(0, seed), limited(12), out, workers, console),
         # One worker more, because processes in lockstep also wait for one another.
-        "e3": lambda: navigation.run(navigation.PaperNavigationJob(0, seed), limited(50), out, workers + 1, console),
-        "any/e3": lambda: navigation.run(any_pair, limited(10), folder("any"), workers, console),
-        "alpha": lambda: step_size.run(localisation.LocalisationJob(0, seed, 50), limited(25), out, workers, console),
-        "steps": lambda: stepping.run(stepping.StepSizeJob(0, seed), limited(10), out, workers, console),
+        "e3": lambda: e3_navigation.run(e3_job, limited(50), out, workers + 1, console),
+        "any/e3": lambda: e3_navigation.run(any_pair, limited(10), folder("any"), workers, console),
+        "alpha": lambda: alpha_sweep.run(e1_job, limited(25), out, workers, console),
+        "steps": lambda: step_sizes.run(step_sizes.StepSizeJob(0, seed), limited(10), out, workers, console),
         "samples": lambda: samples.run(samples.SamplesJob(seed, places=limited(50)), out, workers, console),
         "aliasing": lambda: aliasing.run(aliasing.AliasingJob(seed, places=limited(30)), out, workers, console),
         "prediction": lambda: prediction.run(prediction.PredictionJob(seed), out, 1, console),

@@ -41,10 +41,8 @@ TASKS = {
 # The maps: given as polygons or as an occupancy grid, or a field learned from that grid or from scans with known poses.
 POLYGONS, CELLS, FIELD, POSED = "polygons", "5 cm map", "learned from 5 cm map", "learned from posed scans"
 START_DEVIATION = np.array([0.2, 0.2, 0.1])  # m, m, rad, of the given start of a drive
-CONVERGED_M, LAST_SCANS = (
-    0.2,
-    10,
-)  # limit of the median error, and the number of scans at the end of a trial that it is of
+LAST_SCANS = 10  # of a trial; their median error decides whether it has converged
+CONVERGED_M = 0.2  # limit of this median error
 SETTLED_SCANS = 50  # of a drive, before its errors count
 
 
@@ -82,16 +80,16 @@ class PeersJob:
     seed: int
 
     @property
-    def scans(self) -> TrialScans:
-        """All trials of the job's task."""
-        return read_trial_scans(Path(self.folder) / (PLACES if self.task == STANDING else DRIVES))
-
-    @property
     def training_drives(self) -> str:
         """The drives from which the model is learned; the localised drive is never one of them."""
         if self.task == STANDING:
             return "all"
         return "odd" if self.number % 2 == 0 else "even"
+
+
+def scans_of(folder: Path, task: str) -> TrialScans:
+    """All trials of a task."""
+    return read_trial_scans(folder / (PLACES if task == STANDING else DRIVES))
 
 
 def run(
@@ -105,7 +103,7 @@ def run(
         PeersJob(str(folder), str(models), estimator, task, number, seed)
         for estimator in estimators
         for task in TASKS
-        for number in range(min(trials, len(PeersJob(str(folder), "", estimator, task, 0, seed).scans.truth)))
+        for number in range(min(trials, len(scans_of(folder, task).truth)))
     ]
     learned = {_model_file(job): job for job in jobs if _model_file(job)}
     run_trials("learning", learn, list(learned.values()), out, workers, console)
@@ -131,11 +129,11 @@ def _model_file(job: PeersJob) -> str:
 
 def learn(job: PeersJob) -> dict[str, Any]:
     """Learns the job's model, unless an interrupted run has: from the map, or from drives on which it is not tested."""
-    path = Path(_model_file(job))
+    folder, path = Path(job.folder), Path(_model_file(job))
     if ESTIMATORS[job.estimator].map == FIELD:
-        field_file(path.parent, load_world(str(map_file(Path(job.folder)))), job.scans.scanner)
+        field_file(path.parent, load_world(str(map_file(folder))), scans_of(folder, job.task).scanner)
     elif not path.exists():
-        scans = read_trial_scans(Path(job.folder) / DRIVES)
+        scans = read_trial_scans(folder / DRIVES)
         numbers = range(len(scans.truth))
         drive = scans.drive({"all": numbers, "odd": numbers[1::2], "even": numbers[::2]}[job.training_drives])
         options = TrainDriveOptions(Path(DRIVES))
@@ -165,7 +163,7 @@ def _observation(scans: TrialScans, number: int, k: int, odom: Array | None) -> 
 
 def trial(job: PeersJob) -> dict[str, Any]:
     """Errors, states and processor times of all scans of one trial."""
-    scans, number = job.scans, job.number
+    scans, number = scans_of(Path(job.folder), job.task), job.number
     estimator = _factory(job.folder, job.estimator, _model_file(job), job.seed)(ScannerGeometry.of(scans.scanner))
     truth = scans.truth[number]
     if job.task != STANDING:

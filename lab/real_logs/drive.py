@@ -61,8 +61,7 @@ class StretchJob:
     @property
     def learned(self) -> int:
         """Number of scans in the training half of `drive`, which is also the index of the first scan after it."""
-        first, second = split(drive_at(self.log, self.mount, exchanged=False))
-        return len((second if self.exchanged else first).ranges)
+        return training_scans(self.log, self.mount, exchanged=self.exchanged)
 
 
 @functools.lru_cache(maxsize=2)
@@ -72,6 +71,12 @@ def drive_at(log: str, mount: tuple[float, float, float] | None, *, exchanged: b
         return exchange_halves(drive_at(log, mount, exchanged=False))
     path = Path(log)
     return drive_of(read_scans(path, reading=Reading(mount=None if mount is None else np.array(mount))), path)
+
+
+def training_scans(log: str, mount: tuple[float, float, float] | None, *, exchanged: bool) -> int:
+    """Number of scans in the half with which `drive_at` begins."""
+    first, second = split(drive_at(log, mount, exchanged=False))
+    return len((second if exchanged else first).ranges)
 
 
 def exchange_halves(drive: ReferenceDrive) -> ReferenceDrive:

@@ -45,8 +45,8 @@ from lab.real_logs.scoring import (
     longest_wrong_s,
     scans_until_found,
 )
-from presage.learning.train_drive import TrainDriveOptions as Training
-from presage.learning.train_drive import card_of
+from lab.statistics import root_mean_square
+from presage.learning.train_drive import TrainDriveOptions, card_of
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.precise.learning.drive_learning import learn_drive
@@ -171,7 +171,7 @@ def _train_and_tune(
             bar.update(task, description=title, completed=done)
 
         first = stretch.drive.part(np.arange(half))
-        training = Training(job.log, share=0.5, recipe=Recipe(resolution=0.05, seed=job.seed))
+        training = TrainDriveOptions(job.log, share=0.5, recipe=Recipe(resolution=0.05, seed=job.seed))
         learned = learn_drive(first, training.recipe, None, report)
         card = card_of(training, world, first, learned, 0.0)
         weights.save(path, learned.model, learned.places, card)
@@ -239,9 +239,9 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "trials": len(rows),
         "scans": len(error),
         "error_median_m": float(np.median(error)),
-        "error_rms_m": float(np.sqrt(np.mean(error**2))),
+        "error_rms_m": root_mean_square(error),
         "error_95_m": float(np.quantile(error, 0.95)),
-        "correct_error_rms_m": float(np.sqrt(np.mean(error[correct] ** 2))) if correct.any() else None,
+        "correct_error_rms_m": root_mean_square(error[correct]) if correct.any() else None,
         "yaw_error_median_rad": float(np.median(yaw)),
         "correct": int(correct.sum()),
         "tracking": int(tracking.sum()),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import platform
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -68,6 +70,11 @@ def provenance(seed: int | None = None) -> dict[str, Any]:
     """The information needed to reproduce a result: seed if there is one, commit, versions, command-line arguments."""
     found = {"commit": commit(), "versions": versions(), "arguments": sys.argv[1:]}
     return found if seed is None else {"seed": seed, **found}
+
+
+def machine() -> str:
+    """Architecture and number of cores of this machine, for results that depend on it."""
+    return f"{platform.machine()}, {os.cpu_count()} cores"
 
 
 def printable(text: str) -> str:

@@ -30,8 +30,8 @@ from services.mapper.slam.front_end import ScanPose
 from services.mapper.slam.mapper import Mapper, MapSnapshot
 
 MAX_GAP_NS = 10_000_000_000  # longest time between two scans of which the second one follows the first
-MORE_BEAMS = 1.1  # ratio; numbers of beams that vary from turn to turn do so by less
-UPDATE_PERIOD_NS = 1_000_000_000  # between the beginnings of two updates of the map, which leaves time for the scans
+MAX_BEAM_RATIO = 1.1  # of a scan to the first one; numbers of beams that vary from turn to turn differ by less
+UPDATE_PERIOD_NS = 1_000_000_000  # least time between the starts of two updates of the map
 REPEAT_PERIOD_NS = 5_000_000_000  # an unchanged map is published again after this time, for later subscribers
 
 
@@ -86,7 +86,8 @@ class MapperService(Service):
             if late_ns == 0:
                 self.publish(BELIEF, self._belief)  # a repeated scan gets the same belief again
                 return
-            # One scan whose stamp is far from the others' is late, or its stamp is wrong; two in a row follow a reset.
+            # A single scan whose stamp is far from all others is late or has a wrong stamp, and is left out. If another
+            # scan follows it, the clock was set, as by a reset of the simulator, and mapping goes on.
             last_stamps_ns = self._belief.stamp_ns, received_before_ns
             follows_another = any(0 <= scan.stamp_ns - each <= MAX_GAP_NS for each in last_stamps_ns)
             if 0 < late_ns < MAX_LATE_NS or not follows_another:
@@ -101,7 +102,7 @@ class MapperService(Service):
             self.counters["unmatched_scans"] += 1
         self._belief = belief_message(scan, scan_pose)
         self.publish(BELIEF, self._belief)
-        # Both times may be later than the scan, after a reset.
+        # After a reset, the scan may be earlier than both stamps.
         if self._update is None and mapper.outdated and abs(scan.stamp_ns - self._update_ns) >= UPDATE_PERIOD_NS:
             self._start_update(mapper, scan.stamp_ns)
         if abs(scan.stamp_ns - self._published_ns) >= REPEAT_PERIOD_NS:
@@ -157,10 +158,10 @@ class MapperService(Service):
 
 
 def _reason_to_start_again(mapper: Mapper, scan: Scan) -> str:
-    """Why the laser of the mapper is not that of a scan; empty if it is."""
+    """Returns why mapping has to start again for a scan, or an empty text if the mapper can use it."""
     if not np.allclose(scan.mount.array(), mapper.laser.mount, atol=1e-4):
         return "the scanner's mount changed"
-    if mapper.key_scan_count == 1 and len(scan.ranges) > MORE_BEAMS * len(mapper.laser.angles):
+    if mapper.key_scan_count == 1 and len(scan.ranges) > MAX_BEAM_RATIO * len(mapper.laser.angles):
         return "the first scan lacked some of the beams"
     return ""
 

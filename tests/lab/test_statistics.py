@@ -40,5 +40,8 @@ def test_interval_of_a_median():
 def test_durations(values, longest):
     values = np.array(values, bool)
     assert longest_duration(values, np.full(len(values), 1 / 15)) == pytest.approx(longest / 15, abs=1e-6)
+
+
+def test_durations_of_uneven_and_of_many_periods():
     assert longest_duration(np.ones(15, bool), np.full(15, 1 / 15)) == 1.0
     assert longest_duration(np.array([True, True, False, True]), np.array([1.0, 1.0, 5.0, 3.0])) == 3.0

@@ -105,18 +105,11 @@ class BackEnd:
         for piece in range(1, submaps[-1].piece + 1):
             component = self._components(scans)[[each.reference for each in submaps]]
             before = [k for k, each in enumerate(submaps) if each.piece < piece]
-            if any(
-                each.piece == piece
-                and is_contradicted(
-                    k,
-                    self.poses[each.reference],
-                    [other for other in before if component[other] == component[k]],
-                    submaps,
-                    self.poses,
-                )
-                for k, each in enumerate(submaps)
-            ):
-                self._cut(len(before), int(np.searchsorted(scans.pieces, piece)), scans)
+            for k in (k for k, each in enumerate(submaps) if each.piece == piece):
+                linked = [other for other in before if component[other] == component[k]]
+                if is_contradicted(k, self.poses[submaps[k].reference], linked, submaps, self.poses):
+                    self._cut(len(before), int(np.searchsorted(scans.pieces, piece)), scans)
+                    break
 
     def _cut(self, submap: int, key: int, scans: KeyScanGraph) -> None:
         """Removes all links across the beginning of a ``submap``, whose first key scan is number ``key``."""

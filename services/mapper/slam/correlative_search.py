@@ -38,16 +38,19 @@ def correlative_search(
     sample = source.part(np.linspace(0, len(source) - 1, min(len(source), MAX_ELEMENTS)).astype(int))
     reach = np.hypot(*sample.points.T).max() + np.hypot(*window[:2])
     low = around[:2] - reach - 2 * CELL_M
+    # Rasterise the target, and place the source's elements in its grid at each turn.
     grid = _rasterise(target, low, int(2 * (reach + 2 * CELL_M) / CELL_M) + 2)
     count = np.ceil(window[:2] / CELL_M).astype(int)
     turns = around[2] + turn_step * np.arange(-np.ceil(window[2] / turn_step), np.ceil(window[2] / turn_step) + 1)
     placed = [sample.transformed(np.array([*around[:2], turn])) for turn in turns]
     sector = np.array([_sector(each.normals) for each in placed])
     cells = np.array([np.floor((each.points - low) / CELL_M).astype(np.int64) for each in placed])  # (T, N, 2)
+    # Bound the scores of all blocks of shifts, and order the blocks by their bounds.
     corners = [np.arange(-n, n + 1, BLOCK) for n in count.tolist()]
     blocks = np.stack(np.meshgrid(np.arange(len(turns)), *corners, indexing="ij"), axis=-1).reshape(-1, 3)
     bounds = _count_hits(_pooled(grid), sector, cells, blocks)
     order = np.argsort(-bounds, kind="stable")[: np.count_nonzero(bounds)]
+    # Score one group of blocks after another until no other block can be better than the worst peak.
     best, scores = np.zeros((0, 3), np.int64), np.zeros(0, np.int32)  # of the candidates so far
     peaks, lowest_score = np.zeros((0, 3)), 0
     begin, size = 0, FIRST_BLOCKS

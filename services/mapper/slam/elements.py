@@ -80,7 +80,7 @@ def _windows(along: Array, surface: npt.NDArray[np.int_]) -> tuple[npt.NDArray[n
 
     ``along`` (N,) m are the places of the points along the scan.
     """
-    middle = np.flatnonzero(np.diff(np.floor(along / SPACING_M), prepend=-1.0) > 0)
+    middle = np.flatnonzero(np.diff(np.floor(along / SPACING_M), prepend=-1.0) > 0)  # first point of each interval
     first = np.minimum(np.searchsorted(along, along[middle] - HALF_WIDTH_M), middle - 1)
     last = np.maximum(np.searchsorted(along, along[middle] + HALF_WIDTH_M, side="right"), middle + 2)
     first = np.maximum(first, np.searchsorted(surface, surface[middle]))

@@ -67,7 +67,7 @@ STANDING_DEVIATION = np.array([0.002, 0.002, 0.002])  # m, m, rad: in addition t
 MAX_VELOCITY = 3 * VELOCITY_DEVIATION  # a robot that seems to move faster was kidnapped
 # The velocity is unknown after a period that exceeds both this time and this multiple of the period before.
 MAX_PERIOD_S, MAX_PERIOD_RATIO = 2.0, 5.0
-# Scans over which these deviations are learned, and the largest error that counts, in deviations.
+# A factor on the deviations of the motion is learned over this many scans, from errors of at most so many deviations.
 LEARNING_SCANS, MAX_LEARNED_SIGMAS = 100, 10.0
 # Errors of a registration that do not average out, for each key scan: moving things, the surfaces' roughness.
 REGISTRATION_DEVIATION = np.array([0.005, 0.005, 0.002])
@@ -158,13 +158,16 @@ class FrontEnd:
         scan before; it may step back, as after a reset of the simulator, which also resets the odometry. ``odom`` (3,)
         is the pose of base_link in odom, or None if it is unknown.
         """
+        # Predict the motion since the last scan, and correct the scan for it.
         period = stamp - self.stamps[-1] if self.stamps else 0.0
         clock_stepped = self._update_period(period)
-        if period < 0:
+        if period < 0:  # the real time since the last scan is unknown, and odometry may have been reset
             period, self._odom = MAX_PERIOD_S, None
         motion, deviation = self._predict_motion(period, odom)
         scan = self._correct(ranges, motion, period)
-        used_odometry, self._odom = self._odom is not None and odom is not None, odom
+        used_odometry = self._odom is not None and odom is not None
+        self._odom = odom
+        # Begin with the first scan, and begin again with the first one that shows enough for others to match.
         self.stamps.append(stamp)
         if len(self.stamps) == 1:
             return self._begin_piece(np.zeros(3), scan)
@@ -176,12 +179,14 @@ class FrontEnd:
         if shows_first_surfaces and self._odom is None:
             return self._begin_piece(self.poses[-1], scan)  # so far there was nothing that a scan could match
         self._covariance_since_key = self._covariance_since_key + PRIOR_INFLATION**2 * covariance
+        # Register the scan, and judge whether the match can be right.
         found = self._register(scan, prior, period)
         contradiction = self._contradiction(scan, found, prior)
         reachable_from = [self.poses[-1], prior.mean] if used_odometry else [self.poses[-1]]
         suspect = contradiction > MAX_CONTRADICTION or self._is_suspect(found, prior, reachable_from, period)
         # If odometry and registration agree even after many suspect scans, the surroundings have changed.
         confirmed = self._suspect_scans + 1 >= MAX_SUSPECT_SCANS and used_odometry and not _is_far(found, prior)
+        # Add the scan where it matches, or where the motion model predicts it.
         if found is not None and (confirmed or not suspect):
             slipped = prior.difference(found.pose)[1] > MAX_SLIP**2
             begins_piece = clock_stepped or suspect or slipped or self._is_unusual(contradiction)
@@ -189,7 +194,7 @@ class FrontEnd:
                 self._update_recent_contradiction(contradiction)
             return self._add_matched(scan, found, prior, deviation, period, begins_piece=begins_piece)
         self.unmatched += 1
-        if used_odometry:
+        if used_odometry:  # without it, the old velocity is still the best prediction
             self._velocity = None
         if suspect:
             return self._add_suspect(scan, prior.mean)

@@ -27,9 +27,10 @@ TARGET_SPACING_M = 2.0  # between submaps of the map in which a submap is search
 JOIN_WINDOW_M, TURN_STEP = 4.0, 0.06  # m to either side of a target, and rad between the headings that are tried
 AGREEING_M, AGREEING_RAD = 0.5, 0.1  # two candidates agree if they place the piece this close together
 MIN_SUPPORT = 2  # number of submaps that must agree
-# A pose of a piece is rejected if the share of elements that contradict the nearest submaps exceeds this, plus twice
-# the share that is usual between successive submaps.
-MAX_EXTRA_CONTRADICTION, NEAREST_SUBMAPS = 0.03, 3
+# A pose of a piece is rejected if the share of elements that contradict the nearest submaps exceeds this limit plus
+# twice the share that is usual between successive submaps.
+MAX_EXTRA_CONTRADICTION = 0.03
+NEAREST_SUBMAPS = 3  # submaps of the map with which a submap of a piece is compared
 
 
 @dataclass(frozen=True)

@@ -104,7 +104,7 @@ class Mapper:
                 self._pieces.add(int(scans.pieces[link.second]))
 
     def draw(self) -> OccupancyGrid:
-        """Draws the map of the scans until now, from more of them than `update`: after a long drive, for seconds."""
+        """Draws the map of the scans until now. Uses more scans than `update`, and takes seconds after a long drive."""
         numbers, ranges = self._front_end.grid_scans()
         poses = self._poses()[numbers]
         placed = np.isfinite(poses[:, 0])

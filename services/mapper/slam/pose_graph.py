@@ -71,7 +71,7 @@ class LinkTable:
                 blocks.append(np.einsum("lki,lkm,lmj->lij", by_i, information, by_j))
                 rows.append(i)
                 columns.append(j)
-        hessian = block_matrix(np.concatenate(blocks), np.concatenate(rows), np.concatenate(columns), len(poses))
+        hessian = _block_matrix(np.concatenate(blocks), np.concatenate(rows), np.concatenate(columns), len(poses))
         return hessian, gradient.ravel()
 
 
@@ -81,7 +81,7 @@ def optimise(poses: Array, links: Sequence[PoseLink]) -> Array:
     component = components(len(poses), links)
     for _ in range(MAX_STEPS):
         hessian, gradient = table.normal_equations(poses)
-        step = anchored(hessian, component).solve(-gradient).reshape(-1, 3)
+        step = _factorise_anchored(hessian, component).solve(-gradient).reshape(-1, 3)
         poses += step
         poses[:, 2] = se2.wrap(poses[:, 2])
         if np.abs(step).max() < CONVERGED:
@@ -97,7 +97,7 @@ class Uncertainty:
 
     def __init__(self, poses: Array, links: Sequence[PoseLink], chosen: npt.NDArray[np.integer]) -> None:
         component = components(len(poses), links)
-        self._factor = anchored(LinkTable(links).normal_equations(poses)[0], component)
+        self._factor = _factorise_anchored(LinkTable(links).normal_equations(poses)[0], component)
         self._poses, self._chosen, self._component = poses, np.asarray(chosen), component[chosen]
         self._columns: dict[int, Array] = {}  # (C, 3, 3) covariances of all chosen poses with one
 
@@ -127,14 +127,14 @@ def components(count: int, links: Sequence[PoseLink]) -> npt.NDArray[np.int_]:
     return np.asarray(connected_components(graph, directed=False)[1], int)
 
 
-def anchored(hessian: sparse.csc_array, component: npt.NDArray[np.int_]) -> SuperLU:
-    """Factorisation of a Hessian (3 N, 3 N) with the first pose of each component (N,) held."""
+def _factorise_anchored(hessian: sparse.csc_array, component: npt.NDArray[np.int_]) -> SuperLU:
+    """Factorises a Hessian (3 N, 3 N) with the first pose of each component (N,) held in place."""
     anchor = np.zeros((len(component), 3))
     anchor[np.unique(component, return_index=True)[1]] = ANCHOR
     return splu((hessian + sparse.diags_array(anchor.ravel())).tocsc())
 
 
-def block_matrix(blocks: Array, rows: Array, columns: Array, count: int) -> sparse.csc_array:
+def _block_matrix(blocks: Array, rows: Array, columns: Array, count: int) -> sparse.csc_array:
     """Sparse matrix (3 count, 3 count) that sums blocks (M, 3, 3) at block rows (M,) and columns (M,)."""
     i = np.broadcast_to(3 * rows[:, None, None] + np.arange(3)[:, None], blocks.shape)
     j = np.broadcast_to(3 * columns[:, None, None] + np.arange(3), blocks.shape)

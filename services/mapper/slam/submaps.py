@@ -62,7 +62,7 @@ def divide_into_submaps(
     angles: Array,
     mount: Array,
     *,
-    growing: bool = False,
+    growing: bool,
 ) -> list[Submap]:
     """Divides key scans at ``poses`` (N, 3) of ``pieces`` (N,), with ``ranges`` (N, B), into submaps.
 

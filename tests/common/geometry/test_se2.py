@@ -65,3 +65,9 @@ def test_displacement_jacobian_is_the_finite_difference(pose, point, heading):
 @given(poses, poses)
 def test_points_transform_like_poses(a, b):
     assert se2.transform(a, b[None, :2])[0] == pytest.approx(se2.compose(a, b)[:2], abs=1e-9)
+
+
+def test_alignment():
+    targets = np.random.default_rng(0).uniform(-2, 2, (20, 3))
+    frame = np.array([3.0, -1.0, 0.5])
+    assert se2.alignment(se2.compose(se2.inverse(frame), targets), targets) == pytest.approx(frame)

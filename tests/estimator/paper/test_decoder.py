@@ -8,8 +8,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from common.errors import UserError
 from services.estimator.paper.decoder import Decoder, DecoderShape, PaperModel
+from services.estimator.paper.estimator import PaperGenerativeModel
 from services.estimator.paper.training import Trainer, TrainingParameters, usable_ranges
+from tests.estimator.models import HEADING, SCANNER
 from tests.estimator.paper.training_scans import normalisation, posed_scans
 
 TRAIN, TEST = posed_scans(400, 1), posed_scans(100, 2)
@@ -68,3 +71,19 @@ def test_seed():
 
 def test_usable_ranges():
     assert usable_ranges(np.array([np.inf, -np.inf, 3.0, 30.0]), 25.0).tolist() == [25.0, 0.0, 3.0, 25.0]
+
+
+def test_decoder_as_a_generative_model():
+    torch.manual_seed(0)
+    model = PaperModel(Decoder(DecoderShape(SCANNER.beams, 16, 4)).double(), normalisation())
+    scans = PaperGenerativeModel(model, SCANNER, HEADING, 0.3)
+    laser = np.array([[2.0, 1.5, HEADING + 1.0]])  # the heading is ignored, because the decoder is trained for one only
+    expected = scans.expect(laser, SCANNER.angles())
+    base = np.array([2.0, 1.5, 0.0]) - [*(np.array([np.cos(HEADING + 1), np.sin(HEADING + 1)]) * SCANNER.mount[0]), 0]
+    ranges, jacobian = model.predict(np.array([*base[:2], HEADING]))
+    assert expected.ranges[0] == pytest.approx(ranges)
+    assert expected.jacobian[0] == pytest.approx(jacobian)
+    assert (expected.scale == 0.3).all()
+    assert np.array_equal(scans.expect(laser, SCANNER.angles()[::2]).ranges[0], ranges[::2])
+    with pytest.raises(UserError, match="beams of its training"):
+        scans.expect(laser, np.array([3.0]))

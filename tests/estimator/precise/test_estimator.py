@@ -70,7 +70,7 @@ def test_search_with_many_beams(monkeypatch):
 
 def test_error_and_bound():
     made, scene = estimator(ROOM)
-    outcome = tasks.standing(made, scene, 12, iter)
+    outcome = tasks.standing(made, scene, 12)
     one, many = outcome["from nothing, 1 scan"], outcome["standing, 20 scans"]
     assert one.found >= 11  # some of the poses see bare walls only, which fit as well after half a turn
     rms = [np.sqrt(np.mean(np.square(np.array(o.errors)[:, :2]).sum(1))) for o in (one, many)]
@@ -93,7 +93,7 @@ def test_covariance():
 @pytest.mark.parametrize("odometry", [False, True])
 def test_tracking(odometry):
     made, scene = estimator(ROOM)
-    (outcome,) = tasks.tracking(made, scene, 10.0, iter, odometry=odometry).values()
+    (outcome,) = tasks.tracking(made, scene, 10.0, odometry=odometry).values()
     assert outcome.found == outcome.total == 150
     rms = np.sqrt(np.mean(np.square(np.array(outcome.errors)[:, :2]).sum(1)))
     assert rms < 1.3 * np.sqrt(np.mean(np.square(outcome.bounds)))
@@ -101,7 +101,7 @@ def test_tracking(odometry):
 
 def test_kidnapping():
     made, scene = estimator(load_world("maze"))  # unlike the empty room, it has no two similar places
-    outcome = tasks.kidnapped(made, scene, 8, iter)
+    outcome = tasks.kidnapped(made, scene, 8)
     assert outcome["kidnapped, 1 scan"].found == 8
     assert outcome["kidnapped, 3 scans"].wrong == 0
     assert made._change_rate.remembered < 1  # nothing around the robot has changed

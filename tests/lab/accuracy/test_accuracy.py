@@ -56,7 +56,7 @@ def test_bound_along_a_path():
     assert (bound.position(along) <= bound.position(alone) + 1e-12).all()
     still = np.tile(path[:1], (20, 1))
     last = bound.recursive(scene, still, OdometryNoise(0, 0, 0, 0))[-1]
-    assert last == pytest.approx(bound.single(scene, path[:1], 20)[0], rel=1e-3)
+    assert last == pytest.approx(bound.single(scene, path[:1])[0] / 20, rel=1e-3)
 
 
 def test_bound_with_a_prior():
@@ -155,7 +155,7 @@ def test_both_rooms_kept(believe, kept, wrong):
     paths = [twin_path(scene)[0] for scene in [Scene.of(TWINS, 60, 4)] for _ in range(2)]
     scene = Scene.of(TWINS, 60, 4)
     scene.observe = lambda clean, stamp: None  # the noise would change the paths drawn after it
-    found = tasks.twins(ScriptedEstimator(paths, believe), scene, 2, iter)["two rooms alike: both kept"]
+    found = tasks.twins(ScriptedEstimator(paths, believe), scene, 2)["two rooms alike: both kept"]
     assert (found.found, found.total, found.wrong) == (kept, 2, wrong)
 
 

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
-from common.errors import UserError
 from lab.accuracy.panorama import PanoramaShape, train_panorama
-from services.estimator.paper.decoder import Decoder, DecoderShape, PaperModel, use_one_core
-from services.estimator.paper.estimator import PaperGenerativeModel
-from tests.estimator.models import HEADING, ROOM, SCANNER
-from tests.estimator.paper.training_scans import normalisation
+from services.estimator.paper.decoder import use_one_core
+from tests.estimator.models import ROOM
 
 ANGLES = np.deg2rad(np.linspace(-135, 135, 91))
 use_one_core()  # on a busy machine, several threads that wait for one another take minutes instead of seconds
@@ -61,19 +57,3 @@ def test_jacobian():
         offset = step * np.eye(3)[axis]
         ahead, back = model.expect(np.array([pose + offset, pose - offset]), ANGLES).ranges
         assert found[:, axis] == pytest.approx((ahead - back) / (2 * step), rel=1e-2, abs=1e-2)
-
-
-def test_decoder_of_the_paper():
-    torch.manual_seed(0)
-    model = PaperModel(Decoder(DecoderShape(SCANNER.beams, 16, 4)).double(), normalisation())
-    scans = PaperGenerativeModel(model, SCANNER, HEADING, 0.3)
-    laser = np.array([[2.0, 1.5, HEADING + 1.0]])  # the heading is ignored, because the decoder is trained for one only
-    expected = scans.expect(laser, SCANNER.angles())
-    base = np.array([2.0, 1.5, 0.0]) - [*(np.array([np.cos(HEADING + 1), np.sin(HEADING + 1)]) * SCANNER.mount[0]), 0]
-    ranges, jacobian = model.predict(np.array([*base[:2], HEADING]))
-    assert expected.ranges[0] == pytest.approx(ranges)
-    assert expected.jacobian[0] == pytest.approx(jacobian)
-    assert (expected.scale == 0.3).all()
-    assert np.array_equal(scans.expect(laser, SCANNER.angles()[::2]).ranges[0], ranges[::2])
-    with pytest.raises(UserError, match="beams of its training"):
-        scans.expect(laser, np.array([3.0]))

@@ -5,19 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from common.geometry import se2
 from common.geometry.world import World
 from lab.accuracy.scenes import Scene
 from lab.benchmarks.building_drives import drive_for
 from lab.benchmarks.refinement import wall_errors
 from lab.integrity.buildings import make_building
 from services.estimator.shared.generative_models import RayCaster
-
-
-def test_alignment():
-    truths = np.random.default_rng(0).uniform(-2, 2, (20, 3))
-    frame = np.array([3.0, -1.0, 0.5])
-    assert se2.alignment(se2.compose(se2.inverse(frame), truths), truths) == pytest.approx(frame)
 
 
 def test_walls_of_the_true_world_are_right():

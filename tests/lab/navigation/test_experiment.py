@@ -276,9 +276,6 @@ def test_result_names():
     odd = replace(job, start="unknown", people=10, epistemic=False, estimator="particle-filter", prior="odometry")
     name = driving.result_name(odd, ("folder/my.yaml",), ("differential",))
     assert name == "navigation-my-differential-unknown-people10-particle-filter-odometry-no-epistemic"
-    assert driving.result_name(replace(job, people=3, people_speed=0.5), ("office",), driving.DRIVES) == (
-        "navigation-office-people3-0.5mps"
-    )
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from presage.recordings.csv_tables import columns_of, export_csv
 from presage.recordings.export import ExportOptions, run_export
 from presage.recordings.tum import export_tum
 from services.recorder.reader import read_recording
-from tests.lab.navigation import drives as driven
+from tests.presage.recordings import artificial_session as driven
 
 QUIET = Console(quiet=True)
 

@@ -26,7 +26,7 @@ from presage.recordings.foxglove_numbers import FIELDS
 from presage.recordings.foxglove_session import WallClock
 from presage.recordings.foxglove_shapes import ELLIPSE_SCALE_95, ellipse, grid, world_entities
 from services.recorder.reader import read_recording
-from tests.lab.navigation import drives as driven
+from tests.presage.recordings import artificial_session as driven
 from tests.recorder.sessions import WORLD
 
 

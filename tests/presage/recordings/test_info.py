@@ -18,7 +18,7 @@ from presage.recordings import info as information
 from presage.recordings.info import collect_facts
 from presage.recordings.printing import echo_either, info
 from services.recorder.reader import read_recording
-from tests.lab.navigation import drives as driven
+from tests.presage.recordings import artificial_session as driven
 
 KEY = ODOM.key("rob")
 

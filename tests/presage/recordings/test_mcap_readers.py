@@ -12,7 +12,7 @@ from services.recorder.files.parts import PartLimits, PartsWriter
 from services.recorder.files.writer import RecordingWriter
 from services.recorder.reader import read_recording
 from services.recorder.recover import recover
-from tests.lab.navigation import drives as driven
+from tests.presage.recordings import artificial_session as driven
 
 SENT = [(key, message.encode(), at) for _, key, message, at in driven.events()]
 
