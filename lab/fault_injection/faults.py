@@ -205,16 +205,6 @@ FAULTS: tuple[Fault, ...] = (
         needs_hosts=True,
     ),
     Fault(
-        "clock a minute ahead",
-        "the estimator is killed and restarted with a wrong clock",
-        _kill_and_set_clock_ahead,
-        _restart_with_wrong_clock,
-        "stops",
-        services=("estimator",),
-        restarts_process=True,
-        unavailable_reason=_missing_faketime,
-    ),
-    Fault(
         "duplicates, late",
         "every scan, belief and command is repeated at once and again a second later",
         *REPEATER,
@@ -237,4 +227,15 @@ FAULTS: tuple[Fault, ...] = (
         "slow subscriber", "a subscriber to all topics takes 0.2 s for each message", *SLOW_SUBSCRIBER, "goes on", 8.0
     ),
     Fault("malformed", "100 000 random payloads on all topics, as fast as possible", *NOISE, "survives", 8.0),
+    # The last one, because the clock of the estimator stays wrong.
+    Fault(
+        "clock a minute ahead",
+        "the estimator is killed and restarted with a wrong clock",
+        _kill_and_set_clock_ahead,
+        _restart_with_wrong_clock,
+        "stops",
+        services=("estimator",),
+        restarts_process=True,
+        unavailable_reason=_missing_faketime,
+    ),
 )
