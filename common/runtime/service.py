@@ -7,6 +7,7 @@ import sys
 from abc import ABC
 from collections import Counter
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 from common.bus.bus import Bus, open_bus
@@ -81,8 +82,11 @@ class Service(ABC):
     def on_restored(self, last: dict[Topic, Stamped]) -> None:
         """Handles the last messages of ``restores_latched``: called at most once, within 5 s of the start."""
 
-    def on_request(self, query: Query, request: Request) -> Reply:
-        """Handles a valid request and returns the reply. A UserError becomes a reply with ok=False."""
+    def on_request(self, query: Query, request: Request) -> Reply | Future[Reply]:
+        """Handles a valid request and returns the reply, or its future if another thread does the work.
+
+        A UserError becomes a reply with ok=False.
+        """
         return Reply(ok=False, reason=f"{self.name} does not answer {query.name} ({type(request).__name__})")
 
     def on_reply(self, query: Query, number: int, reply: Reply) -> None:

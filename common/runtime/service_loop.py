@@ -7,6 +7,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,7 @@ from common.bus.leader_election import LeaderElection
 from common.errors import UserError
 from common.log import LogRateLimiter
 from common.messages.definitions import Health, Stamped, TopicHealth
-from common.messages.requests import ConfigReply, Request
+from common.messages.requests import ConfigReply, Reply, Request
 from common.messages.topics import CONFIG, HEALTH, Query, Topic
 from common.messages.wire import DecodeError
 from common.runtime.heartbeat import Heartbeat
@@ -249,15 +250,26 @@ class ServiceLoop:
             self.reject(call.query.name, str(error))
             call.refuse(str(error))
             return
+
+        def result() -> Reply | Future[Reply]:
+            return self._config() if call.query is CONFIG else self.service.on_request(call.query, request)
+
+        self._reply(call, result)
+
+    def _reply(self, call: IncomingRequest, result: Callable[[], Reply | Future[Reply]]) -> None:
+        """Replies with the ``result``, or why there is none; if it is a future, when that is done."""
         try:
-            reply = self._config() if call.query is CONFIG else self.service.on_request(call.query, request)
+            reply = result()
         except UserError as error:
             reply = call.query.reply(ok=False, reason=str(error))
         except Exception as error:  # noqa: BLE001
             self._log_failure("request failed", error, query=call.query.name)
             call.refuse(f"{self.service.name} failed: {type(error).__name__}: {error}")
             return
-        call.reply(reply.encode())
+        if isinstance(reply, Future):
+            reply.add_done_callback(lambda done: self._reply(call, done.result))
+        else:
+            call.reply(reply.encode())
 
     def _config(self) -> ConfigReply:
         config = json.dumps(self.service.settings.effective())

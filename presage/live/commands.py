@@ -39,6 +39,7 @@ from common.messages.topics import (
     Topic,
 )
 from common.messages.wire import DecodeError, Message
+from common.runtime.session_files import session_of
 from presage.live.latest_messages import LatestMessages, session_bus
 from presage.terminal.progress import status_line
 
@@ -315,7 +316,12 @@ def save_map(link: Link, name: str, console: Console) -> None:
     with session_bus(link) as bus:
         # A session that has just opened does not know the services yet.
         if not wait_until(lambda: SAVE_MAP.server in bus.alive(), DISCOVERY_TIMEOUT_S):
-            raise UserError("no mapper is running: start one with `presage up --mapping`, and drive")
+            session = session_of(bus.robot, ",".join(link.connect))
+            command = "" if session is None else session.start_command(SAVE_MAP.server, bus.robot)
+            advice = (
+                f"it ended; start it with: {command}" if command else "start one with `presage up --mapping`, and drive"
+            )
+            raise UserError(f"no mapper is running: {advice}")
         reply = bus.query(SAVE_MAP, SaveMapRequest(name=name), SaveMapReply, SAVE_TIMEOUT_S)
     if not reply.ok:
         raise UserError(f"not saved: {reply.reason}")

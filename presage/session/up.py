@@ -90,6 +90,8 @@ def _check_combination(options: UpOptions, first_robot: str, *, simulated: bool,
         raise UserError(
             "--no-simulator supports one robot in real time only: leave out --robots, and remove pace from the settings"
         )
+    if options.mapping and options.estimator:
+        raise UserError("--mapping runs no estimator: leave out --estimator, --model and --learn")
     if options.mapping and options.robots > 1:
         raise UserError("--mapping maps with one robot: leave out --robots")
 

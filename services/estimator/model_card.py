@@ -110,7 +110,10 @@ def save_learned(
     try:
         precise_weights.write(path, version.model, version.seeds, card)
     except OSError as error:
-        raise UserError(f"{path}: cannot be written ({error.strerror}): choose a folder with --saved-models") from None
+        raise UserError(
+            f"{path}: cannot be written ({error.strerror}): free space, or start the estimator with another folder "
+            "(PRESAGE_ESTIMATOR_SAVED_MODELS)"
+        ) from None
     return path
 
 

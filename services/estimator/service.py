@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -184,7 +185,7 @@ class EstimatorService(Service):
             wait = self.settings.prior == "odometry"
             self._update_all(self.odometry_sync.add_scan(message) if wait else [(message, None)])
 
-    def on_request(self, query: Query, request: Request) -> Reply:
+    def on_request(self, query: Query, request: Request) -> Reply | Future[Reply]:
         """Answers a request to localise again, to predict scans, or to describe or save the model."""
         if isinstance(request, ModelRequest):
             return self._describe_model(request)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import ClassVar
@@ -10,7 +11,9 @@ from typing import ClassVar
 import numpy as np
 
 from common.errors import UserError
+from common.geometry.occupancy_grid import OccupancyGrid
 from common.geometry.ros_map_writer import write_grid
+from common.geometry.se2 import Array
 from common.geometry.tum import write_tum
 from common.geometry.world import known_worlds
 from common.messages.definitions import MAX_LATE_NS, Belief, BeliefHypothesis, Map, Odom, Pose, Scan, Stamped
@@ -146,13 +149,16 @@ class MapperService(Service):
             self._published_ns = self._belief.stamp_ns
             self.publish(MAP, map_message(self._belief.stamp_ns, mapper.map))
 
-    def on_request(self, query: Query, request: Request) -> Reply:
-        """Saves the map of the scans until now."""
+    def on_request(self, query: Query, request: Request) -> Reply | Future[Reply]:
+        """Saves the map of the scans until now, in the second thread."""
         if not isinstance(request, SaveMapRequest):
             return super().on_request(query, request)
         if self.mapper is None:
             raise UserError("there is no map yet: no scan has come")
-        path = save_map(self.settings.maps, request.name, self.mapper)
+        return self._pool.submit(self._save, saving(self.settings.maps, request.name, self.mapper))
+
+    def _save(self, save: Callable[[], Path]) -> Reply:
+        path = save()
         self.log.info("map saved", file=str(path))
         return SaveMapReply(file=str(path))
 
@@ -166,24 +172,38 @@ def _reason_to_start_again(mapper: Mapper, scan: Scan) -> str:
     return ""
 
 
-def save_map(folder: Path, name: str, mapper: Mapper) -> Path:
-    """Writes map and trajectory; returns the path of NAME.yaml. Raises UserError if that fails."""
+def saving(folder: Path, name: str, mapper: Mapper) -> Callable[[], Path]:
+    """Returns a function that writes map and trajectory of the scans until now, and returns the path of NAME.yaml.
+
+    Another thread may call it, because drawing takes seconds. Both raise UserError if they fail.
+    """
     if mapper.map is None:
         raise UserError("there is no map yet: try again in some seconds; if that does not help, scans show too little")
     if re.fullmatch(FILE_NAME, name) is None or name in known_worlds():
         raise UserError(f"name {name!r}: give up to 64 letters, digits, - and _, and not the name of a shipped world")
-    path = folder.resolve() / f"{name}.yaml"
+    drawing, trajectory, path = mapper.drawing(), mapper.trajectory(), folder.resolve() / f"{name}.yaml"
+
+    def save() -> Path:
+        _write_map(path, drawing(), trajectory)
+        return path
+
+    return save
+
+
+def _write_map(path: Path, grid: OccupancyGrid, trajectory: tuple[Array, Array]) -> None:
     files = [path.with_suffix(suffix) for suffix in (".yaml", ".pgm", ".tum")]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if existing := next((file for file in files if file.exists()), None):
             raise UserError(f"{existing} exists already: choose another name")
         with complete_files(path) as partial:
-            write_grid(partial, name, mapper.draw())
-            write_tum(partial / f"{name}.tum", *mapper.trajectory())
+            write_grid(partial, path.stem, grid)
+            write_tum(partial / f"{path.stem}.tum", *trajectory)
     except OSError as error:
-        raise UserError(f"{path}: cannot be written ({error.strerror}): choose another folder with --maps") from None
-    return path
+        raise UserError(
+            f"{path}: cannot be written ({error.strerror}): free space, or start the mapper with another folder "
+            "(PRESAGE_MAPPER_MAPS)"
+        ) from None
 
 
 def belief_message(scan: Scan, scan_pose: ScanPose) -> Belief:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from typing import ClassVar
 
@@ -77,7 +78,7 @@ class RecorderService(Service):
             self.counters["written"] += 1
             self.counters["written_bytes"] += len(sample.payload)
 
-    def on_request(self, query: Query, request: Request) -> Reply:
+    def on_request(self, query: Query, request: Request) -> Reply | Future[Reply]:
         """Starts or stops a recording, and returns its state."""
         if not isinstance(request, RecordRequest):
             return super().on_request(query, request)

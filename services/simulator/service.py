@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from concurrent.futures import Future
 from dataclasses import replace
 from typing import ClassVar
 
@@ -220,7 +221,7 @@ class SimulatorService(Service):
             self.publish(topic, message)
         self._repeat_s = time.monotonic() + REPEAT_S
 
-    def on_request(self, query: Query, request: Request) -> Reply:
+    def on_request(self, query: Query, request: Request) -> Reply | Future[Reply]:
         """Carries out a request. Raises UserError if that is not possible."""
         if query is WORLD:
             simulation = self.simulation

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import Annotated, ClassVar
 
 from pydantic import Field
@@ -33,6 +34,7 @@ class Small(Service):
     def __init__(self, settings):
         super().__init__(settings)
         self.fail = settings.fail
+        self.pool = ThreadPoolExecutor(1)
         if settings.slow == "making":
             self.log.info("in the making")
             time.sleep(0.5)
@@ -67,7 +69,15 @@ class Small(Service):
             raise UserError("inside a wall")
         if request.pose.x > 100:
             raise ValueError("a bug in on_request")
+        if request.pose.y == 2:  # another thread does the work
+            return self.pool.submit(self.slow_reply, request)
         return Reply(reason=f"at {request.pose.x:g}")
+
+    def slow_reply(self, request):
+        time.sleep(0.5)
+        if request.pose.x == 50:
+            raise UserError("inside a wall of the other thread")
+        return Reply(reason=f"late at {request.pose.x:g}")
 
     def on_reply(self, query, number, reply):
         self.counters["replies"] += 1

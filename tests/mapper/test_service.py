@@ -182,15 +182,15 @@ def test_a_failed_save_leaves_the_name_free(tmp_path, monkeypatch):
     grid = OccupancyGrid.of(np.zeros((2, 2), np.uint8), 0.05, (0.0, 0.0, 0.0))
     mapper = SimpleNamespace(
         map=MapSnapshot(grid, np.zeros((1, 3)), np.zeros((0, 2), np.intp)),
-        draw=lambda: grid,
+        drawing=lambda: lambda: grid,
         trajectory=lambda: (np.zeros(1), np.zeros((1, 3))),
     )
     monkeypatch.setattr(service, "write_tum", Mock(side_effect=OSError(28, "No space left on device")))
     with pytest.raises(UserError, match=r"here\.yaml: cannot be written \(No space left on device\)"):
-        service.save_map(tmp_path, "here", mapper)
+        service.saving(tmp_path, "here", mapper)()
     assert list(tmp_path.iterdir()) == []
     monkeypatch.undo()
-    assert service.save_map(tmp_path, "here", mapper) == tmp_path / "here.yaml"
+    assert service.saving(tmp_path, "here", mapper)() == tmp_path / "here.yaml"
     (tmp_path / "file").write_text("", encoding="utf-8")
-    with pytest.raises(UserError, match="choose another folder with --maps"):
-        service.save_map(tmp_path / "file", "here", mapper)
+    with pytest.raises(UserError, match="with another folder"):
+        service.saving(tmp_path / "file", "here", mapper)()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -103,12 +105,15 @@ class Mapper:
             if link.second >= len(snapshot.poses) and scans.pieces[link.first] in self._pieces:
                 self._pieces.add(int(scans.pieces[link.second]))
 
-    def draw(self) -> OccupancyGrid:
-        """Draws the map of the scans until now. Uses more scans than `update`, and takes seconds after a long drive."""
+    def drawing(self) -> Callable[[], OccupancyGrid]:
+        """Returns a function that draws the map of the scans until now, and that another thread may call.
+
+        It uses more scans than `update`, and takes seconds after a long drive.
+        """
         numbers, ranges = self._front_end.grid_scans()
         poses = self._poses()[numbers]
         placed = np.isfinite(poses[:, 0])
-        return grid_of_scans(poses[placed], ranges[placed], self.laser, self.cell)
+        return partial(grid_of_scans, poses[placed], ranges[placed], self.laser, self.cell)
 
     def trajectory(self) -> tuple[Array, Array]:
         """Stamps (N,) in s and poses (N, 3) in map of all scans that are connected to the map."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -144,6 +145,20 @@ def test_requests_to_itself(small):
         assert text in small.latest.note
     small.goal(1.0, 1.0, cancel=True)
     assert small.running.stop() == 0, small.running.output
+
+
+def test_requests_that_another_thread_answers(small):
+    """Meanwhile the service handles messages."""
+
+    def ask(x: float) -> Reply:
+        return small.bus.query(TELEPORT, PoseRequest(pose=Pose(x=x, y=2.0)), Reply)
+
+    with ThreadPoolExecutor(2) as pool:
+        replies = [pool.submit(ask, x) for x in (3.0, 50.0)]
+        small.bus.put(SCAN, scan(1))
+        assert small.until(lambda h: h.counters.get("scans") == 1)
+    assert replies[0].result() == Reply(reason="late at 3")
+    assert replies[1].result() == Reply(ok=False, reason="inside a wall of the other thread")
 
 
 def test_results_of_requests(small):

@@ -107,7 +107,7 @@ def test_first_scans_without_return(with_odometry, first_step):
 def test_a_drawn_map_has_fewer_gaps_than_that_of_the_key_scans():
     truth = Scene.of(OFFICE, 300, 5).path(5)
     mapper, _ = mapped(driven(OFFICE, truth))
-    drawn, of_key_scans = mapper.draw(), mapper.map.grid
+    drawn, of_key_scans = mapper.drawing()(), mapper.map.grid
     occupied = np.argwhere(drawn.values == OCCUPIED)[:, ::-1]
     assert len(occupied) > 1.3 * (of_key_scans.values == OCCUPIED).sum()
     centres = drawn.to_map((occupied + 0.5) * drawn.resolution)

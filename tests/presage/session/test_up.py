@@ -9,6 +9,15 @@ from presage.session import up
 from presage.terminal.options import console
 
 
+@pytest.fixture
+def nothing_starts(monkeypatch):
+    def start(*_, **__):
+        raise AssertionError("a process would be started")
+
+    monkeypatch.setattr(up, "Stack", start)
+
+
+@pytest.mark.usefixtures("nothing_starts")
 @pytest.mark.parametrize(
     ("arguments", "variables", "says"),
     [
@@ -19,11 +28,14 @@ from presage.terminal.options import console
     ],
 )
 def test_two_robots(monkeypatch, arguments, variables, says):
-    def start(*_, **__):
-        raise AssertionError("a process would be started")
-
-    monkeypatch.setattr(up, "Stack", start)
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
     with pytest.raises(UserError, match=says):
         up.run_up(up.UpOptions(estimator=arguments, robots=2), console)
+
+
+@pytest.mark.usefixtures("nothing_starts")
+@pytest.mark.parametrize("arguments", [["--learn", "refine"], ["--estimator", "paper"], ["--model", "exact"]])
+def test_options_of_the_estimator_while_mapping(arguments):
+    with pytest.raises(UserError, match="--mapping runs no estimator"):
+        up.run_up(up.UpOptions(estimator=arguments, mapping=True), console)
