@@ -74,13 +74,6 @@ class Estimator:
         for warning in ignored_settings(preset, given):
             warnings.warn(warning, stacklevel=2)
         generative_model = None if isinstance(model, str | Path) else model
-        for name, part, method in (
-            ("model", generative_model, "expect"),
-            ("likelihood", likelihood, "evaluate"),
-            ("optimiser", optimiser, "descend"),
-        ):
-            if part is not None and not hasattr(part, method):
-                raise UserError(f"{name}: give an object with the method {method}, not {part!r}")
         options = EstimatorOptions(
             world if isinstance(world, World) else str(world),
             preset,
