@@ -258,6 +258,13 @@ def test_parameters_of_preset_paper(world):
     assert estimator.fixed_heading == pytest.approx(np.pi / 2, abs=1e-6)
 
 
+def test_example_policy(tmp_path):
+    assert runpy.run_path(str(ROOT / "docs/examples/own_policy.py"))["drive"](tmp_path / "run.csv").state == "reached"
+    rows = np.genfromtxt(tmp_path / "run.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(rows["free_energy_nats"], rows["accuracy_nats"] + rows["complexity_nats"])
+    assert rows["error_m"].max() < 0.02
+
+
 def test_example_estimator(ranges):
     example = runpy.run_path(str(ROOT / "docs/examples/my_estimator.py"))
     service = example["MyEstimator"](example["MySettings"](start="1,2,90"))
