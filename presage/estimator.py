@@ -60,9 +60,11 @@ class Estimator:
             model: for preset "precise": "learned", "exact" (rays cast in the world), a file of weights, or any object
                 with the methods of GenerativeModel.
             models: folder of weights; defaults to your trained ones for the world, else the shipped ones.
-            likelihood: for preset "precise": density of a range; defaults to the calibrated one of the model.
+            likelihood: for preset "precise": density of a range, with its own sigma; defaults to the calibrated one of
+                the model. It does not decide which hypothesis is believed (docs/api.md).
             optimiser: for preset "precise": finds poses of least free energy; defaults to GaussNewton().
-            sigma: for preset "precise": noise of the scanner in m; defaults to what the scans state, else 0.02.
+            sigma: for preset "precise": noise of the scanner in m, which scans then correct; defaults to what they
+                state, else 0.02.
             initial_pose: (3,) pose at the first scan, or (2,) without a heading; by default, anywhere.
             seed: random seed.
             descent: parameters of preset "paper", which estimates x and y for one heading (`fixed_heading`).
@@ -74,13 +76,6 @@ class Estimator:
         for warning in ignored_settings(preset, given):
             warnings.warn(warning, stacklevel=2)
         generative_model = None if isinstance(model, str | Path) else model
-        for name, part, method in (
-            ("model", generative_model, "expect"),
-            ("likelihood", likelihood, "evaluate"),
-            ("optimiser", optimiser, "descend"),
-        ):
-            if part is not None and not hasattr(part, method):
-                raise UserError(f"{name}: give an object with the method {method}, not {part!r}")
         options = EstimatorOptions(
             world if isinstance(world, World) else str(world),
             preset,
@@ -120,7 +115,8 @@ class Estimator:
         """Returns the belief after one more scan.
 
         ``scan`` is a LaserScan, or the ranges (B,) in m of the estimator's ``scanner``, measured at ``stamp`` (s) with
-        the odometry ``odom`` (3,), base_link in odom. Without stamps, scans are assumed to follow at a usual rate.
+        the odometry ``odom`` (3,), base_link in odom. Odometry is used if it is given, here or in a LaserScan. Without
+        stamps, scans are assumed to follow at a usual rate.
         Raises UserError if the scan does not fit the scanner or the model.
         """
         if not isinstance(scan, LaserScan):

@@ -8,7 +8,7 @@ has odometry.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ from lab.experiments.trials import run_trials
 from lab.statistics import root_mean_square
 from presage.plotting import style as drawing
 from services.estimator.paper.perception import Descent
+from services.estimator.shared.interface import PoseEstimator
 
 EXPERIMENT_ID = 1  # part of the random seeds
 ESTIMATORS = tuple(name for name in NAMES if not uses_odometry(name))  # the robot stands
@@ -51,8 +52,11 @@ class LocalisationJob:
     descent: Descent = PAPER_DESCENT
 
 
-def trial(job: LocalisationJob) -> dict[str, Any]:
-    """Runs one trial. Returns each estimator's error (m) after every iteration and its final state, and the bound."""
+def trial(job: LocalisationJob, create: Callable[..., PoseEstimator] = create_estimator) -> dict[str, Any]:
+    """Runs one trial. Returns each estimator's error (m) after every iteration and its final state, and the bound.
+
+    ``create`` makes the estimators of the job by their names; it has the arguments of `create_estimator`.
+    """
     scene = job.field.scene(job.seed, EXPERIMENT_ID, job.index)
     pose = scene.poses(1)[0]
     pose[2] = job.field.heading
@@ -67,7 +71,7 @@ def trial(job: LocalisationJob) -> dict[str, Any]:
         "claim": {},
     }
     for name in job.estimators:
-        estimator = create_estimator(name, job.field, scene, job.seed * 100_003 + job.index, job.descent)
+        estimator = create(name, job.field, scene, job.seed * 100_003 + job.index, job.descent)
         posteriors = [estimator.update(scan) for scan in scans]
         outcome["error_m"][name] = [round(float(np.hypot(*(p.pose - pose)[:2])), 6) for p in posteriors]
         outcome["claim"][name] = posteriors[-1].state

@@ -1,6 +1,6 @@
 """Predicted against measured scans.
 
-Uses the shipped weights. The paper's decoder predicts no precision: the paper sets Σ_o = 1, here 1 m² for every beam.
+Uses the shipped weights. The paper's decoder predicts no precision, and the paper does not state Σ_o: here it is 1 m².
 The distance field predicts each beam's model error m; with the scanner's noise σ the deviation is (σ² + m²)^½.
 """
 
@@ -32,7 +32,7 @@ from services.estimator.shared.model_folder import SHIPPED
 
 EXPERIMENT_ID = 6  # part of the random seeds
 SAMPLE_SEED, TEST_SEED = 0, 1  # parts of the random seeds
-PAPER_SIGMA = 1.0  # m, the paper's Σ_o
+PAPER_SIGMA = 1.0  # m, of every beam in preset `paper`
 SIGMA_FACTORS = tuple(np.round(np.arange(0.25, 4.01, 0.25), 2).tolist())  # multiples of the predicted deviation
 GAUSSIAN = {1: 0.6827, 2: 0.9545, 3: 0.9973}  # share of a Gaussian within k deviations
 # A beam counts as imprecise (`unsure` in the results) if its deviation exceeds the scanner's noise by this factor, that
@@ -140,7 +140,7 @@ def run(job: PredictionJob, out: Path, workers: int, console: Console) -> result
         rows,
         [
             f"sample: seed {job.seed}, robot at ({x:.2f}, {y:.2f}) m, heading {np.rad2deg(yaw):.0f}°; drawn at random",
-            f"the paper predicts no precision: Σ_o = 1, taken as {PAPER_SIGMA:g} m² for every beam",
+            f"the paper predicts no precision, and does not state Σ_o: here it is {PAPER_SIGMA:g} m² for every beam",
         ],
     )
     result.write(out, draw(result))

@@ -15,7 +15,7 @@ from common.geometry.se2 import Array
 from common.robot.ranges import normalise_driver_ranges
 from presage.logs.log import Log, LoggedScan, Reading
 
-ARRAY_NAMES = {"ranges", "angles", "range_max", "stamps", "odom", "initial_pose", "reference"}
+ARRAY_NAMES = ("ranges", "angles", "range_max", "stamps", "odom", "initial_pose", "reference")
 MAX_SPAN = float(np.deg2rad(361))  # rad, from the first to the last beam
 DEFAULT_MOUNT = (0.2, 0.0, 0.0)  # m, m, rad, of the shipped scanner
 
@@ -30,7 +30,7 @@ def open_npz(path: Path, reading: Reading) -> Log:
             f"{path}: an .npz file has no topics: leave out scan_topic, odom_topic and "
             "reference_topic in section log of --config"
         )
-    data = _load_arrays(path)
+    data, names = _load_arrays(path)
     missing = [name for name in ("ranges", "angles", "range_max") if name not in data]
     if missing:
         raise UserError(f"{path}: lacks {', '.join(missing)}; ranges (N, B), angles (B,) and range_max are required")
@@ -41,6 +41,8 @@ def open_npz(path: Path, reading: Reading) -> Log:
     range_max = reading.range_max or range_max
     reference = None if reading.reference is False else data.get("reference")
     notes = []
+    if unknown := [name for name in names if name not in ARRAY_NAMES]:
+        notes.append(f"not used: {', '.join(unknown)}; the arrays of an .npz file are {', '.join(ARRAY_NAMES)}")
     if reading.mount is None:
         notes.append(f"assumed: the laser is mounted at {DEFAULT_MOUNT[0]:g},0,0 in base_link (change with --mount)")
     return Log(
@@ -90,14 +92,14 @@ def _read_scans(
         yield LoggedScan(stamp, measured, se2.known_pose(odom, k), se2.known_pose(reference, k))
 
 
-def _load_arrays(path: Path) -> dict[str, Array]:
-    """Loads the arrays in `ARRAY_NAMES`, as float64."""
+def _load_arrays(path: Path) -> tuple[dict[str, Array], list[str]]:
+    """Loads the arrays in `ARRAY_NAMES`, as float64. Also returns the names of all arrays."""
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             kept = {name: file[name] for name in file.files if name in ARRAY_NAMES}
             if wrong := [name for name, array in kept.items() if array.dtype.kind not in "fiu"]:
                 raise UserError(f"{path}: {wrong[0]} holds {kept[wrong[0]].dtype}, not real numbers")
-            return {name: np.asarray(array, np.float64) for name, array in kept.items()}
+            return {name: np.asarray(array, np.float64) for name, array in kept.items()}, file.files
     except FileNotFoundError:
         raise UserError(f"{path}: no such file") from None
     except (

@@ -25,10 +25,10 @@ from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.gauss_newton import Optimiser
 from services.estimator.precise.global_seeds import SEED_SPACING_M, Seeds, thin_places
 from services.estimator.precise.learning import weights
-from services.estimator.precise.likelihood import Likelihood
+from services.estimator.precise.likelihood import Likelihood, check_likelihood
 from services.estimator.precise.motion_model import MotionNoise
 from services.estimator.precise.settings import PreciseSettings
-from services.estimator.shared.generative_models import GenerativeModel, RayCaster
+from services.estimator.shared.generative_models import GenerativeModel, RayCaster, check_model
 from services.estimator.shared.interface import Observation, PoseEstimator
 from services.estimator.shared.model_folder import find_folder
 
@@ -148,6 +148,12 @@ def prepare_factory(options: EstimatorOptions) -> EstimatorFactory:
         raise UserError(f"sigma: give the noise of the scanner in m, greater than 0, not {options.sigma}")
     if options.estimator != "precise" and (options.likelihood is not None or options.optimiser is not None):
         raise UserError(f"likelihood and optimiser are for preset precise only, not {options.estimator}")
+    if options.likelihood is not None:
+        check_likelihood(options.likelihood)
+        if options.sigma is not None:
+            raise UserError("give sigma or likelihood, not both: the likelihood has a sigma of its own")
+    if options.optimiser is not None and not hasattr(options.optimiser, "descend"):
+        raise UserError(f"optimiser: give an object with the method descend, not {options.optimiser!r}")
     world = options.loaded_world
     check_start(options.initial_pose, world)
     if options.estimator == "paper":
@@ -213,7 +219,10 @@ def load_model(options: EstimatorOptions, world: World) -> tuple[GenerativeModel
     # The robot may be where an obstacle of the map was removed. A grid does not tell walls from furniture.
     count, rng = max(4000, int(60 * world.free_area)), np.random.default_rng(0)
     places = world.sample_within_walls(count, rng) if world.grid is None else world.sample_free(count, rng, 0.05)
-    model = options.generative_model or RayCaster(world)
+    model: GenerativeModel = RayCaster(world)
+    if options.generative_model is not None:
+        model = options.generative_model
+        check_model(model, places[:2])
     return model, Seeds.at(model, thin_places(places, SEED_SPACING_M)), None
 
 

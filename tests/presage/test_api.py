@@ -7,6 +7,7 @@ import re
 import runpy
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -137,8 +138,13 @@ def test_mount_argument_replaces_the_scans(world, ranges):
             lambda e, r: presage.Estimator("corridor", initial_pose="here"),
             "initial_pose: give x, y in m .*, not 'here'",
         ),
-        (lambda e, r: presage.Estimator("corridor", likelihood=3), "likelihood: .* with the method evaluate, not 3"),
-        (lambda e, r: presage.Estimator("corridor", model=3), "model: .* with the method expect, not 3"),
+        (lambda e, r: presage.Estimator("corridor", likelihood=3), "likelihood: .* of presage.Likelihood, not 3"),
+        (lambda e, r: presage.Estimator("corridor", model=3), "model: .* methods expect and expect_behind .*, not 3"),
+        (lambda e, r: presage.Estimator("corridor", optimiser=3), "optimiser: .* the method descend, not 3"),
+        (
+            lambda e, r: presage.Estimator("corridor", likelihood=presage.Likelihood(), sigma=0.03),
+            "give sigma or likelihood, not both",
+        ),
         (lambda e, r: e.update(r[:50]), r"ranges of shape \(50,\), but scanner tim571 has 200 beams"),
         (lambda e, r: e.update(presage.LaserScan(r, SCANNER.angles(), 25.0)), "the scanner, its mount or its noise"),
         (lambda e, r: presage.LaserScan(r, SCANNER.angles()[1:], 25.0), "as many ranges as angles"),
@@ -156,6 +162,79 @@ def test_mount_argument_replaces_the_scans(world, ranges):
 def test_refusals(estimator, ranges, call, why):
     with pytest.raises(presage.UserError, match=why):
         call(estimator, ranges)
+
+
+class ChangedModel:
+    """Exact rays, of which ``change`` returns something else."""
+
+    def __init__(self, world, change, change_behind=lambda ranges: ranges):
+        self.rays, self.change, self.change_behind = presage.RayCaster(world), change, change_behind
+
+    def expect(self, lasers, angles):
+        return self.change(self.rays.expect(lasers, angles))
+
+    def expect_behind(self, lasers, angles, ranges):
+        return self.change_behind(self.rays.expect_behind(lasers, angles, ranges))
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        # Compiled loops would read beyond the end of this Jacobian.
+        ((lambda e: replace(e, jacobian=e.jacobian[..., :2]),), r"jacobian \(N, B, 3\), not of shapes .*, \(2, 5, 2\)"),
+        ((lambda e: replace(e, ranges=list(e.ranges)),), "not of shapes None"),
+        ((lambda e: (e.ranges, e.scale, e.jacobian),), "expect must return presage.Expected, not tuple"),
+        ((lambda e: e.part(slice(1)),), r"expect must return ranges \(N, B\), here \(2, 5\), not of shape \(1, 5\)"),
+        ((lambda e: e, lambda ranges: ranges[0]), r"expect_behind must return ranges \(N, B\), here \(2, 5\)"),
+        ((lambda e: replace(e, ranges=e.ranges * np.nan),), "expect returned NaN or negative ranges"),
+        ((lambda e: replace(e, jacobian=e.jacobian * np.nan),), "its jacobian must be finite"),
+    ],
+)
+def test_refused_models(world, changes, why):
+    with pytest.raises(presage.UserError, match=why):
+        presage.Estimator(world, model=ChangedModel(world, *changes))
+
+
+class ChangedLikelihood(presage.Likelihood):
+    """The default density, of which ``change`` returns something else."""
+
+    change = staticmethod(lambda evidence: evidence)
+
+    def evaluate(self, *arguments):
+        return self.change(super().evaluate(*arguments))
+
+
+class UncopiedLikelihood(presage.Likelihood):
+    """A likelihood that cannot be copied."""
+
+    def __init__(self, nu):
+        super().__init__()
+        object.__setattr__(self, "nu", nu)
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda e: e.accuracy, "evaluate must return presage.Evidence, not ndarray"),
+        (lambda e: replace(e, xi=e.xi[0]), r"return xi of shape \(2, 3\) for two poses, not \(3,\)"),
+        (lambda e: replace(e, xi=e.xi * np.nan), "evaluate returned NaN or infinite xi"),
+    ],
+)
+def test_refused_likelihoods(world, monkeypatch, change, why):
+    monkeypatch.setattr(ChangedLikelihood, "change", staticmethod(change))
+    with pytest.raises(presage.UserError, match=why):
+        presage.Estimator(world, likelihood=ChangedLikelihood())
+    with pytest.raises(presage.UserError, match=r"UncopiedLikelihood cannot be copied .* remove its __init__"):
+        presage.Estimator(world, likelihood=UncopiedLikelihood(3.0))
+
+
+def test_refused_optimiser(world, ranges):
+    class Poses:
+        def descend(self, scan, poses, prior, schedule):
+            return poses
+
+    with pytest.raises(presage.UserError, match=r"optimiser: Poses\.descend must return a tuple"):
+        presage.Estimator(world, optimiser=Poses(), scanner=SCANNER).update(ranges)
 
 
 def test_parameters_of_another_preset():
@@ -177,6 +256,13 @@ def test_parameters_of_preset_paper(world):
         moved.append(np.hypot(*(estimator.update(scan).pose[:2] - start)))
     assert moved[0] > 10 * moved[1] > 0
     assert estimator.fixed_heading == pytest.approx(np.pi / 2, abs=1e-6)
+
+
+def test_example_policy(tmp_path):
+    assert runpy.run_path(str(ROOT / "docs/examples/own_policy.py"))["drive"](tmp_path / "run.csv").state == "reached"
+    rows = np.genfromtxt(tmp_path / "run.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(rows["free_energy_nats"], rows["accuracy_nats"] + rows["complexity_nats"])
+    assert rows["error_m"].max() < 0.02
 
 
 def test_example_estimator(ranges):

@@ -20,7 +20,7 @@ State = Literal["localising", "tracking", "lost"]
 
 @dataclass(frozen=True)
 class Descent:
-    """The paper's parameters; Sigma_o is 1 m² for every beam, as in the paper."""
+    """The paper's parameters. Sigma_o, which it does not state, is 1 m² for each beam: only alpha / Sigma_o matters."""
 
     # m², step size along the map's longest axis; with twice the value the belief oscillates near walls
     alpha: float = 2e-3

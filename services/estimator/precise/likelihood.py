@@ -14,20 +14,21 @@ has the probability 1 - unseen, and all measured ranges are equally likely.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
+from common.errors import UserError
 from services.estimator.precise import beam_sums
+from services.estimator.shared.generative_models import Expected
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from common.geometry.se2 import Array
-    from services.estimator.shared.generative_models import Expected
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,10 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Likelihood:
-    """Parameters of the density, as the module describes it."""
+    """Parameters of the density, as the module describes it.
+
+    A subclass is also a frozen dataclass, whose parameters are fields: it is copied with each noise that is learned.
+    """
 
     sigma: float = 0.02  # m
     short: float = 0.25  # fraction of beams that end early
@@ -126,3 +130,38 @@ class Likelihood:
         early = np.minimum(measured / np.maximum(expected, 1e-3), 1.0)
         flat = np.minimum(measured / range_max, 1.0)
         return np.asarray((1 - self.short - self.random) * core + self.short * early + self.random * flat)
+
+
+def check_likelihood(likelihood: Likelihood) -> None:
+    """Raises UserError if a likelihood cannot be copied with another noise, or does not return valid Evidence."""
+    if not isinstance(likelihood, Likelihood):
+        raise UserError(f"likelihood: give an object of a subclass of presage.Likelihood, not {likelihood!r}")
+    name = type(likelihood).__name__
+    try:
+        copy = replace(likelihood, sigma=likelihood.sigma)
+    except TypeError as error:
+        raise UserError(
+            f"likelihood: {name} cannot be copied ({error}): remove its __init__, decorate it with "
+            "@dataclass(frozen=True), and make its parameters fields"
+        ) from None
+    # Two poses and seven beams: as expected, too short, no return, not measured, none expected, unknown to the model.
+    ranges, scale = np.full((2, 7), 3.0), np.full((2, 7), 0.01)
+    ranges[:, 3:5] = scale[:, 5:] = np.inf
+    jacobian = np.where(np.isfinite(ranges + scale), 1.0, 0.0)[..., None] * np.array([1.0, 0.5, 0.1])
+    measured = np.array([3.01, 2.0, np.inf, -np.inf, 3.0, np.nan, 3.0])
+    for weights in (None, np.full(ranges.shape, 0.5)):
+        evidence = copy.evaluate(measured, 25.0, Expected(ranges, scale, jacobian), 0.05, weights)
+        if not isinstance(evidence, Evidence):
+            raise UserError(f"likelihood: {name}.evaluate must return presage.Evidence, not {type(evidence).__name__}")
+        for field, values in vars(evidence).items():
+            shape = {"accuracy": (2,), "xi": (2, 3)}.get(field, (2, 3, 3))
+            if np.shape(values) != shape:
+                raise UserError(
+                    f"likelihood: {name}.evaluate must return {field} of shape {shape} for two poses, not "
+                    f"{np.shape(values)}"
+                )
+            if not np.isfinite(values).all():
+                raise UserError(
+                    f"likelihood: {name}.evaluate returned NaN or infinite {field}, for measured ranges {measured} and "
+                    f"expected ranges {ranges[0]} with scale {scale[0]}"
+                )

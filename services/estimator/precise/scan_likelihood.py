@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from common.errors import UserError
 from common.geometry import se2
 from common.robot.ranges import is_surface
 from services.estimator.precise.gauss_newton import TRACKING_SCHEDULE_M, GaussNewton, Optimiser, Prior
@@ -79,7 +80,13 @@ class ScanLikelihood:
         self, poses: Array, prior: Prior | None = None, schedule: tuple[float, ...] = TRACKING_SCHEDULE_M
     ) -> tuple[Array, Evidence]:
         """Returns the minima near ``poses`` (N, 3), and the evidence there (see Optimiser)."""
-        return self.optimiser.descend(self, poses, prior, schedule)
+        found = self.optimiser.descend(self, poses, prior, schedule)
+        if not (isinstance(found, tuple) and np.shape(found[0]) == poses.shape and isinstance(found[-1], Evidence)):
+            raise UserError(
+                f"optimiser: {type(self.optimiser).__name__}.descend must return a tuple: poses of the shape given, "
+                f"{poses.shape}, and the Evidence there"
+            )
+        return found
 
     @cached_property
     def returned(self) -> npt.NDArray[np.bool_]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from common.errors import UserError
 from common.geometry.ray_casting import cast_rays, cast_rays_with_jacobian
 from services.estimator.shared.seen_cells import SeenCells
 
@@ -28,6 +29,15 @@ class Expected:
     ranges: Array  # (N, B) m; +inf if no return is expected
     scale: Array  # (N, B) m, standard deviation of the model's error; +inf where the model knows nothing
     jacobian: Array  # (N, B, 3) derivative of the ranges by the laser's x, y (m/m) and yaw (m/rad) in map
+
+    def __post_init__(self) -> None:
+        """Raises UserError if the shapes differ, because compiled loops do not check their indices."""
+        shapes = [getattr(each, "shape", None) for each in (self.ranges, self.scale, self.jacobian)]
+        if shapes[0] is None or len(shapes[0]) != 2 or shapes != [shapes[0], shapes[0], (*shapes[0], 3)]:
+            raise UserError(
+                "model: give Expected arrays for N poses and B beams: ranges (N, B), scale (N, B) and jacobian "
+                f"(N, B, 3), not of shapes {', '.join(map(str, shapes))}"
+            )
 
     @property
     def slope(self) -> Array:
@@ -60,6 +70,30 @@ class GenerativeModel(Protocol):
         A beam ends there if the first surface was removed.
         """
         ...
+
+
+def check_model(model: GenerativeModel, places: Array) -> None:
+    """Raises UserError if a model does not return what GenerativeModel states, for the laser at ``places`` (N, 2) m."""
+    for method in ("expect", "expect_behind"):
+        if not hasattr(model, method):
+            raise UserError(
+                f"model: give an object with the methods expect and expect_behind of GenerativeModel, not {model!r}"
+            )
+    lasers, angles = np.column_stack([places, np.zeros(len(places))]), np.linspace(-1, 1, 5)
+    expected = model.expect(lasers, angles)
+    if not isinstance(expected, Expected):
+        raise UserError(f"model: expect must return presage.Expected, not {type(expected).__name__}")
+    shape, behind = (len(lasers), len(angles)), model.expect_behind(lasers, angles, expected.ranges)
+    for method, values in (("expect", expected.ranges), ("expect_behind", behind)):
+        if np.shape(values) != shape:
+            raise UserError(f"model: {method} must return ranges (N, B), here {shape}, not of shape {np.shape(values)}")
+        if not (np.asarray(values) >= 0).all():
+            raise UserError(f"model: {method} returned NaN or negative ranges; no return is +inf")
+    if not (expected.scale >= 0).all() or not np.isfinite(expected.jacobian).all():
+        raise UserError(
+            "model: the scale of expect must not be negative or NaN (unknown is +inf), and its jacobian must be finite "
+            "(0 without a return)"
+        )
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +22,7 @@ from lab.paper import alpha_sweep as step_size
 from lab.paper import e1_localisation as localisation
 from lab.paper import e2_crossing as crossing
 from lab.paper.suite import FinishedExperiments
+from tests.conftest import ROOT
 from tests.lab.paper.counting import Count, count
 
 QUIET = Console(quiet=True)
@@ -97,6 +99,16 @@ def test_reproducible_trials():
     localisation.trial(small(0))
     assert localisation.trial(small(1)) == alone
     assert localisation.trial(small(2))["pose"] != alone["pose"]
+
+
+def test_variation_of_the_page():
+    """The code in docs/experiments.md, with another world and an estimator of one's own."""
+    text = (ROOT / "docs/experiments.md").read_text()
+    (block,) = re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    names = {}
+    exec(block, names)
+    assert names["errors"].keys() == {"precise", "mine"}
+    assert all(0 < error < 0.02 for error in names["errors"].values())
 
 
 def test_paper_descent_is_slow():

@@ -50,6 +50,11 @@ def test_format_by_content(tmp_path, name):
         assert kind_of(file.rename(tmp_path / "anything.dat")) == kind
 
 
+def test_unknown_array(tmp_path):
+    np.savez(tmp_path / "drive.npz", ranges=ranges(), angles=ANGLES, range_max=25.0, truth=truth(STAMPS))
+    assert read_scans(tmp_path / "drive.npz").notes[0].startswith("not used: truth; the arrays of an .npz file are ")
+
+
 def test_recording_is_no_log(tmp_path):
     file = write_recording(tmp_path / "run.mcap")
     assert kind_of(file) == "recording"
