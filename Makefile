@@ -101,8 +101,8 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	mkdir -p $(RESULTS)
 	$(BIN)/presage bench accuracy --estimators all --seed 3211 --seeds 5 --trials 10 --minutes 0.2 --json $(RESULTS)/accuracy.json --figure $(RESULTS)/accuracy.png
 	$(BIN)/presage experiment --out $(RESULTS) all
-	$(BIN)/presage experiment --seed 3562 --out $(RESULTS) navigation --trials 30
-	$(BIN)/presage experiment --seed 3563 --out $(RESULTS) navigation --start unknown --trials 30
+	$(BIN)/presage experiment --seed 3579 --out $(RESULTS) navigation --trials 30
+	$(BIN)/presage experiment --seed 3580 --out $(RESULTS) navigation --start unknown --trials 30
 	$(BIN)/presage experiment --seed 3560 --out $(RESULTS) navigation --worlds office --people 10 --trials 50
 	$(BIN)/presage experiment --seed 3551 --out $(RESULTS) navigation --worlds hall --drives holonomic --max-range 4 --beams 271 --prior odometry --slip 0.05 --limit 60 --trials 50
 	$(BIN)/presage experiment --seed 3551 --out $(RESULTS) navigation --worlds hall --drives holonomic --max-range 4 --beams 271 --prior odometry --slip 0.05 --limit 60 --trials 50 --no-epistemic
