@@ -157,7 +157,7 @@ class Belief(Stamped):
     covariance: Covariance | None = None  # (3, 3) of x, y, yaw in map, positive semidefinite
     xi: Floats | None = None  # (3,) dg' Pi (o - g), the negative gradient of accuracy in map: nats/m, nats/m, nats/rad
     curvature: Matrix3 | None = None  # (3, 3) dg' Pi dg, Gauss-Newton Hessian of accuracy in map
-    free_energy: Finite | None = None  # nats, accuracy + complexity; docs/method.md says at which pose
+    free_energy: Finite | None = None  # nats, accuracy + complexity
     accuracy: Finite | None = None  # nats, negative log-likelihood -ln p(o | pose): smaller is better
     complexity: Finite | None = None  # nats, divergence of the posterior from the prior
     # best first; the first one is at `pose`
