@@ -170,12 +170,6 @@ def _build_poses(
         f"{placement.deviation * 1e3:.0f} mm",
         soft_wrap=True,
     )
-    if not placement.confirmed:
-        console.print(
-            f"[yellow]warning:[/] no scan was localised in {rough.name} with certainty: is it a map of the same place, "
-            "not mirrored or scaled, and is at least half of it unchanged? Look at the new map before you use it",
-            soft_wrap=True,
-        )
     return distribute_corrections(poses, keys, placement.poses, np.zeros(len(keys), int))
 
 
@@ -202,13 +196,9 @@ def _build_trajectory(
     )
     unplaced = float(np.isnan(built.poses).any(axis=1).mean())
     if unplaced:
-        causes = "the robot was carried away, or its view was blocked"
-        if not with_odometry:
-            rate = 1 / np.median(np.diff(stamps))
-            causes += f", or it moved too far between two scans ({rate:.3g} per second, without odometry)"
         console.print(
             f"{unplaced:.1%} of the scans are left out: they contradict what was seen just before, and were not found "
-            f"elsewhere in the map; {causes}",
+            "elsewhere in the map; the robot was carried away, or its view was blocked",
             soft_wrap=True,
         )
     return built

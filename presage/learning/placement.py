@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from common.errors import UserError
 from common.geometry import se2
@@ -40,7 +39,6 @@ class Placement:
     poses: Array  # (N, 3) of the key scans in map
     found: float  # share of the key scans that the estimator found there
     deviation: float  # m, median distance between the poses found and those of the placed drive
-    confirmed: bool  # whether the estimator was sure of any of them; in a map of another place it is not
 
 
 def place_drive(world: World, keys: ReferenceDrive, model: Path | None = None) -> Placement:
@@ -52,7 +50,7 @@ def place_drive(world: World, keys: ReferenceDrive, model: Path | None = None) -
     searched = np.arange(len(keys.poses))
     if model is None:
         searched = np.unique(np.linspace(0, len(keys.poses) - 1, MAX_KEYS).round().astype(int))
-    found, covariances, tracking = _localise(world, keys.part(searched), model)
+    found, covariances = _localise(world, keys.part(searched), model)
     # The drive is turned about its middle, so that it hardly moves.
     middle = np.array([*keys.poses[:, :2].mean(axis=0), 0.0])
     local = se2.between(middle, keys.poses[searched])
@@ -72,8 +70,7 @@ def place_drive(world: World, keys: ReferenceDrive, model: Path | None = None) -
     elif world.grid is not None:
         keys = replace(keys, poses=placed)
         placed = align_to_map(with_offset(RayCaster(world), keys), keys).poses
-    deviation = float(np.median(_distance(placed[searched], found)))
-    return Placement(placed, share, deviation, bool(np.any(agreeing[best] & tracking)))
+    return Placement(placed, share, float(np.median(_distance(placed[searched], found))))
 
 
 def _fit_to_found_poses(placed: Array, found: Array, covariances: Array) -> Array:
@@ -86,12 +83,8 @@ def _fit_to_found_poses(placed: Array, found: Array, covariances: Array) -> Arra
     return optimise(np.concatenate([np.zeros((1, 3)), placed]), links)[1:]
 
 
-def _localise(world: World, keys: ReferenceDrive, model: Path | None) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
-    """Poses (N, 3) of key scans in the map, with covariances, and whether they were reported as `tracking` (N,).
-
-    Others may be wrong, at first and where much has changed. As the poses in the drive serve as odometry, wrong poses
-    agree with one another.
-    """
+def _localise(world: World, keys: ReferenceDrive, model: Path | None) -> tuple[Array, Array]:
+    """Poses (N, 3) of key scans in the map with covariances; some are wrong, at first and where much has changed."""
     if model is not None:
         options = EstimatorOptions(world, model=str(model))
     else:  # a learned field, because the cells of oblique walls are staircases, which would bias the headings
@@ -104,8 +97,7 @@ def _localise(world: World, keys: ReferenceDrive, model: Path | None) -> tuple[A
     ]
     found = [estimator.update(observation) for observation in observations]
     covariances = [np.eye(3) if each.covariance is None else each.covariance for each in found]
-    tracking = np.array([each.state == "tracking" for each in found])
-    return np.array([each.pose for each in found]), np.array(covariances), tracking
+    return np.array([each.pose for each in found]), np.array(covariances)
 
 
 def _distance(poses: Array, others: Array) -> Array:

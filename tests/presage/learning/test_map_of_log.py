@@ -17,14 +17,12 @@ from common.geometry.ros_map_writer import write_grid
 from common.geometry.world import load_world
 from lab.accuracy.motion_distortion import observations
 from lab.accuracy.scenes import Scene
-from presage.learning import placement
 from presage.learning.map_of_log import MapOptions, _build_trajectory, map_command
 from presage.learning.train_drive import drive_of
 from presage.logs.log import Reading
 from presage.logs.scan_files import Scans, read_scans
 from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.precise.learning import weights
-from services.estimator.precise.learning.surfaces import Beams, SurfaceCells
 from services.estimator.shared.generative_models import RayCaster
 from services.estimator.shared.interface import Observation
 from services.mapper.slam.drive import Laser
@@ -115,18 +113,15 @@ def test_what_cannot_be_is_said(log, tmp_path):
 
 def test_ranges_in_another_unit(tmp_path):
     path, drive = tmp_path / "far.npz", real_drive.drive(20)
-    real_drive.save(path, replace(drive, ranges=1000 * drive.ranges, range_max=1000 * drive.range_max))
-    with pytest.raises(UserError, match=r"no scanner measures more than 1000 m: are the ranges in mm\?"):
-        map_command(MapOptions(path, tmp_path / "f.yaml", reading=HERE), QUIET, QUIET)
+    millimetres = replace(drive, ranges=1000 * drive.ranges, range_max=1000 * drive.range_max)
+    standing = replace(
+        millimetres, poses=np.zeros_like(drive.poses), ranges=np.repeat(millimetres.ranges[:1], 20, axis=0)
+    )
+    for made, message in ((millimetres, "no two beams end near each other"), (standing, "is too large for")):
+        real_drive.save(path, replace(made, odom=made.poses))
+        with pytest.raises(UserError, match=rf"{message}.* `range_max` \(section `log` of"):
+            map_command(MapOptions(path, tmp_path / "f.yaml", reading=HERE), QUIET, QUIET)
     assert not (tmp_path / "f.yaml").exists()
-
-
-def test_surfaces_too_far_apart():
-    beams = Beams(np.zeros((2, 2)), np.array([0.0, 1.6]), np.array([900.0, 900.0]))
-    with pytest.raises(UserError, match=r"is too large for.* `range_max` \(section `log` of"):
-        SurfaceCells.of(beams, 0.05)
-    with pytest.raises(UserError, match="no two beams end near each other"):
-        Beams(np.zeros((0, 2)), np.zeros(0), np.zeros(0)).check_any()
 
 
 def test_folder_of_the_model_is_checked_first(log, tmp_path):
@@ -188,13 +183,6 @@ def test_odometry_that_begins_after_the_first_scan(log, tmp_path):
     assert np.isfinite(built.poses).all()
 
 
-def test_few_scans_per_second_without_odometry(log, tmp_path):
-    scans = read_scans(log, reading=HERE).part(np.arange(0, 200, 10))
-    console = Console(record=True, width=500, file=io.StringIO())
-    _build_trajectory(scans, scans.stamps, MapOptions(log, tmp_path / "own.yaml", odometry=False), console, QUIET)
-    assert "moved too far between two scans (0.4 per second, without odometry)" in console.export_text()
-
-
 def test_swept_scans():
     """The ranges that are drawn are nearer to those of instantaneous scans."""
     scene = Scene.of(load_world("office"), 300, 5)
@@ -217,9 +205,7 @@ def test_refined_map_keeps_the_rough_frame(tmp_path):
     rough = grid_of_scans(turned, truth.ranges, Laser(truth.angles, truth.mount, truth.range_max), 0.05)
     file = write_grid(tmp_path, "rough", rough)
     options = MapOptions(log, tmp_path / "fine.yaml", reading=HERE, refine=str(file), models=tmp_path)
-    printed = io.StringIO()
-    map_command(options, Console(file=printed), QUIET)
-    assert "with certainty" not in printed.getvalue()
+    map_command(options, QUIET, QUIET)
     placed = np.loadtxt(tmp_path / "fine.tum")[:, 1:3]
     assert (placed - turned[:, :2]).mean(axis=0) == pytest.approx(0, abs=0.01)
     fine = EstimatorOptions(str(tmp_path / "fine.yaml"), models=tmp_path)
@@ -227,23 +213,6 @@ def test_refined_map_keeps_the_rough_frame(tmp_path):
     estimator.restart(turned[0])
     posterior = estimator.update(Observation(truth.ranges[0], truth.angles, truth.range_max, 0.0))
     assert posterior.pose[:2] == pytest.approx(turned[0, :2], abs=0.05)
-
-
-@pytest.mark.parametrize("states", [["localising"] * 4, ["localising"] * 3 + ["tracking"]])
-def test_drive_that_no_scan_shows_in_the_rough_map(tmp_path, monkeypatch, states):
-    """With the drive as odometry, key scans agree with one another in any map. So one must be certain by itself."""
-    log, truth = tmp_path / "drive.npz", real_drive.drive(140)
-    real_drive.save(log, truth)
-
-    def localised(world, keys, model):
-        assert (world.name, model) == ("office", None)
-        return keys.poses, np.tile(np.eye(3), (len(keys.poses), 1, 1)), np.resize(states, len(keys.poses)) == "tracking"
-
-    monkeypatch.setattr(placement, "_localise", localised)
-    printed = io.StringIO()
-    options = MapOptions(log, tmp_path / "fine.yaml", reading=HERE, refine="office")
-    map_command(options, Console(file=printed, width=1000), QUIET)
-    assert ("no scan was localised in office with certainty" in printed.getvalue()) == ("tracking" not in states)
 
 
 def test_damaged_model_of_the_rough_map(log, tmp_path):
