@@ -196,9 +196,13 @@ def _build_trajectory(
     )
     unplaced = float(np.isnan(built.poses).any(axis=1).mean())
     if unplaced:
+        causes = "the robot was carried away, or its view was blocked"
+        if not with_odometry:
+            rate = 1 / np.median(np.diff(stamps))
+            causes += f", or it moved too far between two scans ({rate:.3g} per second, without odometry)"
         console.print(
             f"{unplaced:.1%} of the scans are left out: they contradict what was seen just before, and were not found "
-            "elsewhere in the map; the robot was carried away, or its view was blocked",
+            f"elsewhere in the map; {causes}",
             soft_wrap=True,
         )
     return built

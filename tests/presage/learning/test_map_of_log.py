@@ -187,6 +187,13 @@ def test_odometry_that_begins_after_the_first_scan(log, tmp_path):
     assert np.isfinite(built.poses).all()
 
 
+def test_few_scans_per_second_without_odometry(log, tmp_path):
+    scans = read_scans(log, reading=HERE).part(np.arange(0, 200, 10))
+    console = Console(record=True, width=500, file=io.StringIO())
+    _build_trajectory(scans, scans.stamps, MapOptions(log, tmp_path / "own.yaml", odometry=False), console, QUIET)
+    assert "moved too far between two scans (0.4 per second, without odometry)" in console.export_text()
+
+
 def test_swept_scans():
     """The ranges that are drawn are nearer to those of instantaneous scans."""
     scene = Scene.of(load_world("office"), 300, 5)
