@@ -170,6 +170,10 @@ def _build_poses(
         f"{placement.deviation * 1e3:.0f} mm",
         soft_wrap=True,
     )
+    if placement.scale != 1:
+        size = f"{100 * abs(placement.scale - 1):.1g}% {'larger' if placement.scale > 1 else 'smaller'}"
+        warning = f"warning: {rough.name} is about {size} than the drive: is its resolution right?"
+        progress.print(warning, highlight=False, soft_wrap=True)
     return distribute_corrections(poses, keys, placement.poses, np.zeros(len(keys), int))
 
 
