@@ -12,6 +12,7 @@ from pydantic import Field
 
 MAX_COORDINATE_M = 10_000.0  # absolute value, from the frame's origin
 MAX_DISTANCE_M = 30_000.0  # more than the diagonal of the square of all valid positions
+MAX_RANGE_M = 1_000.0  # measured by a scanner in a log; longer ranges are probably in mm
 MAX_ANGLE_RAD = 10_000.0  # about 1500 turns, because headings need not be wrapped
 MAX_SPEED = 1_000.0  # m/s or rad/s
 MAX_FIELD_SIDE = 4096  # cells along one side of a published cost field

@@ -170,6 +170,10 @@ def _build_poses(
         f"{placement.deviation * 1e3:.0f} mm",
         soft_wrap=True,
     )
+    if placement.scale != 1:
+        size = f"{100 * abs(placement.scale - 1):.1g}% {'larger' if placement.scale > 1 else 'smaller'}"
+        warning = f"warning: {rough.name} is about {size} than the drive: is its resolution right?"
+        progress.print(warning, highlight=False, soft_wrap=True)
     return distribute_corrections(poses, keys, placement.poses, np.zeros(len(keys), int))
 
 
@@ -196,9 +200,13 @@ def _build_trajectory(
     )
     unplaced = float(np.isnan(built.poses).any(axis=1).mean())
     if unplaced:
+        causes = "the robot was carried away, or its view was blocked"
+        if not with_odometry:
+            rate = 1 / np.median(np.diff(stamps))
+            causes += f", or it moved too far between two scans ({rate:.3g} per second, without odometry)"
         console.print(
             f"{unplaced:.1%} of the scans are left out: they contradict what was seen just before, and were not found "
-            "elsewhere in the map; the robot was carried away, or its view was blocked",
+            f"elsewhere in the map; {causes}",
             soft_wrap=True,
         )
     return built

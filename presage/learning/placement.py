@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from common.errors import UserError
 from common.geometry import se2
@@ -22,7 +23,7 @@ from services.estimator.precise.learning.calibration import ReferenceDrive
 from services.estimator.precise.learning.field_learning import Recipe, learn_field
 from services.estimator.precise.learning.map_alignment import align_to_map, with_offset
 from services.estimator.shared.generative_models import RayCaster
-from services.estimator.shared.interface import Observation
+from services.estimator.shared.interface import Observation, Posterior
 from services.mapper.slam.pose_graph import PoseLink, optimise
 
 MAX_KEYS = 60  # key scans that are searched for in a rough map; more do not improve a rigid placement
@@ -39,6 +40,7 @@ class Placement:
     poses: Array  # (N, 3) of the key scans in map
     found: float  # share of the key scans that the estimator found there
     deviation: float  # m, median distance between the poses found and those of the placed drive
+    scale: float  # size of the map relative to the drive; 1 if the difference is less than the map's other errors
 
 
 def place_drive(world: World, keys: ReferenceDrive, model: Path | None = None) -> Placement:
@@ -46,31 +48,62 @@ def place_drive(world: World, keys: ReferenceDrive, model: Path | None = None) -
 
     The drive is moved as a whole. If the map has a ``model``, which is exact to some millimetres, the drive is also
     deformed to fit it. Raises UserError if too few key scans are found in the map at places that agree.
+
+    The estimator gets the motion of the drive, so in any map its poses agree with the drive. A key scan counts as found
+    if the estimator is also `tracking`. If too few are, each key scan is searched for on its own.
     """
     searched = np.arange(len(keys.poses))
     if model is None:
         searched = np.unique(np.linspace(0, len(keys.poses) - 1, MAX_KEYS).round().astype(int))
-    found, covariances = _localise(world, keys.part(searched), model)
+    search = _KeyScanSearch(world, keys.part(searched), model)
     # The drive is turned about its middle, so that it hardly moves.
     middle = np.array([*keys.poses[:, :2].mean(axis=0), 0.0])
     local = se2.between(middle, keys.poses[searched])
-    origins = se2.compose(found, se2.inverse(local))  # pose of the middle in map, according to each key scan
-    agreeing = [_distance(se2.compose(origin, local), found) < SAME_M for origin in origins]
-    best = int(np.argmax([np.count_nonzero(each) for each in agreeing]))
-    share = float(agreeing[best].mean())
+    found, covariances, tracking = search.in_sequence()
+    origin, agreeing = _common_origin(found, local)
+    share = float((agreeing & tracking).mean())
+    if share < MIN_FOUND:
+        found, covariances = search.one_by_one()
+        origin, agreeing = _common_origin(found, local)
+        share = float(agreeing.mean())
     if share < MIN_FOUND:
         raise UserError(
             f"only {share:.0%} of the drive was found in the map {world.name}: is it a map of the same place?"
         )
-    differences = se2.between(origins[best], origins[agreeing[best]])
-    origin = se2.compose(origins[best], np.median(differences, axis=0))
     placed = se2.compose(origin, se2.between(middle, keys.poses))
+    scale = _relative_scale(local[agreeing, :2], found[agreeing, :2])
     if model is not None:
         placed = _fit_to_found_poses(placed, found, covariances)
     elif world.grid is not None:
         keys = replace(keys, poses=placed)
         placed = align_to_map(with_offset(RayCaster(world), keys), keys).poses
-    return Placement(placed, share, float(np.median(_distance(placed[searched], found))))
+    return Placement(placed, share, float(np.median(_distance(placed[searched], found))), scale)
+
+
+def _common_origin(found: Array, local: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
+    """The origin (3,) in map of a drive on which most of the poses ``found`` agree, and which of them (N,) do.
+
+    ``found`` (N, 3) are poses in map, ``local`` (N, 3) the same in the frame of the drive.
+    """
+    origins = se2.compose(found, se2.inverse(local))  # according to each pose
+    agreeing = [_distance(se2.compose(origin, local), found) < SAME_M for origin in origins]
+    best = int(np.argmax([np.count_nonzero(each) for each in agreeing]))
+    differences = se2.between(origins[best], origins[agreeing[best]])
+    return np.asarray(se2.compose(origins[best], np.median(differences, axis=0))), agreeing[best]
+
+
+def _relative_scale(local: Array, found: Array) -> float:
+    """Scale of the similarity (Umeyama 1991) that moves positions ``local`` (N, 2) of a drive to those ``found``.
+
+    Returns 1 if the scale moves most positions by less than the similarity leaves over.
+    """
+    drive, positions = ((each - each.mean(axis=0)) @ [1, 1j] for each in (local, found))
+    if not np.any(drive):
+        return 1.0
+    similarity = np.vdot(drive, positions) / np.vdot(drive, drive)
+    scale = float(np.abs(similarity))
+    left_over = np.median(np.abs(positions - similarity * drive))
+    return scale if np.median(np.abs((scale - 1) * drive)) > left_over else 1.0
 
 
 def _fit_to_found_poses(placed: Array, found: Array, covariances: Array) -> Array:
@@ -83,19 +116,37 @@ def _fit_to_found_poses(placed: Array, found: Array, covariances: Array) -> Arra
     return optimise(np.concatenate([np.zeros((1, 3)), placed]), links)[1:]
 
 
-def _localise(world: World, keys: ReferenceDrive, model: Path | None) -> tuple[Array, Array]:
-    """Poses (N, 3) of key scans in the map with covariances; some are wrong, at first and where much has changed."""
-    if model is not None:
-        options = EstimatorOptions(world, model=str(model))
-    else:  # a learned field, because the cells of oblique walls are staircases, which would bias the headings
-        beams = simulated_beams(RayCaster(world), keys, enough_scans(world), seed=0)
-        options = EstimatorOptions(world, generative_model=FieldModel(learn_field(beams, Recipe(0.05))))
-    estimator = prepare_factory(options)(ScannerGeometry(keys.angles, keys.mount, keys.range_max))
-    observations = [
-        Observation(ranges, keys.angles, keys.range_max, float(stamp), pose)
-        for ranges, stamp, pose in zip(keys.ranges, keys.stamps, keys.poses, strict=True)
-    ]
-    found = [estimator.update(observation) for observation in observations]
+class _KeyScanSearch:
+    """Finds the poses of key scans in a map; some are wrong, at first and where much has changed."""
+
+    def __init__(self, world: World, keys: ReferenceDrive, model: Path | None) -> None:
+        self._keys = keys
+        if model is not None:
+            options = EstimatorOptions(world, model=str(model))
+        else:  # a learned field, because the cells of oblique walls are staircases, which would bias the headings
+            beams = simulated_beams(RayCaster(world), keys, enough_scans(world), seed=0)
+            options = EstimatorOptions(world, generative_model=FieldModel(learn_field(beams, Recipe(0.05))))
+        self._make_estimator = prepare_factory(options)
+        self._geometry = ScannerGeometry(keys.angles, keys.mount, keys.range_max)
+
+    def in_sequence(self) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
+        """Poses (N, 3) found with the motion of the drive, covariances, and whether the estimator was `tracking`."""
+        keys, estimator = self._keys, self._make_estimator(self._geometry)
+        found = [
+            estimator.update(Observation(ranges, keys.angles, keys.range_max, float(stamp), pose))
+            for ranges, stamp, pose in zip(keys.ranges, keys.stamps, keys.poses, strict=True)
+        ]
+        return *_poses(found), np.array([each.state == "tracking" for each in found])
+
+    def one_by_one(self) -> tuple[Array, Array]:
+        """Poses (N, 3) found from one scan each, and covariances."""
+        keys = self._keys
+        observations = [Observation(ranges, keys.angles, keys.range_max) for ranges in keys.ranges]
+        return _poses([self._make_estimator(self._geometry).update(each) for each in observations])
+
+
+def _poses(found: list[Posterior]) -> tuple[Array, Array]:
+    """The poses (N, 3) and covariances (N, 3, 3) of beliefs."""
     covariances = [np.eye(3) if each.covariance is None else each.covariance for each in found]
     return np.array([each.pose for each in found]), np.array(covariances)
 

@@ -8,8 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from common.errors import UserError
 from common.geometry.se2 import Array
+from common.limits import MAX_RANGE_M
 
 Clock = Literal["sensor", "logger"]
 
@@ -46,6 +49,15 @@ class LoggedScan:
     reference: Array | None = None  # (3,) base_link in map
 
 
+def check_ranges(path: Path, ranges: Array) -> None:
+    """Raises UserError if a range in m is longer than any scanner measures."""
+    if (longest := np.max(ranges, where=np.isfinite(ranges), initial=0.0)) > MAX_RANGE_M:
+        raise UserError(
+            f"{path}: has a range of {longest:g} m, but no scanner measures more than {MAX_RANGE_M:g} m: "
+            "are the ranges in mm? If not, range_max is too large"
+        )
+
+
 @dataclass
 class Log:
     """An opened log: everything that is known before its scans are read."""
@@ -70,7 +82,8 @@ class Log:
     def valid_scans(self) -> Iterator[LoggedScan]:
         """Yields the scans with increasing stamps and counts the others in `left_out`.
 
-        Raises UserError at the end if more scans were left out than used.
+        Raises UserError if a range is longer than any scanner measures, and at the end if more scans were left out
+        than used.
         """
         self.left_out.clear()
         self.left_out_other.clear()
@@ -79,6 +92,7 @@ class Log:
             if last is not None and scan.stamp_ns is not None and scan.stamp_ns <= last:
                 self.left_out["scans twice" if scan.stamp_ns == last else "scans older than the one before"] += 1
                 continue
+            check_ranges(self.path, scan.ranges)
             last, used = scan.stamp_ns, used + 1
             yield scan
         if self.left_out.total() > used:

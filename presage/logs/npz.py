@@ -79,8 +79,6 @@ def _check_arrays(path: Path, data: dict[str, Array], ranges: Array) -> None:
             raise UserError(f"{path}: {name} has numbers that are not finite")
     if (span := float(np.ptp(data["angles"]))) > MAX_SPAN:
         raise UserError(f"{path}: angles cover {span:.4g} rad, more than one turn: are they in degrees?")
-    if "stamps" in data and (np.diff(data["stamps"]) < 0).any():
-        raise UserError(f"{path}: stamps are not sorted")
 
 
 def _read_scans(

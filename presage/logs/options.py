@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from common.errors import UserError
 from common.geometry.pose_text import NUMBER_PATTERN, POSE_PATTERN, parse_pose
+from common.limits import MAX_RANGE_M
 from presage.logs.log import Reading
 
 
@@ -29,7 +30,7 @@ class LogSettings(BaseModel):
     reference: bool | None = None  # false reads no reference poses; true also those of corrected CARMEN scans
     reference_topic: str = ""  # Odometry, PoseStamped or PoseWithCovarianceStamped in the map
     angles: str = ""  # of the first and last beam in deg, such as -90,90
-    range_max: Annotated[float, Field(ge=0.1, le=1000)] | None = None  # m; longer ranges are beams without return
+    range_max: Annotated[float, Field(ge=0.1, le=MAX_RANGE_M)] | None = None  # m; longer ranges mean no return
     clock: Literal["sensor", "logger"] = "sensor"  # which stamps are used
     rate: Annotated[float, Field(ge=0.01, le=1000)] | None = None  # Hz, scan rate of a log without stamps
     sigma: Annotated[float, Field(ge=1e-4, le=10)] | None = None  # m, range noise of the scanner

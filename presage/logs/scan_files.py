@@ -18,7 +18,7 @@ from common.messages.definitions import CmdVel, Goal, Odom, Scan, Truth
 from common.messages.topics import CMD_VEL, GOAL, ODOM, SCAN, TRUTH
 from common.robot.ranges import ranges_for_localisation
 from presage.laser_scan import LaserScan
-from presage.logs.log import Log, Reading
+from presage.logs.log import Log, Reading, check_ranges
 from presage.logs.opening import kind_of, open_log
 from presage.recordings.recorded_session import StampedRows
 from presage.recordings.selection import entries, robot_of
@@ -207,9 +207,11 @@ def _read_recording(path: Path) -> Scans:
     if len(alike) != len(scans):
         raise UserError(f"{path}: the scanner changes during the recording; only one scanner per file is supported")
     stamps_ns = np.array([s.stamp_ns for s in scans], np.int64)
+    ranges = np.array([ranges_for_localisation(s.ranges) for s in scans])
+    check_ranges(path, ranges)
     return Scans(
         replace(ScannerGeometry.of_scan(first), mount_assumed=mount_assumed(recording)),
-        np.array([ranges_for_localisation(s.ranges) for s in scans]),
+        ranges,
         seconds([s.stamp_ns for s in scans]),
         odoms.poses_at(stamps_ns, np.array(logged_ns)) if len(odoms) else None,
         None,

@@ -23,6 +23,7 @@ from presage.logs.log import Reading
 from presage.logs.scan_files import Scans, read_scans
 from services.estimator.factory import EstimatorOptions, ScannerGeometry, prepare_factory
 from services.estimator.precise.learning import weights
+from services.estimator.precise.learning.surfaces import Beams, SurfaceCells
 from services.estimator.shared.generative_models import RayCaster
 from services.estimator.shared.interface import Observation
 from services.mapper.slam.drive import Laser
@@ -113,15 +114,18 @@ def test_what_cannot_be_is_said(log, tmp_path):
 
 def test_ranges_in_another_unit(tmp_path):
     path, drive = tmp_path / "far.npz", real_drive.drive(20)
-    millimetres = replace(drive, ranges=1000 * drive.ranges, range_max=1000 * drive.range_max)
-    standing = replace(
-        millimetres, poses=np.zeros_like(drive.poses), ranges=np.repeat(millimetres.ranges[:1], 20, axis=0)
-    )
-    for made, message in ((millimetres, "no two beams end near each other"), (standing, "is too large for")):
-        real_drive.save(path, replace(made, odom=made.poses))
-        with pytest.raises(UserError, match=rf"{message}.* `range_max` \(section `log` of"):
-            map_command(MapOptions(path, tmp_path / "f.yaml", reading=HERE), QUIET, QUIET)
+    real_drive.save(path, replace(drive, ranges=1000 * drive.ranges, range_max=1000 * drive.range_max))
+    with pytest.raises(UserError, match=r"no scanner measures more than 1000 m: are the ranges in mm\?"):
+        map_command(MapOptions(path, tmp_path / "f.yaml", reading=HERE), QUIET, QUIET)
     assert not (tmp_path / "f.yaml").exists()
+
+
+def test_surfaces_too_far_apart():
+    beams = Beams(np.zeros((2, 2)), np.array([0.0, 1.6]), np.array([900.0, 900.0]))
+    with pytest.raises(UserError, match=r"is too large for.* `range_max` \(section `log` of"):
+        SurfaceCells.of(beams, 0.05)
+    with pytest.raises(UserError, match="no two beams end near each other"):
+        Beams(np.zeros((0, 2)), np.zeros(0), np.zeros(0)).check_any()
 
 
 def test_folder_of_the_model_is_checked_first(log, tmp_path):
@@ -181,6 +185,13 @@ def test_odometry_that_begins_after_the_first_scan(log, tmp_path):
     built = _build_trajectory(scans, scans.stamps, MapOptions(log, tmp_path / "own.yaml"), console, QUIET)
     assert "with odometry for 198 of 200 scans" in console.export_text()
     assert np.isfinite(built.poses).all()
+
+
+def test_few_scans_per_second_without_odometry(log, tmp_path):
+    scans = read_scans(log, reading=HERE).part(np.arange(0, 200, 10))
+    console = Console(record=True, width=500, file=io.StringIO())
+    _build_trajectory(scans, scans.stamps, MapOptions(log, tmp_path / "own.yaml", odometry=False), console, QUIET)
+    assert "moved too far between two scans (0.4 per second, without odometry)" in console.export_text()
 
 
 def test_swept_scans():

@@ -182,7 +182,7 @@ def test_particle_filter(tmp_path, estimator):
         ({"angles": np.zeros(3)}, "angles has the shape"),
         ({"odom": np.zeros((3, 3))}, "odom has the shape"),
         ({"reference": np.zeros((9, 3))}, "reference has the shape"),
-        ({"stamps": -np.arange(10.0)}, "not sorted"),
+        ({"stamps": -np.arange(10.0)}, "too few usable scans: 1; left out: scans older than the one before: 9"),
         ({"range_max": -1.0}, "range_max"),
         ({"initial_pose": np.full(3, np.nan)}, "not finite"),
         ({"ranges": np.zeros((2, 3, 4))}, "not \\(N, B\\)"),
@@ -209,6 +209,14 @@ def test_stamps_and_ranges_of_an_npz(tmp_path):
     scans = read_scans(tmp_path / "s.npz")
     assert scans.stamps.tolist() == [scan.stamp for scan in scans] == stamps
     assert scans[0].ranges.tolist() == [1.0, np.inf, np.inf, -np.inf, -np.inf, -np.inf]
+
+
+def test_stamps_of_an_npz_that_step_back(tmp_path):
+    stamps = [0.0, 0.1, 0.2, 0.1, 0.2, 0.3]
+    np.savez(tmp_path / "s.npz", stamps=stamps, ranges=np.ones((6, 3)), angles=np.arange(3) / 10, range_max=25.0)
+    scans = read_scans(tmp_path / "s.npz")
+    assert scans.stamps.tolist() == [0.0, 0.1, 0.2, 0.3]
+    assert "left out: scans older than the one before: 1, scans twice: 1" in scans.notes
 
 
 def test_unknown_odometry_in_an_npz(tmp_path):
