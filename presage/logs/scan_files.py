@@ -16,7 +16,7 @@ from common.errors import UserError
 from common.geometry.se2 import Array
 from common.messages.definitions import CmdVel, Goal, Odom, Scan, Truth
 from common.messages.topics import CMD_VEL, GOAL, ODOM, SCAN, TRUTH
-from common.robot.ranges import ranges_for_localisation
+from common.robot.ranges import is_surface, ranges_for_localisation
 from presage.laser_scan import LaserScan
 from presage.logs.log import Log, Reading, check_ranges
 from presage.logs.opening import kind_of, open_log
@@ -26,6 +26,9 @@ from services.estimator.factory import ScannerGeometry
 from services.recorder.reader import Recording, read_recording
 
 RECORDED_TRUTH = "the recorded truth"
+# The longest range of a log probably means "no return" if it is at least this share of all beams, occurs in this share
+# of the directions, and is so many times more frequent than any other range of at least half of it.
+NO_RETURN_SHARE, NO_RETURN_DIRECTIONS, NO_RETURN_RATIO = 0.01, 0.5, 5
 Prior = Literal["motion", "odometry", "command"]
 
 
@@ -157,6 +160,7 @@ def scans_of_log(log: Log) -> Scans:
     if not ranges:
         raise UserError(f"{log.path}: no usable scan in it" + (f"; left out: {left_out}" if left_out else ""))
     times = [stamp for stamp in stamps if stamp is not None]
+    no_return = describe_probable_no_return(np.array(ranges))
     return Scans(
         ScannerGeometry(log.angles, log.mount, log.range_max, mount_assumed=log.mount_assumed),
         np.array(ranges),
@@ -166,7 +170,29 @@ def scans_of_log(log: Log) -> Scans:
         np.array(references) if log.reference else None,
         truth_is=log.reference or RECORDED_TRUTH,
         time_increment=log.time_increment,
-        notes=(*log.notes, *([f"left out: {left_out}"] if left_out else [])),
+        notes=(*log.notes, *([no_return] if no_return else []), *([f"left out: {left_out}"] if left_out else [])),
+    )
+
+
+def describe_probable_no_return(ranges: Array) -> str:
+    """A note if the longest of the ranges (N, B) m probably means "no return"; empty otherwise.
+
+    Some scanners report a fixed value shorter than the stated maximum range. Such beams look like a wall that moves
+    with the robot. As ranges are rounded in many logs, the longest one is compared with others, and as a robot may
+    stand, directions are counted.
+    """
+    single = ranges.astype(np.float32)
+    longest = np.max(single, where=is_surface(single), initial=0.0)
+    at_longest = single == longest
+    share = float(at_longest.mean())
+    if longest == 0 or share < NO_RETURN_SHARE or at_longest.any(axis=0).mean() < NO_RETURN_DIRECTIONS:
+        return ""
+    _, counts = np.unique(single[(single >= longest / 2) & (single < longest)], return_counts=True)
+    if at_longest.sum() < NO_RETURN_RATIO * counts.max(initial=1):
+        return ""
+    return (
+        f"{share:.0%} of all ranges are exactly {longest} m, and none is longer: if this means no return, "
+        f"set range_max to {longest} in section log of --config"
     )
 
 

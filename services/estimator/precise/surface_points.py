@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from scipy.special import expit, logit
 
 from common.geometry import se2
+from common.geometry.information import subtract_spurious
 from common.geometry.se2 import Array
 from services.estimator.precise.gauss_newton import position_information
 from services.estimator.precise.motion_model import MotionCandidate
@@ -161,21 +162,6 @@ class SurfacePoints:
 def place_points(scan: ScanLikelihood, pose: Array) -> Array:
     """End points (K, 2) m of the beams of a scan that returned, with base_link at ``pose`` (3,)."""
     return se2.transform(se2.compose(pose, scan.mount), scan.points)
-
-
-def subtract_spurious(information: Array, spurious: Array) -> Array:
-    """The ``information`` (3, 3) minus the ``spurious`` part of it (3, 3), but nowhere less than 0.
-
-    Their ratio is limited to 1 along the directions in which both are diagonal, so units do not matter.
-    """
-    unit = np.sqrt(np.diag(information))
-    unit[unit == 0] = 1.0
-    units = np.outer(unit, unit)
-    root = np.linalg.cholesky(information / units + 1e-6 * np.eye(3))  # which exists without information too
-    inverse = np.linalg.inv(root)
-    kept, directions = np.linalg.eigh(inverse @ ((information - spurious) / units) @ inverse.T)
-    half = root @ directions * np.sqrt(np.maximum(kept, 0.0))
-    return np.asarray(half @ half.T * units)
 
 
 def _average_in_cells(points: Array) -> Array:

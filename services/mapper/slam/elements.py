@@ -21,6 +21,7 @@ SPACING_M = 0.1  # between elements, across the beams
 # multiple of the spacing of the beams at this range, on a surface perpendicular to them.
 MIN_GAP_M, GAP_BEAMS = 0.12, 6.0
 MAX_ROUGHNESS_M = 0.03  # standard deviation of the points from the line; rougher elements are corners
+MAX_TILT = 1.0  # rad², about the variance of a direction that is unknown
 MIN_POINTS = 3  # from which the direction of a surface is computed
 
 
@@ -31,14 +32,16 @@ class Elements:
     points: Array  # (K, 2) m
     normals: Array  # (K, 2) unit vectors towards free space
     lengths: Array  # (K,) m, extent of each along its surface
+    tilts: Array  # (K,) rad², variance of the direction
 
     def transformed(self, pose: Array) -> Elements:
         """The elements in the parent frame of the frame with ``pose`` (3,)."""
-        return Elements(se2.transform(pose, self.points), se2.rotate(float(pose[2]), self.normals), self.lengths)
+        points, normals = se2.transform(pose, self.points), se2.rotate(float(pose[2]), self.normals)
+        return Elements(points, normals, self.lengths, self.tilts)
 
     def part(self, which: npt.NDArray[np.integer | np.bool_]) -> Elements:
         """The elements with these indices, or in this mask."""
-        return Elements(self.points[which], self.normals[which], self.lengths[which])
+        return Elements(self.points[which], self.normals[which], self.lengths[which], self.tilts[which])
 
     def divided(self) -> Elements:
         """The same surfaces, in elements of at most `SPACING_M`; where beams are sparse, elements are longer."""
@@ -48,7 +51,7 @@ class Elements:
         along = ((number + 0.5) / count[which] - 0.5) * self.lengths[which]
         x, y = self.normals[which].T
         points = self.points[which] + along[:, None] * np.column_stack([-y, x])
-        return Elements(points, self.normals[which], self.lengths[which] / count[which])
+        return Elements(points, self.normals[which], self.lengths[which] / count[which], self.tilts[which])
 
     def __len__(self) -> int:
         return len(self.points)
@@ -56,15 +59,15 @@ class Elements:
 
 def concatenate(elements: list[Elements]) -> Elements:
     """All elements of a list, in one frame."""
-    points, normals, lengths = zip(*((e.points, e.normals, e.lengths) for e in elements), strict=True)
-    return Elements(np.concatenate(points), np.concatenate(normals), np.concatenate(lengths))
+    points, normals, lengths, tilts = zip(*((e.points, e.normals, e.lengths, e.tilts) for e in elements), strict=True)
+    return Elements(np.concatenate(points), np.concatenate(normals), np.concatenate(lengths), np.concatenate(tilts))
 
 
 def elements_of_scan(ranges: Array, angles: Array, mount: Array, range_max: float) -> Elements:
     """Surface elements in base_link of a scan ``ranges`` (B,) m at ``angles`` (B,) rad."""
     hit = np.flatnonzero(is_surface(ranges) & (ranges < range_max))
     if len(hit) < MIN_POINTS:
-        return Elements(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
+        return Elements(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
     r, angle = ranges[hit], angles[hit]
     points = r[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
     step = abs(angles[-1] - angles[0]) / (len(angles) - 1)
@@ -95,10 +98,15 @@ def _fit_lines(points: Array, first: npt.NDArray[np.int_], last: npt.NDArray[np.
     count = last - first
     mx, my, xx, xy, yy = ((sums[last] - sums[first]) / np.maximum(count, 1)[:, None]).T
     xx, xy, yy = xx - mx**2, xy - mx * my, yy - my**2  # covariance
-    across = np.arctan2(2 * xy, xx - yy) / 2 + np.pi / 2
-    normals = np.column_stack([np.cos(across), np.sin(across)])
+    angle = np.arctan2(2 * xy, xx - yy) / 2 + np.pi / 2
+    normals = np.column_stack([np.cos(angle), np.sin(angle)])
     normals *= -np.sign(normals[:, 0] * mx + normals[:, 1] * my)[:, None]  # towards the scanner
-    smallest = (xx + yy) / 2 - np.sqrt(((xx - yy) / 2) ** 2 + xy**2)  # eigenvalue: variance across the line
-    flat = (count >= MIN_POINTS) & (smallest < MAX_ROUGHNESS_M**2)
+    # Eigenvalues of the covariance.
+    middle, half_difference = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy**2)
+    across, along = middle - half_difference, middle + half_difference
+    flat = (count >= MIN_POINTS) & (across < MAX_ROUGHNESS_M**2)
     lengths = np.hypot(*(points[last - 1] - points[first]).T) / 2
-    return Elements(np.column_stack([mx, my])[flat], normals[flat], lengths[flat])
+    # Asymptotic variance of the direction of a principal component (Anderson, Ann. Math. Stat. 34, 1963).
+    spread = (count - 2) * (along - across) ** 2
+    tilts = np.clip((across * along)[flat] / np.maximum(spread[flat], 1e-12), 0.0, MAX_TILT)
+    return Elements(np.column_stack([mx, my])[flat], normals[flat], lengths[flat], tilts)

@@ -55,7 +55,8 @@ MAX_CONTRADICTION, PRIOR_AGREEMENT = 0.22, 10
 # recent maximum decays with a time constant of this many scans.
 UNUSUAL_CONTRADICTION, UNUSUAL_RATIO, FADING_SCANS = 0.05, 1.5, 50
 MAX_SUSPECT_SCANS = 10  # after this many suspect scans in a row, the last of them begins another piece
-MAX_SLIP = 6.0  # standard deviations of the motion; a scan that matches farther from the prior begins a piece
+# Standard deviations of motion and registration; a scan that matches farther from the prior begins a piece.
+MAX_SLIP = 6.0
 CLOSE_TO_PRIOR = np.array([0.1, 0.1, 0.1])  # m, m, rad: after a suspect scan, a match farther away may be accidental
 NO_PIECE = -1  # of a suspect scan, instead of the number of a piece
 # Standard deviations of the motion. With odometry: of its error, per unit of motion. Without: of the change of the
@@ -188,7 +189,7 @@ class FrontEnd:
         confirmed = self._suspect_scans + 1 >= MAX_SUSPECT_SCANS and used_odometry and not _is_far(found, prior)
         # Add the scan where it matches, or where the motion model predicts it.
         if found is not None and (confirmed or not suspect):
-            slipped = prior.difference(found.pose)[1] > MAX_SLIP**2
+            slipped = _squared_deviation(found, prior, covariance) > MAX_SLIP**2
             begins_piece = clock_stepped or suspect or slipped or self._is_unusual(contradiction)
             if not suspect:  # in a suspect scan, the contradiction is not due to moving objects
                 self._update_recent_contradiction(contradiction)
@@ -324,7 +325,7 @@ class FrontEnd:
         self._velocity = None if begins_piece else se2.between(self.poses[-1], found.pose) / period
         familiar = found.matched_fraction > FAMILIAR_FRACTION
         if familiar:
-            self._scale = _learn_scale(self._scale, self._scale * deviation, prior.mean, found)
+            self._scale = _learn_scale(self._scale, self._scale * deviation, prior, found)
         covariance = found.covariance + np.diag(REGISTRATION_DEVIATION**2)
         piece = self._key_pieces[-1] + (1 if begins_piece else 0)
         scan_pose = ScanPose(found.pose, covariance, matched=True, piece=piece, linked=begins_piece)
@@ -430,18 +431,26 @@ def _is_far(found: Registration | None, prior: PosePrior) -> bool:
     return found is None or bool((np.abs(se2.between(prior.mean, found.pose)) > CLOSE_TO_PRIOR).any())
 
 
+def _squared_deviation(found: Registration, prior: PosePrior, motion_covariance: Array) -> float:
+    """Squared Mahalanobis distance of a registration from the prior's mean; both are uncertain."""
+    difference = se2.difference(prior.mean, found.pose)
+    return float(difference @ np.linalg.solve(motion_covariance + found.covariance, difference))
+
+
 def _median_range(elements: Elements) -> float:
     return float(np.median(np.hypot(*elements.points.T))) if len(elements) else 0.0
 
 
-def _learn_scale(scale: Array, deviation: Array, expected: Array, found: Registration) -> Array:
+def _learn_scale(scale: Array, deviation: Array, prior: PosePrior, found: Registration) -> Array:
     """The factor (3,) of the motion's deviations after one more scan, by expectation maximisation.
 
-    It is learned because the errors of odometries differ tenfold.
+    It is learned because the errors of odometries differ tenfold. Where the scan does not observe the motion, the
+    expected square of the error is that of the prior, so that the factor stays. The registration's covariance is larger
+    than that of the error: it inflates the prior.
     """
-    turn = se2.rotation(-float(expected[2]))
-    variance = np.diag(turn @ found.covariance @ turn.T)
-    squared = (se2.between(expected, found.pose) ** 2 + variance) / deviation**2
+    turn = se2.rotation(-float(prior.mean[2]))
+    variance = np.diag(turn @ np.linalg.inv(found.information + prior.information) @ turn.T)
+    squared = (se2.between(prior.mean, found.pose) ** 2 + variance) / deviation**2
     return np.asarray(scale * np.sqrt(1 + (np.minimum(squared, MAX_LEARNED_SIGMAS**2) - 1) / LEARNING_SCANS))
 
 

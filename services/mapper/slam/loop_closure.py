@@ -136,7 +136,9 @@ def _close_loop(
     window = SEARCH_SIGMAS * np.sqrt(np.diag(covariance))
     wide = bool((window > NO_SEARCH_WINDOW).any())
     surface = Surface(target.elements)
-    starts = correlative_search(surface.elements, source.elements, predicted, window) if wide else predicted[None]
+    starts = [predicted]
+    if wide:
+        starts += list(correlative_search(surface.elements, source.elements, predicted, window))
     found = [match_submaps(target, surface, source, start) for start in starts]
     matches = [each for each in found if each is not None and _is_plausible(each, predicted, covariance)]
     if not matches:

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from common.geometry import se2
+from common.geometry.information import subtract_spurious
 from common.geometry.se2 import Array
 from services.mapper.slam.elements import Elements
 
@@ -71,7 +72,10 @@ class Registration:
 
 
 def register(surface: Surface, elements: Elements, start: Array, prior: PosePrior = NO_PRIOR) -> Registration | None:
-    """Registers elements, starting at the pose ``start`` (3,); returns None if too few match."""
+    """Registers elements, starting at the pose ``start`` (3,); returns None if too few match.
+
+    Along directions that the surface does not show, as in a corridor, the pose is that of the prior.
+    """
     pose = np.array(start, float)
     for radius in CORRESPONDENCE_RADII_M:
         placed = elements.transformed(pose)
@@ -82,21 +86,33 @@ def register(surface: Surface, elements: Elements, start: Array, prior: PosePrio
         nearest = nearest[paired]
         normal = surface.elements.normals[nearest]
         error = np.einsum("ni,ni->n", normal, placed.points[paired] - surface.elements.points[nearest])
-        J = se2.displacement_jacobian(placed.points[paired] - pose[:2], normal)
+        offset = placed.points[paired] - pose[:2]
+        J = se2.displacement_jacobian(offset, normal)
         weight = 1 / (1 + (error / RESIDUAL_M) ** 2) / RESIDUAL_M**2
         H = (J.T * weight) @ J
         to_prior, squared = prior.difference(pose)
         information = prior.information / PRIOR_INFLATION**2 / (1 + squared / PRIOR_SCALE**2)
-        step = np.linalg.solve(H + information + 1e-6 * np.eye(3), information @ to_prior - (J.T * weight) @ error)
-        pose = pose + step
-        pose[2] = se2.wrap(pose[2])
+        to_best = -np.linalg.solve(H + 1e-6 * np.eye(3), (J.T * weight) @ error)
+        before, pose = pose, _fuse(pose, H, to_best, information, to_prior)
+    # A line that noise has tilted seems to show the place along itself (errors in variables).
+    along = se2.displacement_jacobian(offset, se2.rotate(np.pi / 2, normal))
+    shown = subtract_spurious(H, (along.T * weight * surface.elements.tilts[nearest]) @ along)
+    pose = _fuse(before, shown, to_best, information, to_prior)
     matched = distance < MATCHED_M
     missed = np.where(matched, 0.0, MATCHED_M)
     missed[paired & matched] = error[matched[paired]]
     cost = np.log1p((missed / RESIDUAL_M) ** 2).sum() / 2 / CORRELATED_ELEMENTS
     cost += PRIOR_SCALE**2 * np.log1p(prior.difference(pose)[1] / PRIOR_SCALE**2) / 2
-    covariance = np.linalg.inv(H + information + 1e-6 * np.eye(3))
-    return Registration(pose, H, covariance, float(matched.mean()), float(cost))
+    covariance = np.asarray(np.linalg.inv(shown + information + 1e-6 * np.eye(3)), float)
+    return Registration(pose, shown, covariance, float(matched.mean()), float(cost))
+
+
+def _fuse(pose: Array, by_scan: Array, to_best: Array, by_prior: Array, to_prior: Array) -> Array:
+    """The ``pose`` (3,) moved to the mean of scan and prior, weighted by their information matrices (3, 3)."""
+    weighted = by_scan @ to_best + by_prior @ to_prior
+    fused = pose + np.linalg.solve(by_scan + by_prior + 1e-6 * np.eye(3), weighted)
+    fused[2] = se2.wrap(fused[2])
+    return np.asarray(fused)
 
 
 def _features(elements: Elements) -> Array:

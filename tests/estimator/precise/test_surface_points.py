@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from common.geometry.world import World
 from lab.accuracy.scenes import Scene
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.motion_model import MotionCandidate
 from services.estimator.precise.scan_likelihood import ScanLikelihood
-from services.estimator.precise.surface_points import SurfacePoints, place_points, subtract_spurious
+from services.estimator.precise.surface_points import SurfacePoints, place_points
 from services.estimator.shared.generative_models import RayCaster
 
 CORRIDOR = [(0, 0), (60, 0), (60, 2), (0, 2)]  # longer than the scanner sees
@@ -62,24 +60,6 @@ def test_column_of_the_map_shows_the_place():
     assert not match.degenerate
     assert match.movable_surfaces == 0
     assert np.sqrt(np.diag(covariance(match)))[0] < 0.02
-
-
-@given(st.integers(0, 2**32 - 1), st.floats(1e-3, 1.0), st.integers(0, 8))
-def test_information_that_is_not_spurious(seed, unit_of_yaw, count):
-    """It is between 0 and all of the information, in whatever unit the heading is."""
-    rng, unit = np.random.default_rng(seed), np.array([1, 1, unit_of_yaw])
-    information, spurious = ((J.T @ J) @ np.eye(3) for J in (rng.normal(size=(count, 3)), rng.normal(size=(5, 3))))
-    left = subtract_spurious(information, spurious)
-    assert np.linalg.eigvalsh(left).min() >= -1e-6
-    assert np.linalg.eigvalsh(information - left).min() >= -1e-6
-    assert subtract_spurious(information, 0 * spurious) == pytest.approx(information, abs=1e-6)
-    units = np.outer(unit, unit)
-    assert subtract_spurious(units * information, units * spurious) / units == pytest.approx(left, abs=1e-6)
-
-
-def test_information_in_one_direction_only():
-    information = np.diag([4.0, 0.0, 1.0])
-    assert subtract_spurious(information, np.diag([1.0, 1.0, 2.0])) == pytest.approx(np.diag([3.0, 0.0, 0.0]), abs=1e-5)
 
 
 @pytest.mark.parametrize("step", [-0.15, 0.1, 0.2])

@@ -22,5 +22,5 @@ def test_correspondences_between_beams(moved):
 @pytest.mark.parametrize(("seen", "free"), [(19.0, False), (24.0, False), (40.0, True)])
 def test_grazing_beams(seen, free):
     scans = PosedScans(np.zeros((1, 3)), np.full((1, len(ANGLES)), seen), ANGLES)
-    wall = Elements(np.array([[20.0, 1.0]]), np.array([[0.0, -1.0]]), np.array([0.1]))
+    wall = Elements(np.array([[20.0, 1.0]]), np.array([[0.0, -1.0]]), np.array([0.1]), np.zeros(1))
     assert scans.see_through(wall).tolist() == [free]

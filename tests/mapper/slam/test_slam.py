@@ -12,6 +12,7 @@ from common.geometry import se2
 from common.geometry.world import load_world
 from lab.accuracy.motion_distortion import observations
 from lab.accuracy.scenes import TWIN_OFFSET, TWINS, Scene
+from lab.integrity.buildings import make_building
 from services.mapper.slam import back_end as back_end_module
 from services.mapper.slam import correlative_search as correlative
 from services.mapper.slam.back_end import BackEnd
@@ -22,6 +23,7 @@ from services.mapper.slam.front_end import NO_PIECE, FrontEnd, track_drive
 from services.mapper.slam.loop_closure import LoopClosure, find_closures
 from services.mapper.slam.pose_graph import ANCHOR, LinkTable, PoseLink, Uncertainty, optimise
 from services.mapper.slam.trajectory import build_trajectory
+from services.simulator.odometry import Odometer, OdometryNoise
 from tests.mapper.drives import driven
 
 
@@ -122,6 +124,29 @@ def test_pausing_odometry_is_no_kidnapping(pause):
     assert (tracked.pieces != NO_PIECE).all()
 
 
+@pytest.mark.parametrize("seed", [1, 4])
+def test_few_beams_correct_odometry(seed):
+    """Odometry keeps its weight: scans that hardly observe the motion say nothing about the error of the odometry."""
+    world = make_building(88045, "office").world
+    truth = Scene.of(world, 30, seed).path(40)
+    odometer = Odometer(OdometryNoise(), np.random.default_rng(seed))
+    odom = [odometer.pose]
+    for before, after in pairwise(truth):
+        odometer.move(before, after)
+        odom.append(odometer.pose)
+    tracked = track_drive(replace(driven(world, truth, beams=30), odom=np.array(odom)))
+    by_odometry, by_scans = (
+        np.hypot(*(se2.compose(truth[0], poses) - truth)[:, :2].T).max() for poses in (np.array(odom), tracked.poses)
+    )
+    assert 5 * by_scans < by_odometry
+
+
+def test_frozen_odometry_is_no_slip():
+    truth = Scene.of(load_world("office"), 300, 6).path(20)
+    tracked = track_drive(replace(driven(load_world("office"), truth), odom=np.zeros_like(truth)))
+    assert (tracked.pieces == 0).all()
+
+
 @pytest.mark.parametrize("odometry", [False, True])
 def test_empty_scans(odometry):
     """A driver that is just starting may send scans without any return."""
@@ -148,7 +173,7 @@ def test_search_finds_the_best_of_all_poses(seed):
     def random_elements(count):
         yaw = rng.uniform(-np.pi, np.pi, count)
         normals = np.column_stack([np.cos(yaw), np.sin(yaw)])
-        return Elements(rng.uniform(-3, 3, (count, 2)), normals, np.full(count, 0.1))
+        return Elements(rng.uniform(-3, 3, (count, 2)), normals, np.full(count, 0.1), np.zeros(count))
 
     target, source = random_elements(60), random_elements(30)
     around, window, turn_step = rng.normal(size=3), np.array([0.5, 0.8, 0.4]), 0.1
@@ -178,7 +203,8 @@ def test_search_finds_the_best_of_all_poses(seed):
 def test_search_finds_all_headings():
     """In a square room, four headings fit alike."""
     along = np.arange(-1.95, 2.0, 0.1)
-    wall = Elements(np.column_stack([along, np.full(40, 2.0)]), np.tile([0.0, -1.0], (40, 1)), np.full(40, 0.1))
+    points, normals = np.column_stack([along, np.full(40, 2.0)]), np.tile([0.0, -1.0], (40, 1))
+    wall = Elements(points, normals, np.full(40, 0.1), np.zeros(40))
     room = concatenate([wall.transformed(np.array([0.0, 0.0, turn])) for turn in np.pi / 2 * np.arange(4)])
     found = correlative_search(room, room, np.zeros(3), np.array([0.3, 0.3, np.pi]))
     quarters = found[:, 2] / (np.pi / 2)
