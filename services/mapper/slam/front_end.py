@@ -44,7 +44,9 @@ KEY_RANGE_SHARE = 0.1  # in large rooms, the distance is this share of the media
 GRID_SCAN_DISTANCE_M, GRID_SCAN_TURN_RAD = 0.1, 0.1
 # A scan of which a smaller fraction matches sees something new. It becomes a key scan after this part of the distance.
 FAMILIAR_FRACTION, EARLY_KEY_PROGRESS = 0.7, 0.25
-SEARCH_WINDOW = np.array([0.3, 0.3, 0.4])  # m, m, rad to either side of the prior's mean
+# m, m, rad to either side of the prior's mean: so many of its standard deviations, within these limits.
+SEARCH_SIGMAS = 3.0
+MIN_SEARCH_WINDOW, MAX_SEARCH_WINDOW = np.array([0.3, 0.3, 0.4]), np.array([4.0, 4.0, np.pi])
 MAX_SEARCHED_M = 10.0  # farther elements take no part in the search
 LOCAL_SCANS = 12  # key scans in the local map
 MIN_MATCHED_FRACTION = 0.2  # of a scan's elements that must match the local map
@@ -66,6 +68,9 @@ VELOCITY_CHANGE_DEVIATION = np.array([1.0, 1.0, 3.0])
 VELOCITY_DEVIATION = np.array([1.0, 1.0, 1.5])
 STANDING_DEVIATION = np.array([0.002, 0.002, 0.002])  # m, m, rad: in addition to both
 MAX_VELOCITY = 3 * VELOCITY_DEVIATION  # a robot that seems to move faster was kidnapped
+# Without odometry, a swept scan is corrected again for the motion that its registration found, so many times. If it
+# were corrected only for the last velocity, an error of one pose would cause an opposite, larger one of the next.
+SWEEP_CORRECTIONS = 2
 # The velocity is unknown after a period that exceeds both this time and this multiple of the period before.
 MAX_PERIOD_S, MAX_PERIOD_RATIO = 2.0, 5.0
 # A factor on the deviations of the motion is learned over this many scans, from errors of at most so many deviations.
@@ -130,6 +135,7 @@ class FrontEnd:
         self.stamps: list[float] = []  # s
         self.poses: list[Array] = []  # (3,)
         self.pieces: list[int] = []
+        self._odom: list[Array | None] = []  # (3,)
         self.unmatched = 0  # number of scans that are suspect, or of which too little matches
         # One entry for each key scan.
         self.keys: list[int] = []  # its number among all scans
@@ -144,11 +150,12 @@ class FrontEnd:
         self._local: Submap
         self._first_local = 0  # first key scan that links connect to the latest one; the local map starts no earlier
         # The motion.
-        self._odom: Array | None = None  # (3,) of the last scan
+        self._reference = 0  # number of the last scan whose pose is known; the next pose is predicted from it
         self._velocity: Array | None = None  # (3,) base_link
         self._period: float | None = None  # s between the last two scans between which the clock did not step
         self._scale = np.ones(3)  # of the deviations of the motion, learned
-        self._covariance_since_key = np.zeros((3, 3))  # of the motion since the last key scan, by the motion model
+        # Of the motion since the last key scan, by the motion model: to the latest scan, and to the reference.
+        self._covariance_since_key = self._covariance_at_reference = np.zeros((3, 3))
         self._suspect_scans = 0  # in a row until now
         self._recent_contradiction = 0.0  # recent maximum of the share of contradictions, see `FADING_SCANS`
 
@@ -159,17 +166,17 @@ class FrontEnd:
         scan before; it may step back, as after a reset of the simulator, which also resets the odometry. ``odom`` (3,)
         is the pose of base_link in odom, or None if it is unknown.
         """
-        # Predict the motion since the last scan, and correct the scan for it.
-        period = stamp - self.stamps[-1] if self.stamps else 0.0
-        clock_stepped = self._update_period(period)
-        if period < 0:  # the real time since the last scan is unknown, and odometry may have been reset
-            period, self._odom = MAX_PERIOD_S, None
-        motion, deviation = self._predict_motion(period, odom)
-        scan = self._correct(ranges, motion, period)
-        used_odometry = self._odom is not None and odom is not None
-        self._odom = odom
-        # Begin with the first scan, and begin again with the first one that shows enough for others to match.
+        # Predict the motion since the reference, and correct the scan for it.
+        clock_stepped = self._update_period(stamp - self.stamps[-1] if self.stamps else 0.0)
         self.stamps.append(stamp)
+        self._odom.append(odom)
+        period = stamp - self.stamps[self._reference]
+        if period <= 0 and self.poses:  # the real time since then is unknown, and odometry may have been reset
+            period, self._odom[self._reference] = MAX_PERIOD_S, None
+        motion, deviation = self._predict_motion(period)
+        scan = self._correct(ranges, motion, period)
+        used_odometry = self._odom[self._reference] is not None and odom is not None
+        # Begin with the first scan, and begin again with the first one that shows enough for others to match.
         if len(self.stamps) == 1:
             return self._begin_piece(np.zeros(3), scan)
         prior, covariance = self._prior(motion, deviation)
@@ -177,13 +184,16 @@ class FrontEnd:
         if shows_first_surfaces and self.shows_too_little:
             self._remove_key_scans()
             return self._begin_piece(prior.mean, scan)
-        if shows_first_surfaces and self._odom is None:
+        if shows_first_surfaces and odom is None:
             return self._begin_piece(self.poses[-1], scan)  # so far there was nothing that a scan could match
-        self._covariance_since_key = self._covariance_since_key + PRIOR_INFLATION**2 * covariance
+        self._covariance_since_key = self._covariance_at_reference + PRIOR_INFLATION**2 * covariance
         # Register the scan, and judge whether the match can be right.
+        last = self.poses[self._reference]
         found = self._register(scan, prior, period)
+        if found is not None and self.laser.time_increment and not used_odometry:
+            scan, found = self._register_sweep(ranges, found, prior, period)
         contradiction = self._contradiction(scan, found, prior)
-        reachable_from = [self.poses[-1], prior.mean] if used_odometry else [self.poses[-1]]
+        reachable_from = [last, prior.mean] if used_odometry else [last]
         suspect = contradiction > MAX_CONTRADICTION or self._is_suspect(found, prior, reachable_from, period)
         # If odometry and registration agree even after many suspect scans, the surroundings have changed.
         confirmed = self._suspect_scans + 1 >= MAX_SUSPECT_SCANS and used_odometry and not _is_far(found, prior)
@@ -236,11 +246,11 @@ class FrontEnd:
             np.array(self.poses), np.array(self.pieces), self.keys.copy(), self.key_scans(), self.unmatched
         )
 
-    def _predict_motion(self, period: float, odom: Array | None) -> tuple[Array, Array]:
-        """Motion (3,) in base_link in the ``period`` since the scan before, and its standard deviations (3,)."""
-        velocity = self._velocity
-        if odom is not None and self._odom is not None:
-            motion = se2.between(self._odom, odom)
+    def _predict_motion(self, period: float) -> tuple[Array, Array]:
+        """Motion (3,) in base_link in the ``period`` since the reference, and its standard deviations (3,)."""
+        velocity, odom_before, odom = self._velocity, self._odom[self._reference], self._odom[-1]
+        if odom is not None and odom_before is not None:
+            motion = se2.between(odom_before, odom)
             # A robot that seems to stop suddenly may go on: odometry lags behind the scans, or pauses.
             possible = np.abs([motion, np.zeros(3) if velocity is None else velocity * period])
             moved, turned = np.hypot(possible[:, 0], possible[:, 1]).max(), possible[:, 2].max()
@@ -252,7 +262,7 @@ class FrontEnd:
         return velocity * period, STANDING_DEVIATION + deviation * period
 
     def _correct(self, ranges: Array, motion: Array, period: float) -> _Scan:
-        """The scan as if measured at its stamp, with a ``motion`` (3,) since the scan before."""
+        """The scan as if measured at its stamp, with a ``motion`` (3,) in the ``period`` before."""
         laser, angles = self.laser, self.laser.angles
         if laser.time_increment and period:
             times = beam_times(len(angles), laser.time_increment)
@@ -261,7 +271,7 @@ class FrontEnd:
 
     def _prior(self, motion: Array, deviation: Array) -> tuple[PosePrior, Array]:
         """The pose after a motion, and the covariance (3, 3) of the motion."""
-        last = self.poses[-1]
+        last = self.poses[self._reference]
         _, jacobian = se2.compose_jacobians(last, motion)
         covariance = (jacobian * (self._scale * deviation) ** 2) @ jacobian.T
         return PosePrior(se2.compose(last, motion), np.asarray(np.linalg.inv(covariance), float)), covariance
@@ -276,14 +286,24 @@ class FrontEnd:
         found = register(surface, elements, prior.mean, prior)
         if found is not None and found.matched_fraction > FAMILIAR_FRACTION:
             return found
-        last = self.poses[-1]
+        last, deviation = self.poses[self._reference], np.sqrt(np.diag(np.linalg.inv(prior.information)))
+        window = np.clip(SEARCH_SIGMAS * deviation, MIN_SEARCH_WINDOW, MAX_SEARCH_WINDOW)
         starts = [last if self._velocity is None else se2.compose(last, self._velocity * period)]
         near = elements.part(np.hypot(*elements.points.T) < MAX_SEARCHED_M)
-        starts += list(correlative_search(surface.elements, near, prior.mean, SEARCH_WINDOW))
+        starts += list(correlative_search(surface.elements, near, prior.mean, window))
         others = [register(surface, elements, start, prior) for start in starts]
         matches = [each for each in (found, *others) if each is not None]
         best = min(matches, key=lambda each: each.cost, default=None)
         return None if best is None or best.matched_fraction < MIN_MATCHED_FRACTION else best
+
+    def _register_sweep(
+        self, ranges: Array, found: Registration, prior: PosePrior, period: float
+    ) -> tuple[_Scan, Registration]:
+        """Corrects a swept scan for the motion to the pose at which it was found, and registers it again."""
+        for _ in range(SWEEP_CORRECTIONS):
+            scan = self._correct(ranges, se2.between(self.poses[self._reference], found.pose), period)
+            found = register(self._surface, scan.elements, found.pose, prior) or found
+        return scan, found
 
     def _is_suspect(
         self, found: Registration | None, prior: PosePrior, reachable_from: list[Array], period: float
@@ -291,8 +311,8 @@ class FrontEnd:
         """Whether a registration implies that the robot was kidnapped, or may match by chance.
 
         The robot was kidnapped if it cannot have driven there within ``period`` s from any pose in ``reachable_from``.
-        These are the last pose and, with odometry, the pose that odometry predicts: after a pause, odometry reports the
-        motion of several scans at once.
+        These are the last known pose and, with odometry, the pose that odometry predicts: after a pause, odometry
+        reports the motion of several scans at once.
         """
         pose = prior.mean if found is None else found.pose
         if all((np.abs(se2.between(each, pose)) > MAX_VELOCITY * period).any() for each in reachable_from):
@@ -322,7 +342,7 @@ class FrontEnd:
     ) -> ScanPose:
         """Adds a scan at its pose. If ``begins_piece``, it starts another piece, linked to the last key scan."""
         self._suspect_scans = 0
-        self._velocity = None if begins_piece else se2.between(self.poses[-1], found.pose) / period
+        self._velocity = None if begins_piece else se2.between(self.poses[self._reference], found.pose) / period
         familiar = found.matched_fraction > FAMILIAR_FRACTION
         if familiar:
             self._scale = _learn_scale(self._scale, self._scale * deviation, prior, found)
@@ -330,6 +350,7 @@ class FrontEnd:
         piece = self._key_pieces[-1] + (1 if begins_piece else 0)
         scan_pose = ScanPose(found.pose, covariance, matched=True, piece=piece, linked=begins_piece)
         self._append(scan_pose)
+        self._make_reference()
         off = np.abs(se2.between(self.poses[self._grid_scans[-1][0]], found.pose))
         if begins_piece or np.hypot(*off[:2]) > GRID_SCAN_DISTANCE_M or off[2] > GRID_SCAN_TURN_RAD:
             self._keep_for_grid(scan)
@@ -377,6 +398,10 @@ class FrontEnd:
         self.poses.append(scan_pose.pose)
         self.pieces.append(scan_pose.piece)
 
+    def _make_reference(self) -> None:
+        """Makes the last scan the one from which the next pose is predicted."""
+        self._reference, self._covariance_at_reference = len(self.poses) - 1, self._covariance_since_key
+
     def _keep_for_grid(self, scan: _Scan) -> None:
         """Keeps the last scan for the grid."""
         self._grid_scans.append((len(self.poses) - 1, self._evenly_spaced(scan).astype(np.float32)))
@@ -402,6 +427,7 @@ class FrontEnd:
         self._elements.append(scan.elements)
         self._ranges.append(self._evenly_spaced(scan))
         self._covariance_since_key = np.zeros((3, 3))
+        self._make_reference()
         recent = range(max(self._first_local, len(self.keys) - LOCAL_SCANS), len(self.keys))
         poses = np.array([self.poses[self.keys[k]] for k in recent])
         local = concatenate([self._elements[k].transformed(pose) for k, pose in zip(recent, poses, strict=True)])

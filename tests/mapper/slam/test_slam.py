@@ -101,6 +101,55 @@ def test_swept_scans():
     assert 3 * corrected < uncorrected
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_errors_of_swept_scans_do_not_alternate(seed):
+    """The motion for which a sweep is corrected comes from poses; an error of one pose must not reverse in the next."""
+    scene = Scene.of(load_world("office"), 300, seed)
+    path, scanner = scene.path(6, at_full_speed=True), scene.scanner
+    scans = observations(scene, path, "corrected", "laser only")
+    laser = Laser(scanner.angles(), np.array(scanner.mount), scanner.range_max, scans[0].time_increment)
+    stamps = np.arange(len(scans)) / scanner.rate
+    tracked = track_drive(RawDrive(stamps, np.array([scan.ranges for scan in scans]), laser))
+    error = se2.compose(path[0], tracked.poses)[:, :2] - path[:-1, :2]
+    alternating = (error[2:] - 2 * error[1:-1] + error[:-2]) / 4
+    assert np.sqrt((alternating**2).sum(axis=1).mean()) < 0.0017
+
+
+def turning_unseen(seed):
+    """A robot that stands, turns by 1.2 rad in about a second, and stands; and which scans it turns in."""
+    world, turn = load_world("office"), 1.2 * np.clip((np.arange(34) - 9) / 15, 0, 1)
+    x, y, yaw = Scene.of(world, 300, seed).poses(1)[0]
+    truth = np.column_stack([np.full(34, x), np.full(34, y), yaw + turn])
+    return driven(world, truth, seed), truth, (turn > 0) & (turn < 1.2)
+
+
+def is_tracked(drive, truth):
+    """Which scans are at their places, in one piece with the first."""
+    tracked = track_drive(drive)
+    off = np.abs(se2.between(se2.compose(truth[0], tracked.poses), truth))
+    return (off < 0.1).all(axis=1) & (tracked.pieces == 0)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_turn_in_a_gap_of_the_scans(seed):
+    """Scans for which the mapper has no time are left out, also while the robot begins to turn."""
+    drive, truth, turning = turning_unseen(seed)
+    kept = replace(drive, stamps=drive.stamps[~turning], ranges=drive.ranges[~turning])
+    assert is_tracked(kept, truth[~turning]).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_turn_while_the_view_is_hidden(seed):
+    """The longer scans do not match, the less is known about the pose."""
+    drive, truth, turning = turning_unseen(seed)
+    kept = np.flatnonzero(~turning | (np.arange(len(truth)) % 2 == 0))  # fewer than begin another piece
+    hidden = drive.ranges[turning]
+    hidden[:], hidden[:, ::3] = np.inf, np.random.default_rng(seed).uniform(1, 8, hidden[:, ::3].shape)
+    drive.ranges[turning] = hidden
+    tracked = is_tracked(replace(drive, stamps=drive.stamps[kept], ranges=drive.ranges[kept]), truth[kept])
+    assert tracked[~turning[kept]].all()
+
+
 def test_pausing_odometry():
     world = load_world("office")
     truth = Scene.of(world, 300, 5).path(20)
