@@ -8,8 +8,9 @@ unknown, unless odometry and the local map agree on it.
 
 A scan that matches, but far from where the motion model expects it, or with more contradictions than usual, also begins
 a piece: the wheels may have slipped, a door may have moved, or the robot was carried to a place that looks alike. So
-does a scan that matches at once after the stamps have stepped back or jumped ahead, because the robot may have been
-moved meanwhile. This piece is linked to the former one, but the link may turn out to be wrong.
+does one of which only a part matches after scans that did not match, because that may be accidental, and one that
+matches at once after the stamps have stepped back or jumped ahead, because the robot may have been moved meanwhile.
+This piece is linked to the former one, but the link may turn out to be wrong.
 """
 
 from __future__ import annotations
@@ -200,7 +201,8 @@ class FrontEnd:
         # Add the scan where it matches, or where the motion model predicts it.
         if found is not None and (confirmed or not suspect):
             slipped = _squared_deviation(found, prior, covariance) > MAX_SLIP**2
-            begins_piece = clock_stepped or suspect or slipped or self._is_unusual(contradiction)
+            may_be_accidental = self._reference < len(self.poses) - 1 and found.matched_fraction < FAMILIAR_FRACTION
+            begins_piece = clock_stepped or suspect or slipped or may_be_accidental or self._is_unusual(contradiction)
             if not suspect:  # in a suspect scan, the contradiction is not due to moving objects
                 self._update_recent_contradiction(contradiction)
             return self._add_matched(scan, found, prior, deviation, period, begins_piece=begins_piece)
