@@ -31,7 +31,9 @@ class FaultOutcome:
     stopped_s: float | None = None  # from the fault until the robot stands
     start_s: float | None = None  # from the restart of a killed service until its liveliness token appears
     again_s: float | None = None  # from a service's return until the robot drives, or the service works, again
-    least_speed: float | None = None  # m/s, during a fault in which the robot should keep driving
+    # During a fault in which the robot should keep driving.
+    least_speed: float | None = None  # m/s
+    driving_share: float | None = None  # share of the measured speeds that are at least `MIN_SPEED`
     contact: bool = False
     deviations: str = ""  # deviations from the expectation; empty if there are none
 
@@ -115,7 +117,9 @@ def _evaluate(timeline: Timeline, injected: float, speed: float, fault: Fault, o
         reached = timeline.first(injected, lambda r: r["what"] == "status" and (r["distance"] or 9.0) < 1.5)
         until = float("inf") if reached is None else reached["t"]
         speeds = [row["speed"] for row in timeline.rows if is_truth(row) and injected <= row["t"] < until]
-        outcome.least_speed = min(speeds) if speeds else None
+        if speeds:
+            outcome.least_speed = min(speeds)
+            outcome.driving_share = sum(speed >= MIN_SPEED for speed in speeds) / len(speeds)
 
 
 def judge(outcome: FaultOutcome, fault: Fault) -> str:
