@@ -19,6 +19,7 @@ from common.geometry.tum import write_tum
 from common.geometry.world import World, load_world, world_name
 from common.writing import complete_files
 from presage.learning.map_picture import draw_map
+from presage.learning.odometry_check import odometry_warnings
 from presage.learning.placement import place_drive
 from presage.learning.pose_refinement import refine_poses
 from presage.learning.train_drive import TrainDriveOptions, drive_of, enough_scans, split, train_on_drive, usable_scans
@@ -198,6 +199,9 @@ def _build_trajectory(
         f"{built.unmatched} scans that did not match those before; {_odometry_note(with_odometry, len(scans))}",
         soft_wrap=True,
     )
+    if odom is not None:
+        for warning in odometry_warnings(built.poses[built.keys], odom[built.keys]):
+            progress.print(f"warning: {warning}", highlight=False, soft_wrap=True)
     unplaced = float(np.isnan(built.poses).any(axis=1).mean())
     if unplaced:
         causes = "the robot was carried away, or its view was blocked"

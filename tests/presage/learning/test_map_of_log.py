@@ -187,6 +187,14 @@ def test_odometry_that_begins_after_the_first_scan(log, tmp_path):
     assert np.isfinite(built.poses).all()
 
 
+def test_wrong_scale_of_odometry(log, tmp_path):
+    scans = read_scans(log, reading=HERE)
+    scans.odom[:, :2] *= 1.3
+    console = Console(record=True, width=500, file=io.StringIO())
+    _build_trajectory(scans, scans.stamps, MapOptions(log, tmp_path / "own.yaml"), QUIET, console)
+    assert "warning: the odometry reports 1.30 times the distances of the scans" in console.export_text()
+
+
 def test_few_scans_per_second_without_odometry(log, tmp_path):
     scans = read_scans(log, reading=HERE).part(np.arange(0, 200, 10))
     console = Console(record=True, width=500, file=io.StringIO())
