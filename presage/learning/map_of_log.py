@@ -209,8 +209,8 @@ def _build_trajectory(
             rate = 1 / np.median(np.diff(stamps))
             causes += f", or it moved too far between two scans ({rate:.3g} per second, without odometry)"
         console.print(
-            f"{unplaced:.1%} of the scans are left out: they contradict what was seen just before, and were not found "
-            f"elsewhere in the map; {causes}",
+            f"{unplaced:.1%} of the scans are left out: they contradict what was seen just before, or match it at "
+            f"several places, and were not found elsewhere in the map; {causes}",
             soft_wrap=True,
         )
     return built

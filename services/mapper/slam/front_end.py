@@ -48,6 +48,7 @@ FAMILIAR_FRACTION, EARLY_KEY_PROGRESS = 0.7, 0.25
 # m, m, rad to either side of the prior's mean: so many of its standard deviations, within these limits.
 SEARCH_SIGMAS = 3.0
 MIN_SEARCH_WINDOW, MAX_SEARCH_WINDOW = np.array([0.3, 0.3, 0.4]), np.array([4.0, 4.0, np.pi])
+MAX_RIVAL_NATS = 3.0  # a match elsewhere that is at least 0.05 times as probable as the best makes the place ambiguous
 MAX_SEARCHED_M = 10.0  # farther elements take no part in the search
 LOCAL_SCANS = 12  # key scans in the local map
 MIN_MATCHED_FRACTION = 0.2  # of a scan's elements that must match the local map
@@ -190,12 +191,13 @@ class FrontEnd:
         self._covariance_since_key = self._covariance_at_reference + PRIOR_INFLATION**2 * covariance
         # Register the scan, and judge whether the match can be right.
         last = self.poses[self._reference]
-        found = self._register(scan, prior, period)
+        found, ambiguous = self._register(scan, prior, period)
         if found is not None and self.laser.time_increment and not used_odometry:
             scan, found = self._register_sweep(ranges, found, prior, period)
         contradiction = self._contradiction(scan, found, prior)
         reachable_from = [last, prior.mean] if used_odometry else [last]
-        suspect = contradiction > MAX_CONTRADICTION or self._is_suspect(found, prior, reachable_from, period)
+        suspect = ambiguous or contradiction > MAX_CONTRADICTION
+        suspect = suspect or self._is_suspect(found, prior, reachable_from, period)
         # If odometry and registration agree even after many suspect scans, the surroundings have changed.
         confirmed = self._suspect_scans + 1 >= MAX_SUSPECT_SCANS and used_odometry and not _is_far(found, prior)
         # Add the scan where it matches, or where the motion model predicts it.
@@ -278,16 +280,16 @@ class FrontEnd:
         covariance = (jacobian * (self._scale * deviation) ** 2) @ jacobian.T
         return PosePrior(se2.compose(last, motion), np.asarray(np.linalg.inv(covariance), float)), covariance
 
-    def _register(self, scan: _Scan, prior: PosePrior, period: float) -> Registration | None:
-        """Registers a scan to the local map, starting at the prior's mean; returns None if too little matches.
+    def _register(self, scan: _Scan, prior: PosePrior, period: float) -> tuple[Registration | None, bool]:
+        """Registers a scan to the local map, starting at the prior's mean.
 
         If only a part of the scan matches, also starts at the pose that the last velocity predicts and at the results
-        of a search.
+        of a search. Returns the best match, or None if too little matches, and whether it is ambiguous.
         """
         surface, elements = self._surface, scan.elements
         found = register(surface, elements, prior.mean, prior)
         if found is not None and found.matched_fraction > FAMILIAR_FRACTION:
-            return found
+            return found, False
         last, deviation = self.poses[self._reference], np.sqrt(np.diag(np.linalg.inv(prior.information)))
         window = np.clip(SEARCH_SIGMAS * deviation, MIN_SEARCH_WINDOW, MAX_SEARCH_WINDOW)
         starts = [last if self._velocity is None else se2.compose(last, self._velocity * period)]
@@ -296,7 +298,10 @@ class FrontEnd:
         others = [register(surface, elements, start, prior) for start in starts]
         matches = [each for each in (found, *others) if each is not None]
         best = min(matches, key=lambda each: each.cost, default=None)
-        return None if best is None or best.matched_fraction < MIN_MATCHED_FRACTION else best
+        if best is None or best.matched_fraction < MIN_MATCHED_FRACTION:
+            return None, False
+        rivals = [each for each in matches if each.cost < best.cost + MAX_RIVAL_NATS]
+        return best, any((np.abs(se2.between(best.pose, each.pose)) > CLOSE_TO_PRIOR).any() for each in rivals)
 
     def _register_sweep(
         self, ranges: Array, found: Registration, prior: PosePrior, period: float
