@@ -110,7 +110,7 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	$(BIN)/presage experiment --seed 3535 --out $(RESULTS) navigation --worlds twins --start unknown --trials 50 --drives holonomic --no-epistemic
 	$(BIN)/presage experiment --seed 3500 --out $(RESULTS) docking --trials 64
 	$(BIN)/presage experiment --seed 3485 --out $(RESULTS) exploration
-	$(BIN)/presage bench mapping-faults --worlds 2 --seed 990 --seconds 60 --json $(RESULTS)/mapping-faults.json
+	$(BIN)/presage bench mapping-faults --worlds 2 --seed 3583 --seconds 60 --json $(RESULTS)/mapping-faults.json
 	$(BIN)/presage bench refinement --worlds 3 --seed 3447 --seconds 300 --out $(RESULTS)/refinement --json $(RESULTS)/refinement.json
 	$(BIN)/presage bench visits --worlds 0 --visits 6 --scans 100 --seed 4711 --out $(RESULTS)/visits --json $(RESULTS)/visits-office.json
 	$(BIN)/presage bench map --size 2000 --json $(RESULTS)/large-map.json
