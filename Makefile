@@ -103,7 +103,7 @@ tables: install ## measure the generated tables of README and docs/ at this comm
 	$(BIN)/presage experiment --out $(RESULTS) all
 	$(BIN)/presage experiment --seed 3579 --out $(RESULTS) navigation --trials 30
 	$(BIN)/presage experiment --seed 3580 --out $(RESULTS) navigation --start unknown --trials 30
-	$(BIN)/presage experiment --seed 3560 --out $(RESULTS) navigation --worlds office --people 10 --trials 50
+	$(BIN)/presage experiment --seed 3578 --out $(RESULTS) navigation --worlds office --people 10 --trials 50
 	$(BIN)/presage experiment --seed 3551 --out $(RESULTS) navigation --worlds hall --drives holonomic --max-range 4 --beams 271 --prior odometry --slip 0.05 --limit 60 --trials 50
 	$(BIN)/presage experiment --seed 3551 --out $(RESULTS) navigation --worlds hall --drives holonomic --max-range 4 --beams 271 --prior odometry --slip 0.05 --limit 60 --trials 50 --no-epistemic
 	$(BIN)/presage experiment --seed 3549 --out $(RESULTS) navigation --worlds twins --start unknown --trials 50
