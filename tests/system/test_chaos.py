@@ -13,13 +13,13 @@ import pytest
 from lab.fault_injection.faults import FAULTS
 
 ROWS = ("killed: router", "killed: recorder", "network cut 1 s", "duplicates, late")
-# What may happen on a busy machine: it reacts late, or the robot brakes because a command is late.
-LATE = ("only after more than", "stood after more than", "the robot did not go on")
+LATE = ("only after more than", "stood after more than")  # on a busy machine
 
 
 def reasons(row):
     """Why the benchmark says that the system did not react to a fault as expected."""
-    return filter(None, row["why"].split("; "))
+    # A robot that should go on may brake on a busy machine, because a command is late; see `driving_share`.
+    return {*row["why"].split("; ")} - {"", "the robot did not go on"}
 
 
 def test_faults(process, tmp_path):

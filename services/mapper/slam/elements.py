@@ -106,7 +106,8 @@ def _fit_lines(points: Array, first: npt.NDArray[np.int_], last: npt.NDArray[np.
     across, along = middle - half_difference, middle + half_difference
     flat = (count >= MIN_POINTS) & (across < MAX_ROUGHNESS_M**2)
     lengths = np.hypot(*(points[last - 1] - points[first]).T) / 2
-    # Asymptotic variance of the direction of a principal component (Anderson, Ann. Math. Stat. 34, 1963).
+    # Asymptotic variance of the direction of a principal component (Anderson, Ann. Math. Stat. 34, 1963), with n - 2
+    # instead of n, because a line has two parameters.
     spread = (count - 2) * (along - across) ** 2
     tilts = np.clip((across * along)[flat] / np.maximum(spread[flat], 1e-12), 0.0, MAX_TILT)
     return Elements(np.column_stack([mx, my])[flat], normals[flat], lengths[flat], tilts)

@@ -9,7 +9,7 @@ unknown, unless odometry and the local map agree on it.
 A scan that matches, but far from where the motion model expects it, or with more contradictions than usual, also begins
 a piece: the wheels may have slipped, a door may have moved, or the robot was carried to a place that looks alike. So
 does one of which only a part matches after scans that did not match, because that may be accidental, and one that
-matches at once after the stamps have stepped back or jumped ahead, because the robot may have been moved meanwhile.
+matches first after the stamps have stepped back or jumped ahead, because the robot may have been moved meanwhile.
 This piece is linked to the former one, but the link may turn out to be wrong.
 """
 
@@ -47,6 +47,7 @@ GRID_SCAN_DISTANCE_M, GRID_SCAN_TURN_RAD = 0.1, 0.1
 FAMILIAR_FRACTION, EARLY_KEY_PROGRESS = 0.7, 0.25
 # m, m, rad to either side of the prior's mean: so many of its standard deviations, within these limits.
 SEARCH_SIGMAS = 3.0
+# The largest takes about 50 ms for each scan.
 MIN_SEARCH_WINDOW, MAX_SEARCH_WINDOW = np.array([0.3, 0.3, 0.4]), np.array([4.0, 4.0, np.pi])
 MAX_RIVAL_NATS = 3.0  # a match elsewhere that is at least 0.05 times as probable as the best makes the place ambiguous
 MAX_SEARCHED_M = 10.0  # farther elements take no part in the search
@@ -61,7 +62,7 @@ UNUSUAL_CONTRADICTION, UNUSUAL_RATIO, FADING_SCANS = 0.05, 1.5, 50
 MAX_SUSPECT_SCANS = 10  # after this many suspect scans in a row, the last of them begins another piece
 # Standard deviations of motion and registration; a scan that matches farther from the prior begins a piece.
 MAX_SLIP = 6.0
-CLOSE_TO_PRIOR = np.array([0.1, 0.1, 0.1])  # m, m, rad: after a suspect scan, a match farther away may be accidental
+SAME_PLACE = np.array([0.1, 0.1, 0.1])  # m, m, rad: poses that differ by more are different places
 NO_PIECE = -1  # of a suspect scan, instead of the number of a piece
 # Standard deviations of the motion. With odometry: of its error, per unit of motion. Without: of the change of the
 # velocity in one second, m/s and rad/s, or of the velocity if the last one is unknown.
@@ -152,7 +153,10 @@ class FrontEnd:
         self._local: Submap
         self._first_local = 0  # first key scan that links connect to the latest one; the local map starts no earlier
         # The motion.
-        self._reference = 0  # number of the last scan whose pose is known; the next pose is predicted from it
+        # Number of the last scan that matched or became a key scan; the next pose is predicted from it.
+        self._reference = 0
+        self._since_reference = 0.0  # s; a step back of the clock counts as `MAX_PERIOD_S`
+        self._clock_stepped = False  # since the reference
         self._velocity: Array | None = None  # (3,) base_link
         self._period: float | None = None  # s between the last two scans between which the clock did not step
         self._scale = np.ones(3)  # of the deviations of the motion, learned
@@ -169,12 +173,14 @@ class FrontEnd:
         is the pose of base_link in odom, or None if it is unknown.
         """
         # Predict the motion since the reference, and correct the scan for it.
-        clock_stepped = self._update_period(stamp - self.stamps[-1] if self.stamps else 0.0)
+        since_last = stamp - self.stamps[-1] if self.stamps else 0.0
+        self._clock_stepped |= self._update_period(since_last)
         self.stamps.append(stamp)
         self._odom.append(odom)
-        period = stamp - self.stamps[self._reference]
-        if period <= 0 and self.poses:  # the real time since then is unknown, and odometry may have been reset
-            period, self._odom[self._reference] = MAX_PERIOD_S, None
+        if since_last < 0:  # the real time since then is unknown, and odometry may have been reset
+            since_last, self._odom[self._reference] = MAX_PERIOD_S, None
+        self._since_reference += since_last
+        period = self._since_reference
         motion, deviation = self._predict_motion(period)
         scan = self._correct(ranges, motion, period)
         used_odometry = self._odom[self._reference] is not None and odom is not None
@@ -192,8 +198,6 @@ class FrontEnd:
         # Register the scan, and judge whether the match can be right.
         last = self.poses[self._reference]
         found, ambiguous = self._register(scan, prior, period)
-        if found is not None and self.laser.time_increment and not used_odometry:
-            scan, found = self._register_sweep(ranges, found, prior, period)
         contradiction = self._contradiction(scan, found, prior)
         reachable_from = [last, prior.mean] if used_odometry else [last]
         suspect = ambiguous or contradiction > MAX_CONTRADICTION
@@ -204,7 +208,12 @@ class FrontEnd:
         if found is not None and (confirmed or not suspect):
             slipped = _squared_deviation(found, prior, covariance) > MAX_SLIP**2
             may_be_accidental = self._reference < len(self.poses) - 1 and found.matched_fraction < FAMILIAR_FRACTION
-            begins_piece = clock_stepped or suspect or slipped or may_be_accidental or self._is_unusual(contradiction)
+            begins_piece = (
+                self._clock_stepped or suspect or slipped or may_be_accidental or self._is_unusual(contradiction)
+            )
+            # A match that was not expected may be wrong, and the scan would be bent to fit it.
+            if self.laser.time_increment and not used_odometry and not begins_piece:
+                scan, found = self._register_sweep(ranges, found, prior, period)
             if not suspect:  # in a suspect scan, the contradiction is not due to moving objects
                 self._update_recent_contradiction(contradiction)
             return self._add_matched(scan, found, prior, deviation, period, begins_piece=begins_piece)
@@ -301,7 +310,7 @@ class FrontEnd:
         if best is None or best.matched_fraction < MIN_MATCHED_FRACTION:
             return None, False
         rivals = [each for each in matches if each.cost < best.cost + MAX_RIVAL_NATS]
-        return best, any((np.abs(se2.between(best.pose, each.pose)) > CLOSE_TO_PRIOR).any() for each in rivals)
+        return best, any(_is_elsewhere(best.pose, each.pose) for each in rivals)
 
     def _register_sweep(
         self, ranges: Array, found: Registration, prior: PosePrior, period: float
@@ -349,7 +358,9 @@ class FrontEnd:
     ) -> ScanPose:
         """Adds a scan at its pose. If ``begins_piece``, it starts another piece, linked to the last key scan."""
         self._suspect_scans = 0
-        self._velocity = None if begins_piece else se2.between(self.poses[self._reference], found.pose) / period
+        # After scans that did not match, the motion may not have been steady.
+        steady = not begins_piece and self._reference == len(self.poses) - 1
+        self._velocity = se2.between(self.poses[self._reference], found.pose) / period if steady else None
         familiar = found.matched_fraction > FAMILIAR_FRACTION
         if familiar:
             self._scale = _learn_scale(self._scale, self._scale * deviation, prior, found)
@@ -368,7 +379,7 @@ class FrontEnd:
     def _add_unmatched(self, scan: _Scan, pose: Array, *, is_key: bool) -> ScanPose:
         """Adds a scan of which too little matches, at the pose that the motion model predicts.
 
-        It is a key scan if ``is_key``, or if the robot has moved far enough.
+        It is a key scan if ``is_key``, or if the robot has moved far enough. Then its predicted pose counts as known.
         """
         scan_pose = ScanPose(pose, self._covariance_since_key, matched=False, piece=self._key_pieces[-1])
         self._append(scan_pose)
@@ -408,6 +419,7 @@ class FrontEnd:
     def _make_reference(self) -> None:
         """Makes the last scan the one from which the next pose is predicted."""
         self._reference, self._covariance_at_reference = len(self.poses) - 1, self._covariance_since_key
+        self._since_reference, self._clock_stepped = 0.0, False
 
     def _keep_for_grid(self, scan: _Scan) -> None:
         """Keeps the last scan for the grid."""
@@ -461,7 +473,12 @@ def track_drive(drive: RawDrive, report: Callable[[float], None] = lambda _done:
 
 def _is_far(found: Registration | None, prior: PosePrior) -> bool:
     """Whether a registration is far from where the motion model expects it, or there is none."""
-    return found is None or bool((np.abs(se2.between(prior.mean, found.pose)) > CLOSE_TO_PRIOR).any())
+    return found is None or _is_elsewhere(prior.mean, found.pose)
+
+
+def _is_elsewhere(a: Array, b: Array) -> bool:
+    """Whether two poses (3,) are different places."""
+    return bool((np.abs(se2.between(a, b)) > SAME_PLACE).any())
 
 
 def _squared_deviation(found: Registration, prior: PosePrior, motion_covariance: Array) -> float:
@@ -475,11 +492,11 @@ def _median_range(elements: Elements) -> float:
 
 
 def _learn_scale(scale: Array, deviation: Array, prior: PosePrior, found: Registration) -> Array:
-    """The factor (3,) of the motion's deviations after one more scan, by expectation maximisation.
+    """The factor (3,) of the motion's deviations after one more scan, roughly by expectation maximisation.
 
     It is learned because the errors of odometries differ tenfold. Where the scan does not observe the motion, the
-    expected square of the error is that of the prior, so that the factor stays. The registration's covariance is larger
-    than that of the error: it inflates the prior.
+    factor stays. Where it hardly observes it, the factor becomes too large, as the match follows the scan more than the
+    prior allows (`PRIOR_INFLATION`).
     """
     turn = se2.rotation(-float(prior.mean[2]))
     variance = np.diag(turn @ np.linalg.inv(found.information + prior.information) @ turn.T)
