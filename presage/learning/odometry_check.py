@@ -26,9 +26,8 @@ def odometry_warnings(poses: Array, odom: Array) -> list[str]:
         ratio = float(np.median(by_odom[turned, 2] / by_scans[turned, 2]))
         if ratio < -0.5:
             # The scans are then a mirror image, so that distances and directions say nothing.
-            return [
-                "the odometry turns right where the scans turn left: reverse the angles if the laser is upside down"
-            ]
+            problem = "the odometry turns right where the scans turn left"
+            return [f"{problem}: if the laser is upside down, set upside_down: true in section log of --config"]
         if abs(ratio - 1) > MAX_SCALE_ERROR:
             warnings.append(f"the odometry reports {ratio:.2f} times the turns of the scans: is the track width right?")
     x, y, _ = by_scans.T

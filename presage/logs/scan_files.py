@@ -160,10 +160,11 @@ def scans_of_log(log: Log) -> Scans:
     if not ranges:
         raise UserError(f"{log.path}: no usable scan in it" + (f"; left out: {left_out}" if left_out else ""))
     times = [stamp for stamp in stamps if stamp is not None]
-    no_return = describe_probable_no_return(np.array(ranges))
+    all_ranges = np.array(ranges)
+    no_return = _describe_probable_no_return(all_ranges)
     return Scans(
         ScannerGeometry(log.angles, log.mount, log.range_max, mount_assumed=log.mount_assumed),
-        np.array(ranges),
+        all_ranges,
         seconds(times) if len(times) == len(ranges) else None,
         np.array(odoms) if log.odometry else None,
         log.initial_pose,
@@ -174,7 +175,7 @@ def scans_of_log(log: Log) -> Scans:
     )
 
 
-def describe_probable_no_return(ranges: Array) -> str:
+def _describe_probable_no_return(ranges: Array) -> str:
     """A note if the longest of the ranges (N, B) m probably means "no return"; empty otherwise.
 
     Some scanners report a fixed value shorter than the stated maximum range. Such beams look like a wall that moves

@@ -152,9 +152,8 @@ class FrontEnd:
         self._surface: Surface
         self._local: Submap
         self._first_local = 0  # first key scan that links connect to the latest one; the local map starts no earlier
-        # The motion.
-        # Number of the last scan that matched or became a key scan; the next pose is predicted from it.
-        self._reference = 0
+        # The motion. The next pose is predicted from the reference, the last scan that matched or became a key scan.
+        self._reference = 0  # its number among all scans
         self._since_reference = 0.0  # s; a step back of the clock counts as `MAX_PERIOD_S`
         self._clock_stepped = False  # since the reference
         self._velocity: Array | None = None  # (3,) base_link

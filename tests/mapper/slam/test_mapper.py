@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -15,18 +14,9 @@ from lab.accuracy.scenes import Scene
 from services.mapper.slam.mapper import Mapper
 from services.mapper.slam.submaps import KEY_SCANS_PER_SUBMAP
 from services.mapper.slam.trajectory import build_trajectory
-from services.simulator.odometry import Odometer, OdometryNoise
-from tests.mapper.drives import driven
+from tests.mapper.drives import driven, odometry
 
 OFFICE = load_world("office")
-
-
-def odometry(truth):
-    odometer, poses = Odometer(OdometryNoise(), np.random.default_rng(0)), [np.zeros(3)]
-    for before, after in pairwise(truth):
-        odometer.move(before, after)
-        poses.append(odometer.pose)
-    return np.array(poses)
 
 
 def mapped(drive):

@@ -23,8 +23,7 @@ from services.mapper.slam.front_end import NO_PIECE, FrontEnd, track_drive
 from services.mapper.slam.loop_closure import LoopClosure, find_closures
 from services.mapper.slam.pose_graph import ANCHOR, LinkTable, PoseLink, Uncertainty, optimise
 from services.mapper.slam.trajectory import build_trajectory
-from services.simulator.odometry import Odometer, OdometryNoise
-from tests.mapper.drives import driven
+from tests.mapper.drives import driven, odometry
 
 
 def test_jacobians_of_links():
@@ -199,14 +198,10 @@ def test_few_beams_correct_odometry(seed):
     """Odometry keeps its weight: scans that hardly observe the motion say little about its error."""
     world = make_building(88045, "office").world
     truth = Scene.of(world, 30, seed).path(40)
-    odometer = Odometer(OdometryNoise(), np.random.default_rng(seed))
-    odom = [odometer.pose]
-    for before, after in pairwise(truth):
-        odometer.move(before, after)
-        odom.append(odometer.pose)
-    tracked = track_drive(replace(driven(world, truth, beams=30), odom=np.array(odom)))
+    odom = odometry(truth, seed)
+    tracked = track_drive(replace(driven(world, truth, beams=30), odom=odom))
     by_odometry, by_scans = (
-        np.hypot(*(se2.compose(truth[0], poses) - truth)[:, :2].T).max() for poses in (np.array(odom), tracked.poses)
+        np.hypot(*(se2.compose(truth[0], poses) - truth)[:, :2].T).max() for poses in (odom, tracked.poses)
     )
     assert 5 * by_scans < by_odometry
 
