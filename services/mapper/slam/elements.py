@@ -6,7 +6,7 @@ the scanner, so the two sides of a thin wall are never confused.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +21,7 @@ SPACING_M = 0.1  # between elements, across the beams
 # multiple of the spacing of the beams at this range, on a surface perpendicular to them.
 MIN_GAP_M, GAP_BEAMS = 0.12, 6.0
 MAX_ROUGHNESS_M = 0.03  # standard deviation of the points from the line; rougher elements are corners
-MAX_TILT = 1.0  # rad², about the variance of a direction that is unknown
+MAX_DIRECTION_VARIANCE = 1.0  # rad², about the variance of a direction that is unknown
 MIN_POINTS = 3  # from which the direction of a surface is computed
 
 
@@ -32,16 +32,16 @@ class Elements:
     points: Array  # (K, 2) m
     normals: Array  # (K, 2) unit vectors towards free space
     lengths: Array  # (K,) m, extent of each along its surface
-    tilts: Array  # (K,) rad², variance of the direction
+    direction_variances: Array  # (K,) rad²
 
     def transformed(self, pose: Array) -> Elements:
         """The elements in the parent frame of the frame with ``pose`` (3,)."""
         points, normals = se2.transform(pose, self.points), se2.rotate(float(pose[2]), self.normals)
-        return Elements(points, normals, self.lengths, self.tilts)
+        return replace(self, points=points, normals=normals)
 
     def part(self, which: npt.NDArray[np.integer | np.bool_]) -> Elements:
         """The elements with these indices, or in this mask."""
-        return Elements(self.points[which], self.normals[which], self.lengths[which], self.tilts[which])
+        return Elements(self.points[which], self.normals[which], self.lengths[which], self.direction_variances[which])
 
     def divided(self) -> Elements:
         """The same surfaces, in elements of at most `SPACING_M`; where beams are sparse, elements are longer."""
@@ -51,7 +51,7 @@ class Elements:
         along = ((number + 0.5) / count[which] - 0.5) * self.lengths[which]
         x, y = self.normals[which].T
         points = self.points[which] + along[:, None] * np.column_stack([-y, x])
-        return Elements(points, self.normals[which], self.lengths[which] / count[which], self.tilts[which])
+        return replace(self.part(which), points=points, lengths=self.lengths[which] / count[which])
 
     def __len__(self) -> int:
         return len(self.points)
@@ -59,8 +59,7 @@ class Elements:
 
 def concatenate(elements: list[Elements]) -> Elements:
     """All elements of a list, in one frame."""
-    points, normals, lengths, tilts = zip(*((e.points, e.normals, e.lengths, e.tilts) for e in elements), strict=True)
-    return Elements(np.concatenate(points), np.concatenate(normals), np.concatenate(lengths), np.concatenate(tilts))
+    return Elements(*(np.concatenate([getattr(each, field.name) for each in elements]) for field in fields(Elements)))
 
 
 def elements_of_scan(ranges: Array, angles: Array, mount: Array, range_max: float) -> Elements:
@@ -109,5 +108,5 @@ def _fit_lines(points: Array, first: npt.NDArray[np.int_], last: npt.NDArray[np.
     # Asymptotic variance of the direction of a principal component (Anderson, Ann. Math. Stat. 34, 1963), with n - 2
     # instead of n, because a line has two parameters.
     spread = (count - 2) * (along - across) ** 2
-    tilts = np.clip((across * along)[flat] / np.maximum(spread[flat], 1e-12), 0.0, MAX_TILT)
-    return Elements(np.column_stack([mx, my])[flat], normals[flat], lengths[flat], tilts)
+    variances = np.clip((across * along)[flat] / np.maximum(spread[flat], 1e-12), 0.0, MAX_DIRECTION_VARIANCE)
+    return Elements(np.column_stack([mx, my])[flat], normals[flat], lengths[flat], variances)

@@ -96,7 +96,7 @@ def register(surface: Surface, elements: Elements, start: Array, prior: PosePrio
         before, pose = pose, _fuse(pose, H, to_best, information, to_prior)
     # A line that noise has tilted seems to show the place along itself (errors in variables).
     along = se2.displacement_jacobian(offset, se2.rotate(np.pi / 2, normal))
-    shown = subtract_spurious(H, (along.T * weight * surface.elements.tilts[nearest]) @ along)
+    shown = subtract_spurious(H, (along.T * weight * surface.elements.direction_variances[nearest]) @ along)
     pose = _fuse(before, shown, to_best, information, to_prior)
     matched = distance < MATCHED_M
     missed = np.where(matched, 0.0, MATCHED_M)

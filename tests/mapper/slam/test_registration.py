@@ -42,5 +42,5 @@ def test_corridor_does_not_show_the_place_along_it(beams):
 def test_variance_of_directions():
     walls = [elements_at(HERE, 622, seed) for seed in range(20)]
     x, y = np.concatenate([se2.rotate(float(HERE[2]), wall.normals) for wall in walls]).T
-    tilts = np.concatenate([wall.tilts for wall in walls])
-    assert tilts.mean() == pytest.approx(np.mean(np.arctan(x / y) ** 2), rel=0.3)
+    direction_variances = np.concatenate([wall.direction_variances for wall in walls])
+    assert direction_variances.mean() == pytest.approx(np.mean(np.arctan(x / y) ** 2), rel=0.3)

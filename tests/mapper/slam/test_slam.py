@@ -115,7 +115,7 @@ def test_errors_of_swept_scans_do_not_alternate(seed):
 
 
 def turning_unseen(seed):
-    """A robot that stands, turns by 1.2 rad in about a second, and stands; and which scans it turns in."""
+    """A robot that stands, turns by 1.2 rad in a second, and stands: its drive, true poses, mask of the turn."""
     world, turn = load_world("office"), 1.2 * np.clip((np.arange(34) - 9) / 15, 0, 1)
     x, y, yaw = Scene.of(world, 300, seed).poses(1)[0]
     truth = np.column_stack([np.full(34, x), np.full(34, y), yaw + turn])
